@@ -1,0 +1,238 @@
+"""The trained bundle: a manifest (JSON) and weights (safetensors) in one directory. No code in it, no pickle.
+
+::
+
+    lab/
+    ├── manifest.json        machine, equations, units, seeds, versions, healthy spread, hash of the weights
+    └── weights.safetensors  input_scale, W1, b1, W2, b2 of every equation, float64
+
+Loading refuses a bundle that is damaged or was trained for another machine, and says what differs.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from models.diagnosis.networks import HIDDEN, EquationNetwork, Healthy, Network, equation_by_number
+from models.errors import BundleError
+from models.machine import Machine
+
+__all__ = ["Bundle", "Manifest", "Training", "load_bundle", "save_bundle"]
+
+_SHIPPED = Path(__file__).parent.parent / "bundles"
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+_FORMAT = 1
+_PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
+_ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
+
+
+class HealthyEntry(BaseModel):
+    """Healthy spread of one equation, see `models.diagnosis.networks.Healthy`."""
+
+    model_config = _STRICT
+
+    windows: int = Field(ge=1)
+    msd: float = Field(ge=0)
+    z_scale: tuple[float, ...]
+    spread: tuple[float, ...]
+
+
+class EquationEntry(BaseModel):
+    """One equation of the bundle."""
+
+    model_config = _STRICT
+
+    number: str
+    inputs: tuple[str, ...] = Field(description="inputs in order, SI units, divided by the rms of the target")
+    parameters: tuple[str, ...]
+    hidden: int
+    healthy: HealthyEntry
+
+
+class Training(BaseModel):
+    """How the bundle was made: enough to make it again."""
+
+    model_config = _STRICT
+
+    seed: int
+    training_windows: int
+    calibration_windows: int
+    versions: dict[str, str]
+
+
+class Manifest(BaseModel):
+    """What a bundle says about itself."""
+
+    model_config = _STRICT
+
+    format: int
+    machine: str
+    physics: dict[str, Any] = Field(description="rotor, operation, condition, rate and window it was trained for")
+    equations: tuple[EquationEntry, ...]
+    training: Training
+    weights_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """Trained networks of one machine.
+
+    Attributes
+    ----------
+    manifest : Manifest
+    networks : tuple of EquationNetwork
+        In the order of the equation table.
+    """
+
+    manifest: Manifest
+    networks: tuple[EquationNetwork, ...]
+
+    @property
+    def identity(self) -> str:
+        """Twelve hexadecimal digits that change with anything in the bundle."""
+        return hashlib.sha256(_canonical(self.manifest)).hexdigest()[:12]
+
+
+def _canonical(manifest: Manifest) -> bytes:
+    return json.dumps(manifest.model_dump(mode="json"), sort_keys=True, indent=1).encode()
+
+
+def _physics(machine: Machine) -> dict[str, Any]:
+    return json.loads(json.dumps(machine.model_dump(mode="json", include=set(_PHYSICS))))  # type: ignore[no-any-return]
+
+
+def save_bundle(directory: Path, machine: Machine, networks: tuple[EquationNetwork, ...], training: Training) -> Bundle:
+    """Write a bundle.
+
+    Raises
+    ------
+    BundleError
+        If a network is not calibrated or the directory cannot be written.
+    """
+    arrays: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = {}
+    entries = []
+    for trained in networks:
+        number, healthy = trained.equation.number, trained.healthy
+        if healthy is None:
+            raise BundleError(f"{directory}: equation {number} has no healthy spread: calibrate it before saving")
+        for name in _ARRAYS:
+            arrays[f"{number}.{name}"] = np.ascontiguousarray(getattr(trained.network, name))
+        entries.append(
+            EquationEntry(
+                number=number,
+                inputs=trained.equation.input_names,
+                parameters=trained.equation.parameters,
+                hidden=HIDDEN,
+                healthy=HealthyEntry(
+                    windows=healthy.windows, msd=healthy.msd, z_scale=healthy.z_scale, spread=healthy.spread
+                ),
+            )
+        )
+    weights = save(arrays)
+    manifest = Manifest(
+        format=_FORMAT,
+        machine=machine.name,
+        physics=_physics(machine),
+        equations=tuple(entries),
+        training=training,
+        weights_sha256=hashlib.sha256(weights).hexdigest(),
+    )
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / "weights.safetensors").write_bytes(weights)
+        (directory / "manifest.json").write_bytes(_canonical(manifest) + b"\n")
+    except OSError as error:
+        raise BundleError(f"{directory}: cannot be written ({error.strerror})") from error
+    return Bundle(manifest, networks)
+
+
+def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
+    """Load a bundle and check that it belongs to a machine.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        "lab" (shipped), or a directory.
+    machine : Machine
+        The machine it must have been trained for: rotor, operation, condition range, rate and window.
+
+    Raises
+    ------
+    BundleError
+        Naming what is missing, damaged, or different, with both values.
+    """
+    directory = Path(name_or_path)
+    if not directory.is_dir() and (_SHIPPED / str(name_or_path)).is_dir():
+        directory = _SHIPPED / str(name_or_path)
+    try:
+        manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+        weights = (directory / "weights.safetensors").read_bytes()
+    except OSError as error:
+        raise BundleError(f"{directory}: not a bundle: {Path(error.filename).name}: {error.strerror}") from error
+    except ValidationError as error:
+        raise BundleError(f"{directory}/manifest.json: {error}") from error
+    if manifest.format != _FORMAT:
+        raise BundleError(f"{directory}: format is {manifest.format}, this program reads {_FORMAT}")
+    digest = hashlib.sha256(weights).hexdigest()
+    if digest != manifest.weights_sha256:
+        raise BundleError(
+            f"{directory}/weights.safetensors: sha256 is {digest[:12]}…, "
+            f"the manifest says {manifest.weights_sha256[:12]}…"
+        )
+    differences = list(_differences(manifest.physics, _physics(machine)))
+    if differences:
+        raise BundleError(
+            f"{directory}: trained for another machine than {machine.site}/{machine.name}: {'; '.join(differences)}"
+        )
+    try:
+        arrays = load(weights)
+    except SafetensorError as error:
+        raise BundleError(f"{directory}/weights.safetensors: {error}") from error
+    return Bundle(manifest, tuple(_network(directory, entry, arrays) for entry in manifest.equations))
+
+
+def _network(
+    directory: Path, entry: EquationEntry, arrays: dict[str, np.ndarray[Any, np.dtype[Any]]]
+) -> EquationNetwork:
+    """One equation's network, checked against this program's equation table."""
+    where = f"{directory}: equation {entry.number}"
+    try:
+        equation = equation_by_number(entry.number)
+    except KeyError:
+        raise BundleError(f"{where} is not in this program's table") from None
+    checks: tuple[tuple[str, object, object], ...] = (
+        ("inputs", entry.inputs, equation.input_names),
+        ("parameters", entry.parameters, equation.parameters),
+        ("hidden", entry.hidden, HIDDEN),
+    )
+    for field, found, expected in checks:
+        if found != expected:
+            raise BundleError(f"{where}: {field} are {found}, this program expects {expected}")
+    n_inputs = len(equation.input_names)
+    shapes = {"input_scale": (n_inputs,), "W1": (n_inputs, HIDDEN), "b1": (HIDDEN,), "W2": (HIDDEN,), "b2": (1,)}
+    parts = []
+    for name in _ARRAYS:
+        array = arrays.get(f"{entry.number}.{name}")
+        if array is None or array.shape != shapes[name] or array.dtype != np.float64 or not np.isfinite(array).all():
+            state = "missing" if array is None else f"{array.dtype}{array.shape}"
+            raise BundleError(f"{where}: weight {name} is {state}, expected finite float64{shapes[name]}")
+        parts.append(array)
+    healthy = Healthy(entry.healthy.windows, entry.healthy.msd, entry.healthy.z_scale, entry.healthy.spread)
+    return EquationNetwork(equation, Network(*parts), healthy)
+
+
+def _differences(trained: Any, present: Any, path: str = "") -> list[str]:
+    """Fields whose values differ, with both values."""
+    if isinstance(trained, dict) and isinstance(present, dict):
+        found: list[str] = []
+        for key in sorted({*trained, *present}):
+            found += _differences(trained.get(key), present.get(key), f"{path}.{key}" if path else str(key))
+        return found
+    return [] if trained == present else [f"{path} is {present}, trained for {trained}"]

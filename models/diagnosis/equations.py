@@ -1,0 +1,269 @@
+"""The equation table: the compatibility equations (28)-(31) as data.
+
+Each is one row of the equation of motion, correlated with a measured reference. For every lag beyond the excitation's
+memory its target correlation is a fixed combination of its inputs, and only the equation's *own* parameters can change
+that combination: this is what locates a fault. Two additions to the printed equations make that exact without tilt
+sensors: all measured displacements serve as reference, and the correlation of the disc's acceleration eliminates the
+tilt through row 2 (`docs/method.md`). Equation 29 uses the phase reference itself as reference, so that the stochastic
+excitation drops out at every lag.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.moments import ComplexArray
+from models.errors import EstimationError
+from models.machine import Machine
+from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
+from models.physics.parameters import RotorParameters
+from models.signals.block import FloatArray
+
+__all__ = ["EQUATIONS", "Equation", "EquationRows", "StatisticsView", "SynchronousEquation", "Term"]
+
+_REFERENCES = ("y1", "y2", "z1", "z2")
+_ANGLES = np.arange(16) * (2 * np.pi / 16)
+
+
+@dataclass(frozen=True, slots=True)
+class StatisticsView:
+    """The statistics an equation looks at: of a whole window or of one hop in it.
+
+    Attributes
+    ----------
+    states : tuple of str
+        Measured states, naming rows and columns of the correlations.
+    correlation : ndarray, shape (n_lags, n, n)
+        Stochastic part at the lags that the networks use.
+    synchronous : ndarray of complex, shape (n,) or None
+        Rotation-synchronous vectors.
+    speed_rad_s : float
+        Speed Ω.
+    """
+
+    states: tuple[str, ...]
+    correlation: FloatArray
+    synchronous: ComplexArray | None
+    speed_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class EquationRows:
+    """Training or evaluation rows of one equation: one per lag and reference.
+
+    Attributes
+    ----------
+    inputs : ndarray, shape (n_rows, n_inputs)
+    target : ndarray, shape (n_rows,)
+    signatures : ndarray, shape (n_rows, n_parameters)
+        What a relative change of one of the own parameters adds to the target.
+    """
+
+    inputs: FloatArray
+    target: FloatArray
+    signatures: FloatArray
+
+    @property
+    def norm(self) -> float:
+        """Root mean square of the target: the relation is homogeneous, levels are divided out."""
+        return float(np.sqrt(np.mean(self.target**2)))
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One correlation R_ij(τ), of a reference i with a response j.
+
+    Attributes
+    ----------
+    response : str
+        State j.
+    rate_reference : bool
+        Whether the reference is the rate ẏ instead of the displacement y of the reference channel.
+    times_speed : bool
+        Whether the term stands with Ω (gyroscopic).
+    """
+
+    response: str
+    rate_reference: bool = False
+    times_speed: bool = False
+
+    @property
+    def name(self) -> str:
+        """As in the paper, with i for the reference: ``R[i,y1]``, ``R[i',y1']``."""
+        response = self.response.replace("_dot", "'")
+        factor = "Ω·" if self.times_speed else ""
+        return f"{factor}R[{'i' + chr(39) if self.rate_reference else 'i'},{response}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Equation:
+    """An equation between correlations of the stochastic part (28, 30, 31).
+
+    Attributes
+    ----------
+    number, title : str
+        The paper's number, and what it is about.
+    target : Term
+    inputs : tuple of Term
+    signatures : mapping of str to function
+        Own parameter to the coefficients of the inputs that it scales, a function of the rotor.
+    """
+
+    number: str
+    title: str
+    target: Term
+    inputs: tuple[Term, ...]
+    signatures: Mapping[str, Callable[[RotorParameters], tuple[float, ...]]]
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Own parameters."""
+        return tuple(self.signatures)
+
+    @property
+    def kept_nominal(self) -> tuple[str, ...]:
+        """Parameters that do not vary in its training windows."""
+        return self.parameters
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs in order."""
+        return tuple(term.name for term in self.inputs)
+
+    def missing(self, states: tuple[str, ...], *, phase_reference: bool) -> tuple[str, ...]:
+        """What would have to be measured besides."""
+        del phase_reference  # needed by the synchronous equation only
+        needed = [term.response for term in (self.target, *self.inputs)]
+        needed += [name for reference in _REFERENCES for name in (reference, f"{reference}_dot")]
+        return tuple(dict.fromkeys(name for name in needed if name not in states))
+
+    def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
+        """Rows of one view, SI units."""
+        speed_ratio = view.speed_rad_s / machine.operation.speed_rad_s
+        index = {name: position for position, name in enumerate(view.states)}
+        references = [index[name] for name in _REFERENCES]
+        rates = [index[f"{name}_dot"] for name in _REFERENCES]
+
+        def values(term: Term) -> FloatArray:
+            rows = view.correlation[:, rates if term.rate_reference else references, index[term.response]].ravel()
+            return rows * speed_ratio if term.times_speed else rows
+
+        inputs = np.stack([values(term) for term in self.inputs], axis=1)
+        coefficients = np.array([function(machine.rotor) for function in self.signatures.values()])
+        return EquationRows(inputs, values(self.target), inputs @ coefficients.T)
+
+
+@dataclass(frozen=True, slots=True)
+class SynchronousEquation:
+    """Equation (29) with the phase reference n(t) as reference.
+
+    Rows 2, 3, 5 and 6 give the disc's synchronous vector from the bearing's vectors and e, Y2 = α(Ω) Y1 + β(Ω) jZ1 +
+    γ(Ω) e with real α, β, γ, and the same for jZ2 with Y1 and jZ1 exchanged. Powers of Ω among the inputs let the
+    network follow the coefficients through the speed range. Both planes and all shaft angles Ωτ serve as rows; the
+    bearings' stiffness and damping do not occur.
+
+    The printed equation takes the disc's acceleration as target and its displacement as input. In the synchronous part
+    one is -Ω² times the other, and a network that may use both predicts the target without e: it reads -2 % for -20 %.
+    """
+
+    number: str
+    title: str
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Own parameters."""
+        return ("e",)
+
+    @property
+    def kept_nominal(self) -> tuple[str, ...]:
+        """Parameters that do not vary in its training windows: the shaft stands in this row too (k22, k23)."""
+        return ("e", "EI")
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs in order."""
+        return ("R[n,y1]", "Ω²R[n,y1]", "Ω⁴R[n,y1]", "Ω²R[n,z1]", "Ω²R[n,n]", "Ω⁴R[n,n]", "Ω⁶R[n,n]")
+
+    def missing(self, states: tuple[str, ...], *, phase_reference: bool) -> tuple[str, ...]:
+        """What would have to be measured besides."""
+        absent = [name for name in _REFERENCES if name not in states]
+        return tuple(absent if phase_reference else [*absent, "theta"])
+
+    def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
+        """Rows of one view, SI units.
+
+        Raises
+        ------
+        EstimationError
+            Without a phase reference.
+        """
+        if view.synchronous is None:
+            raise EstimationError(f"{machine.name}: equation 29 without a phase reference")
+        y1, y2, z1, z2 = (complex(view.synchronous[view.states.index(name)]) for name in _REFERENCES)
+        speed2 = (view.speed_rad_s / machine.operation.speed_rad_s) ** 2
+        turn = np.exp(1j * _ANGLES)
+        R_nn = np.real(np.exp(1j * machine.operation.unbalance_phase_rad) * turn) / 2
+
+        def correlation(vector: complex) -> FloatArray:
+            return np.asarray(np.real(vector * turn) / 2, dtype=np.float64)
+
+        e = speed2 * machine.rotor.e_m * R_nn
+        planes = []
+        for own, other, disc in ((y1, 1j * z1, y2), (1j * z1, y1, 1j * z2)):
+            R = correlation(own)
+            columns = (R, speed2 * R, speed2**2 * R, speed2 * correlation(other), e, speed2 * e, speed2**2 * e)
+            planes.append((np.stack(columns, axis=1), correlation(disc)))
+        inputs, target = (np.concatenate(parts) for parts in zip(*planes, strict=True))
+        response = _disc_response_to_e(machine.rotor, view.speed_rad_s)
+        return EquationRows(inputs, target, np.tile(response * R_nn, 2)[:, None])
+
+
+def _disc_response_to_e(rotor: RotorParameters, speed_rad_s: float) -> float:
+    """Change of Y2 with the relative change of e while the bearing's motion is given, m (real by symmetry)."""
+    W = speed_rad_s
+    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
+    disc = [1, 2, 4, 5]
+    H = H_matrix(rotor, W)
+    vector = np.linalg.solve(dynamic[np.ix_(disc, disc)], (H[:, 0] - 1j * H[:, 1])[disc])
+    return float(vector[0].real)
+
+
+def _shaft_over_inertia(rotor: RotorParameters) -> tuple[float, ...]:
+    """Coefficients of y1, y2 and psi in row 3; the gyroscopic input does not scale with the shaft."""
+    L = rotor.shaft_length_m
+    b, c = 6 * rotor.EI_N_m2 / L**2, 4 * rotor.EI_N_m2 / L
+    return (b / rotor.I2_kg_m2, -b / rotor.I2_kg_m2, c / rotor.I2_kg_m2, 0.0)
+
+
+EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
+    Equation(
+        number="28",
+        title="bearing, horizontal",
+        target=Term("y1_dot", rate_reference=True),
+        inputs=(Term("y1"), Term("y2"), Term("y1_dot"), Term("y2_dot", rate_reference=True)),
+        signatures={
+            "k_by": lambda rotor: (rotor.k_by_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0),
+            "c_by": lambda rotor: (0.0, 0.0, rotor.c_by_N_s_per_m / rotor.m1_kg, 0.0),
+        },
+    ),
+    SynchronousEquation(number="29", title="unbalance at the disc"),
+    Equation(
+        number="30",
+        title="disc tilt and shaft",
+        target=Term("psi_dot", rate_reference=True),
+        inputs=(Term("y1"), Term("y2"), Term("psi"), Term("phi_dot", times_speed=True)),
+        signatures={"EI": _shaft_over_inertia},
+    ),
+    Equation(
+        number="31",
+        title="bearing, vertical",
+        target=Term("z1_dot", rate_reference=True),
+        inputs=(Term("z1"), Term("z2"), Term("z1_dot"), Term("z2_dot", rate_reference=True)),
+        signatures={
+            "k_bz": lambda rotor: (rotor.k_bz_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0),
+            "c_bz": lambda rotor: (0.0, 0.0, rotor.c_bz_N_s_per_m / rotor.m1_kg, 0.0),
+        },
+    ),
+)
+"""The equations in the paper's order; adding a row here is all it takes."""

@@ -1,0 +1,212 @@
+"""Moments of one hop of samples: what a window is the sum of.
+
+A window's statistics are sums over its hops, so a sliding window is a ring of hop moments that are added up anew each
+time. Nothing is ever subtracted: a running sum would keep the rounding of everything that went through it.
+
+The rotation-synchronous part and the mean are not removed sample by sample. The regressors n = (1, cos θ, sin θ) ride
+along as further channels, and the window takes out their part by algebra (`models.diagnosis.window`). That is exact for
+any window and needs no second pass over samples.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.machine import Machine
+from models.physics.matrices import STATE_INDEX
+from models.signals.block import FloatArray
+
+__all__ = ["ComplexArray", "HopMoments", "Plan", "hop_moments", "plan_for"]
+
+ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Sizes and columns derived once from a machine file.
+
+    Attributes
+    ----------
+    rate_hz : float
+        Sampling rate.
+    states : tuple of str
+        Measured state variables (``y1`` … ``phi_dot``) in the order of the statistics' columns.
+    columns : ndarray of int
+        Column of the stream for each of `states`.
+    scales : ndarray
+        Factor to SI for each of `states`.
+    angle_column : int or None
+        Column of the shaft angle; without it the regressors are only the mean.
+    hop, preamble, segment : int
+        Samples per hop, samples of history a hop needs before it, samples per spectral segment.
+    lags : ndarray of int
+        Lags of the correlation functions, samples.
+    bins : ndarray of int
+        Frequency bins of a segment's Fourier transform that are kept.
+    hops : int
+        Hops in a full window.
+    max_span_ns : int
+        Oldest data a window may hold.
+    """
+
+    rate_hz: float
+    states: tuple[str, ...]
+    columns: npt.NDArray[np.intp]
+    scales: FloatArray
+    angle_column: int | None
+    hop: int
+    preamble: int
+    segment: int
+    lags: npt.NDArray[np.intp]
+    bins: npt.NDArray[np.intp]
+    hops: int
+    max_span_ns: int
+
+    @property
+    def lags_s(self) -> FloatArray:
+        """Lags in seconds."""
+        return np.asarray(self.lags / self.rate_hz, dtype=np.float64)
+
+    @property
+    def frequencies_hz(self) -> FloatArray:
+        """Frequencies of the kept bins."""
+        return np.asarray(self.bins * (self.rate_hz / self.segment), dtype=np.float64)
+
+    def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
+        """Measured states in SI units and, last, the shaft angle if there is one; shape (n_samples, n)."""
+        states = samples[:, self.columns].astype(np.float64) * self.scales
+        if self.angle_column is None:
+            return states
+        return np.column_stack([states, samples[:, self.angle_column].astype(np.float64)])
+
+
+def plan_for(machine: Machine) -> Plan:
+    """Derive the plan of a machine."""
+    window, rate_hz = machine.window, machine.rate_hz
+    order = {name: column for column, name in enumerate(machine.descriptor.states)}
+    states = tuple(name for name in STATE_INDEX if name in order)
+    columns = np.array([order[name] for name in states], dtype=np.intp)
+    segment = round(window.segment_s * rate_hz)
+    lag_step = round(window.lag_step_s * rate_hz)
+    lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
+    first, last = (round(edge * window.segment_s) for edge in window.band_hz)
+    return Plan(
+        rate_hz=rate_hz,
+        states=states,
+        columns=columns,
+        scales=np.array([machine.sensors[column].to_si for column in columns]),
+        angle_column=order.get("theta"),
+        hop=round(window.hop_s * rate_hz),
+        preamble=max(int(lags[-1]), segment // 2),
+        segment=segment,
+        lags=lags,
+        bins=np.arange(first, last + 1),
+        hops=window.hops,
+        max_span_ns=round(window.max_span_s * 1e9),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class HopMoments:
+    """Sums over one hop, of the measured states x followed by the regressors n.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Time of the first sample and of the one after the last.
+    products : ndarray, shape (n_lags, n, n)
+        ``products[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the t of the hop, a = (x, n).
+    segments : ndarray, shape (n_segments, n_bins, n)
+        Fourier coefficients of Hann-windowed segments, scaled so that their squared magnitude estimates the two-sided
+        power spectral density per Hz.
+    turned_rad : float
+        Shaft angle covered in the hop (nan without a phase reference).
+    """
+
+    start_ns: int
+    end_ns: int
+    products: FloatArray
+    segments: ComplexArray
+    turned_rad: float
+
+
+def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: int) -> HopMoments:
+    """Compute the moments of one hop.
+
+    Parameters
+    ----------
+    plan : Plan
+        Sizes.
+    samples : ndarray, shape (preamble + hop, n_states [+ 1])
+        SI samples as `Plan.to_si` gives them, without a gap; the first `preamble` rows are history.
+    level : ndarray, shape (n_states,)
+        Fixed level subtracted before anything is summed. A proximity probe's gap voltage may be a million times its
+        fluctuation; squared, it would swallow every digit.
+    start_ns : int
+        Time of the first sample of the hop itself.
+    """
+    n_states = len(plan.states)
+    x = samples[:, :n_states] - level
+    turned_rad = np.nan
+    ones = np.ones((samples.shape[0], 1))
+    if plan.angle_column is None:
+        a = np.hstack([x, ones])
+    else:
+        theta = samples[:, n_states]
+        a = np.hstack([x, ones, np.cos(theta)[:, None], np.sin(theta)[:, None]])
+        steps = np.diff(theta[plan.preamble - 1 :])
+        turned_rad = float(np.sum((steps + np.pi) % (2 * np.pi) - np.pi))
+    return HopMoments(
+        start_ns=start_ns,
+        end_ns=start_ns + round(plan.hop * 1e9 / plan.rate_hz),
+        products=_lagged_products(a, plan),
+        segments=_segment_spectra(a, plan),
+        turned_rad=turned_rad,
+    )
+
+
+def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
+    """Sums of products at all lags through zero-padded Fourier transforms: history as reference, hop as response."""
+    longest = int(plan.lags[-1])
+    reference = a[plan.preamble - longest :]
+    response = a[plan.preamble :]
+    size = _fast_length(reference.shape[0])
+    spectrum_reference = np.fft.rfft(reference, size, axis=0)
+    spectrum_response = np.fft.rfft(np.vstack([np.zeros((longest, a.shape[1])), response]), size, axis=0)
+    products = np.empty((plan.lags.size, a.shape[1], a.shape[1]))
+    for i in range(a.shape[1]):
+        cross = np.fft.irfft(spectrum_reference[:, i, None].conj() * spectrum_response, size, axis=0)
+        products[:, i, :] = cross[plan.lags]
+    return products
+
+
+def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:
+    """Fourier coefficients of the half-overlapping segments that end within the hop."""
+    half = plan.segment // 2
+    taper = np.hanning(plan.segment + 1)[:-1]
+    scale = 1 / np.sqrt(plan.rate_hz * np.sum(taper**2))
+    count = plan.hop // half
+    first = plan.preamble + half - plan.segment
+    spectra = np.empty((count, plan.bins.size, a.shape[1]), dtype=np.complex128)
+    for number in range(count):
+        start = first + number * half
+        piece = a[start : start + plan.segment] * taper[:, None]
+        spectra[number] = np.fft.rfft(piece, axis=0)[plan.bins] * scale
+    return spectra
+
+
+def _fast_length(n: int) -> int:
+    """Smallest 2^a 3^b 5^c ≥ n."""
+    best = 1 << (n - 1).bit_length()
+    five = 1
+    while five < best:
+        three = five
+        while three < best:
+            two = three
+            while two < n:
+                two *= 2
+            best = min(best, two)
+            three *= 3
+        five *= 5
+    return best

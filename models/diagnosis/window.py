@@ -1,0 +1,193 @@
+"""The sliding window: a ring of hop moments, and the statistics of the window they make."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.moments import ComplexArray, HopMoments, Plan, hop_moments
+from models.signals.block import FloatArray
+
+__all__ = ["SlidingWindow", "WindowStatistics", "window_statistics"]
+
+
+@dataclass(frozen=True, slots=True)
+class WindowStatistics:
+    """Everything the diagnosis looks at, for one window.
+
+    Attributes
+    ----------
+    states : tuple of str
+        State variables of all rows and columns below.
+    start_ns, end_ns : int
+        Oldest and newest data in the window.
+    n_samples, n_segments : int
+        How much data it holds.
+    lags_s : ndarray, shape (n_lags,)
+        Lags of the correlation functions, s.
+    correlation : ndarray, shape (n_lags, n, n)
+        ``correlation[l, i, j]`` estimates R_ij(τ_l) = E{x_i(t) x_j(t+τ_l)} of the part that is neither mean nor
+        rotation-synchronous (Eq. 18), SI units.
+    hop_correlation : ndarray, shape (n_hops, n_lags, n, n)
+        The same of every hop alone (with the window's mean and synchronous part taken out): their scatter gives
+        standard errors.
+    spectrum : ndarray, shape (n_bins, n, n)
+        Hermitian cross-spectral matrices of the same part, two-sided, SI²/Hz.
+    frequencies_hz : ndarray, shape (n_bins,)
+        Their frequencies.
+    synchronous : ndarray of complex, shape (n,) or None
+        q of x_n = Re{q e^{jθ}} over the window; None without a phase reference.
+    hop_synchronous : ndarray of complex, shape (n_hops, n) or None
+        The same of every hop alone.
+    speed_rad_s : float
+        Mean speed (nan without a phase reference).
+    duration_s : float
+        Length of the data in the window.
+    """
+
+    states: tuple[str, ...]
+    start_ns: int
+    end_ns: int
+    n_samples: int
+    n_segments: int
+    lags_s: FloatArray
+    correlation: FloatArray
+    hop_correlation: FloatArray
+    spectrum: ComplexArray
+    frequencies_hz: FloatArray
+    synchronous: ComplexArray | None
+    hop_synchronous: ComplexArray | None
+    speed_rad_s: float
+    duration_s: float
+
+
+def window_statistics(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowStatistics:
+    """Add hops up to a window and take out its mean and its rotation-synchronous part.
+
+    With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
+    (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
+    """
+    n = len(plan.states)
+    products = np.stack([hop.products for hop in hops])
+    total = products[0].copy()
+    for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
+        total += hop
+    beta = _regression(total[0], n)
+    remove = np.hstack([np.eye(n), -beta])
+    hop_correlation = (remove @ products @ remove.T) / plan.hop
+    segments = np.concatenate([hop.segments for hop in hops])
+    rest = np.ascontiguousarray((segments @ remove.T).transpose(1, 2, 0))
+    spectrum = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
+    duration_s = len(hops) * plan.hop / plan.rate_hz
+    synchronous = hop_synchronous = None
+    if plan.angle_column is not None:
+        synchronous = _synchronous(beta)
+        hop_synchronous = np.stack([_synchronous(_regression(product[0], n)) for product in products])
+    return WindowStatistics(
+        states=plan.states,
+        start_ns=hops[0].start_ns,
+        end_ns=hops[-1].end_ns,
+        n_samples=len(hops) * plan.hop,
+        n_segments=segments.shape[0],
+        lags_s=plan.lags_s,
+        correlation=(remove @ total @ remove.T) / (len(hops) * plan.hop),
+        hop_correlation=hop_correlation,
+        spectrum=spectrum,
+        frequencies_hz=plan.frequencies_hz,
+        synchronous=synchronous,
+        hop_synchronous=hop_synchronous,
+        speed_rad_s=sum(hop.turned_rad for hop in hops) / duration_s,
+        duration_s=duration_s,
+    )
+
+
+def _regression(zero_lag: FloatArray, n: int) -> FloatArray:
+    """β of x on the regressors, shape (n, n_regressors)."""
+    return np.asarray(np.linalg.solve(zero_lag[n:, n:], zero_lag[n:, :n]).T, dtype=np.float64)
+
+
+def _synchronous(beta: FloatArray) -> ComplexArray:
+    return np.asarray(beta[:, 1] - 1j * beta[:, 2], dtype=np.complex128)
+
+
+class SlidingWindow:
+    """Cuts a stream into hops and keeps the latest ones.
+
+    The same samples give the same hops, whatever blocks they come in. A gap costs the hop it falls into; earlier hops
+    stay until the window's allowed span has passed.
+
+    Parameters
+    ----------
+    plan : Plan
+        Sizes.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
+        self._pending: list[FloatArray] = []
+        self._pending_samples = 0
+        self._pending_start_ns = 0
+        self._level: FloatArray | None = None
+
+    @property
+    def filled(self) -> float:
+        """Fraction of a full window that is there."""
+        return len(self._hops) / self.plan.hops
+
+    def feed(self, samples: FloatArray, start_ns: int) -> Iterator[int]:
+        """Add samples that continue the previous ones, stopping at every completed hop.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_states [+ 1])
+            Finite SI samples as `Plan.to_si` gives them.
+        start_ns : int
+            Time of the first sample.
+
+        Yields
+        ------
+        int
+            End time of a hop that became complete and is in the window now. A long block may complete several: ask for
+            the statistics between them, and take all, or the rest of the block is lost.
+        """
+        if not self._pending:
+            self._pending_start_ns = start_ns
+        self._pending.append(samples)
+        self._pending_samples += samples.shape[0]
+        need = self.plan.preamble + self.plan.hop
+        while self._pending_samples >= need:
+            buffer = np.concatenate(self._pending)
+            end_ns = self._complete(buffer[:need])
+            rest = buffer[self.plan.hop :]
+            self._pending = [rest]
+            self._pending_samples = rest.shape[0]
+            self._pending_start_ns += round(self.plan.hop * 1e9 / self.plan.rate_hz)
+            yield end_ns
+
+    def _complete(self, samples: FloatArray) -> int:
+        if self._level is None:
+            self._level = samples[:, : len(self.plan.states)].mean(axis=0)
+        start_ns = self._pending_start_ns + round(self.plan.preamble * 1e9 / self.plan.rate_hz)
+        hop = hop_moments(self.plan, samples, self._level, start_ns)
+        while self._hops and hop.end_ns - self._hops[0].start_ns > self.plan.max_span_ns:
+            self._hops.popleft()
+        self._hops.append(hop)
+        return hop.end_ns
+
+    def gap(self) -> None:
+        """Forget the unfinished hop: what comes next does not continue it."""
+        self._pending = []
+        self._pending_samples = 0
+
+    def clear(self) -> None:
+        """Forget everything but the reference level."""
+        self.gap()
+        self._hops.clear()
+
+    def statistics(self) -> WindowStatistics | None:
+        """Statistics of the window, or None while it is not full."""
+        if len(self._hops) < self.plan.hops:
+            return None
+        return window_statistics(self.plan, tuple(self._hops))

@@ -1,0 +1,283 @@
+"""The machine file: everything the programs know about one machine, in one checked TOML file.
+
+Every field carries its unit in its name; unknown keys are refused. ``docs/machine-file.md`` explains each field.
+"""
+
+import hashlib
+import json
+import math
+import tomllib
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from models.errors import MachineFileError
+from models.physics.parameters import PARAMETERS, RotorParameters
+from models.signals.channels import Channel, ChannelDescriptor
+from models.signals.keys import MachineKeys
+
+__all__ = [
+    "AlarmSettings",
+    "ConditionRange",
+    "IngestSettings",
+    "Machine",
+    "WindowSettings",
+    "load_machine",
+    "read_toml",
+    "validation_text",
+]
+
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+_SHIPPED = Path(__file__).parent / "machines"
+
+
+def _whole(value: float) -> bool:
+    return abs(value - round(value)) < 1e-9 * max(1.0, abs(value))
+
+
+class Operation(BaseModel):
+    """How the machine runs."""
+
+    model_config = _STRICT
+
+    speed_rpm: float = Field(gt=0, le=1e6, description="nominal speed")
+    speed_tolerance: float = Field(default=0.25, ge=0, lt=1, description="relative speed range that is evaluated")
+    unbalance_phase_rad: float = Field(
+        default=0.0, ge=-math.pi, le=math.pi, description="angle of the heavy spot from the phase reference"
+    )
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Nominal speed Ω, rad/s."""
+        return self.speed_rpm * 2 * math.pi / 60
+
+
+class ConditionRange(BaseModel):
+    """Operating conditions the networks are trained for and the monitor vouches for."""
+
+    model_config = _STRICT
+
+    cutoff_hz: tuple[float, float] = Field(description="cutoff frequency of the excitation, from and to")
+    stochastic_to_1x: tuple[float, float] = Field(
+        default=(0.5, 4.0),
+        description="stochastic displacement at the disc over its 1x amplitude, both rms, from and to",
+    )
+    noise_relative: tuple[float, float] = Field(
+        default=(0.01, 0.05), description="sensor noise over the channel's own rms, from and to"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for field in ("cutoff_hz", "stochastic_to_1x", "noise_relative"):
+            low, high = getattr(self, field)
+            if not 0 <= low <= high:
+                raise ValueError(f"{field} is ({low}, {high}), expected 0 ≤ from ≤ to")
+        return self
+
+
+class WindowSettings(BaseModel):
+    """The sliding window: its length, how often it is evaluated, and what is computed in it."""
+
+    model_config = _STRICT
+
+    length_s: float = Field(default=60.0, gt=0, le=3600, description="window length")
+    hop_s: float = Field(default=5.0, gt=0, le=600, description="one report per hop; also the sub-block of the errors")
+    max_span_s: float = Field(default=90.0, gt=0, le=7200, description="oldest sample a window may hold, across gaps")
+    lag_from_s: float = Field(default=0.01, ge=0, le=10, description="shortest lag of the relation networks")
+    lag_to_s: float = Field(default=0.125, gt=0, le=10, description="longest lag of the correlation functions")
+    lag_step_s: float = Field(default=0.001, gt=0, le=1, description="lag spacing of the relation networks")
+    segment_s: float = Field(default=2.0, gt=0, le=120, description="segment of the cross-spectra, half overlapped")
+    band_hz: tuple[float, float] = Field(default=(3.0, 150.0), description="band of the likelihood, from and to")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if not _whole(self.length_s / self.hop_s) or self.length_s < 4 * self.hop_s:
+            raise ValueError(f"length_s {self.length_s} must be a multiple of hop_s {self.hop_s}, at least four hops")
+        if not _whole(2 * self.hop_s / self.segment_s):
+            raise ValueError(f"hop_s {self.hop_s} must be a multiple of half of segment_s {self.segment_s}")
+        if self.lag_to_s >= self.hop_s:
+            raise ValueError(f"lag_to_s {self.lag_to_s} must be below hop_s {self.hop_s}")
+        if self.lag_from_s >= self.lag_to_s:
+            raise ValueError(f"lag_from_s {self.lag_from_s} must be below lag_to_s {self.lag_to_s}")
+        if not 0 < self.band_hz[0] < self.band_hz[1]:
+            raise ValueError(f"band_hz {self.band_hz} must be 0 < from < to")
+        if self.max_span_s < self.length_s:
+            raise ValueError(f"max_span_s {self.max_span_s} must not be below length_s {self.length_s}")
+        return self
+
+    @property
+    def hops(self) -> int:
+        """Hops in a full window."""
+        return round(self.length_s / self.hop_s)
+
+
+class IngestSettings(BaseModel):
+    """When a block is refused, and when silence is called missing data."""
+
+    model_config = _STRICT
+
+    block_from_s: float = Field(default=0.001, gt=0, le=1, description="shortest accepted block")
+    block_to_s: float = Field(default=2.0, gt=0, le=60, description="longest accepted block")
+    time_tolerance_s: float = Field(default=0.0005, gt=0, le=1, description="jitter of block times that is no gap")
+    rate_tolerance: float = Field(default=1e-4, ge=0, lt=0.1, description="relative deviation of the sampling rate")
+    max_jump_s: float = Field(default=3600.0, gt=0, description="a block further ahead than this is refused as future")
+    resync_blocks: int = Field(default=10, ge=2, le=1000, description="blocks in a row that establish a stepped clock")
+    no_data_after_s: float = Field(default=5.0, gt=0, le=3600, description="silence that is called no data")
+
+
+class AlarmLimits(BaseModel):
+    """Limits of one parameter's relative change."""
+
+    model_config = _STRICT
+
+    raise_above: float = Field(default=0.10, gt=0, lt=1, description="alert when the change is larger, either sign")
+    clear_below: float = Field(default=0.06, gt=0, lt=1, description="back to normal when smaller")
+    danger_above: float = Field(default=0.40, gt=0, description="danger when larger")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.clear_below < self.raise_above < self.danger_above:
+            raise ValueError(
+                f"expected clear_below < raise_above < danger_above, got {self.clear_below}, {self.raise_above}, "
+                f"{self.danger_above}"
+            )
+        return self
+
+
+class AlarmSettings(BaseModel):
+    """When a parameter change becomes an alarm; all times are data time."""
+
+    model_config = _STRICT
+
+    limits: AlarmLimits = AlarmLimits()
+    parameters: dict[str, AlarmLimits] = Field(default={}, description="limits of single parameters instead")
+    raise_z: float = Field(default=5.0, ge=2, le=20, description="the change must exceed this many standard errors")
+    clear_z: float = Field(default=3.0, ge=1, le=20, description="and counts as gone below this many")
+    on_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must last before the alarm")
+    off_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must be gone before it clears")
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        unknown = sorted(set(self.parameters) - set(PARAMETERS))
+        if unknown:
+            raise ValueError(f"parameters {unknown} are not among {', '.join(PARAMETERS)}")
+        if self.clear_z > self.raise_z:
+            raise ValueError(f"clear_z {self.clear_z} must not be above raise_z {self.raise_z}")
+        return self
+
+    def for_parameter(self, name: str) -> AlarmLimits:
+        """Limits of one parameter."""
+        return self.parameters.get(name, self.limits)
+
+
+class Machine(BaseModel):
+    """One machine: identity, physics, sensors, operation, window, ingest and alarms."""
+
+    model_config = _STRICT
+
+    site: str
+    name: str
+    description: str = ""
+    rotor: RotorParameters
+    operation: Operation
+    condition: ConditionRange
+    rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
+    dtype: str = Field(default="float32", pattern="^float(32|64)$")
+    sensors: tuple[Channel, ...] = Field(min_length=1)
+    window: WindowSettings = WindowSettings()
+    ingest: IngestSettings = IngestSettings()
+    alarms: AlarmSettings = AlarmSettings()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        try:
+            MachineKeys(self.site, self.name)
+        except MachineFileError as error:
+            raise ValueError(str(error)) from error
+        for field in ("length_s", "hop_s", "segment_s", "lag_step_s"):
+            samples = getattr(self.window, field) * self.rate_hz
+            if not _whole(samples):
+                raise ValueError(
+                    f"window.{field} is {samples:.6g} samples at {self.rate_hz} Hz, expected a whole number"
+                )
+        if self.window.band_hz[1] >= self.rate_hz / 2:
+            raise ValueError(
+                f"window.band_hz ends at {self.window.band_hz[1]} Hz, above half of rate_hz {self.rate_hz}"
+            )
+        _ = self.descriptor  # refuses double channels
+        return self
+
+    @property
+    def keys(self) -> MachineKeys:
+        """The machine's Zenoh keys."""
+        return MachineKeys(self.site, self.name)
+
+    @property
+    def descriptor(self) -> ChannelDescriptor:
+        """What the machine's stream must look like."""
+        return ChannelDescriptor.model_validate(
+            {
+                "site": self.site,
+                "machine": self.name,
+                "rate_hz": self.rate_hz,
+                "dtype": self.dtype,
+                "channels": self.sensors,
+            }
+        )
+
+    @property
+    def physics_hash(self) -> str:
+        """Twelve hexadecimal digits that change with the rotor, its operation or condition range, rate or window."""
+        fields = {"rotor", "operation", "condition", "rate_hz", "window"}
+        text = json.dumps(self.model_dump(mode="json", include=fields), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def load_machine(name_or_path: str | Path) -> Machine:
+    """Load a machine file by path, or a shipped one by its name.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        "lab" or "heavy" (shipped), or the path of a TOML file.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
+    """
+    path = Path(name_or_path)
+    if path.suffix != ".toml" and (_SHIPPED / f"{name_or_path}.toml").is_file():
+        path = _SHIPPED / f"{name_or_path}.toml"
+    try:
+        return Machine.model_validate(read_toml(path))
+    except ValidationError as error:
+        raise MachineFileError(validation_text(path, error)) from error
+
+
+def read_toml(path: Path) -> dict[str, object]:
+    """Read a TOML file.
+
+    Raises
+    ------
+    MachineFileError
+        If it cannot be read or is not TOML; the message names the file and, where known, the line.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        shipped = ", ".join(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
+        raise MachineFileError(f"{path}: cannot be read ({error.strerror}); shipped machines: {shipped}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise MachineFileError(f"{path}: not a TOML file: {error}") from error
+
+
+def validation_text(path: Path, error: ValidationError) -> str:
+    """One line per fault: file, field, what is wrong, and the value found."""
+    lines = []
+    for fault in error.errors():
+        field = ".".join(str(part) for part in fault["loc"]) or "file"
+        found = "" if fault["type"] == "missing" or isinstance(fault["input"], dict) else f" (found {fault['input']!r})"
+        lines.append(f"{path}: {field}: {fault['msg']}{found}")
+    return "\n".join(lines)

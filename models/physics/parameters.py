@@ -1,0 +1,96 @@
+"""Physical parameters of the six-degree-of-freedom rotor and their relative changes."""
+
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+
+from pydantic import BaseModel, ConfigDict, Field
+
+__all__ = ["FAULT_FIELDS", "PARAMETERS", "PARAMETER_TEXT", "RotorParameters", "changed"]
+
+
+class RotorParameters(BaseModel):
+    """Bearing mass on springs and dampers, flexible shaft, overhung disc (paper §2.1, Fig. 2).
+
+    The shaft between bearing and disc is a cantilever that keeps its slope at the bearing. The paper's own values
+    (Table 1) are lost; nothing here depends on a particular number.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    m1_kg: float = Field(gt=0, le=1e5, description="bearing mass")
+    m2_kg: float = Field(gt=0, le=1e5, description="disc mass")
+    I2_kg_m2: float = Field(gt=0, le=1e5, description="disc moment of inertia about a diameter")
+    I2p_kg_m2: float = Field(ge=0, le=1e5, description="disc polar moment of inertia")
+    shaft_length_m: float = Field(gt=0, le=50, description="bearing to disc")
+    shaft_diameter_m: float = Field(gt=0, le=5, description="solid round shaft")
+    shaft_E_Pa: float = Field(gt=0, le=1e12, description="Young's modulus of the shaft")
+    k_by_N_per_m: float = Field(gt=0, le=1e12, description="bearing stiffness, horizontal")
+    k_bz_N_per_m: float = Field(gt=0, le=1e12, description="bearing stiffness, vertical")
+    c_by_N_s_per_m: float = Field(gt=0, le=1e9, description="bearing damping, horizontal")
+    c_bz_N_s_per_m: float = Field(gt=0, le=1e9, description="bearing damping, vertical")
+    e_m: float = Field(ge=0, le=0.1, description="eccentricity of the disc's centre of mass")
+
+    @property
+    def EI_N_m2(self) -> float:
+        """Bending stiffness of the shaft, N m²."""
+        return self.shaft_E_Pa * math.pi * self.shaft_diameter_m**4 / 64
+
+
+FAULT_FIELDS: Mapping[str, str] = MappingProxyType(
+    {
+        "k_by": "k_by_N_per_m",
+        "c_by": "c_by_N_s_per_m",
+        "k_bz": "k_bz_N_per_m",
+        "c_bz": "c_bz_N_s_per_m",
+        "e": "e_m",
+        "EI": "shaft_E_Pa",
+    }
+)
+"""Parameters a fault can change, and the field that carries them (EI through Young's modulus)."""
+
+PARAMETERS: tuple[str, ...] = tuple(FAULT_FIELDS)
+"""The diagnosed parameters, in the order in which they are always reported."""
+
+PARAMETER_TEXT: Mapping[str, str] = MappingProxyType(
+    {
+        "k_by": "bearing stiffness, horizontal",
+        "c_by": "bearing damping, horizontal",
+        "k_bz": "bearing stiffness, vertical",
+        "c_bz": "bearing damping, vertical",
+        "e": "unbalance (eccentricity)",
+        "EI": "shaft bending stiffness",
+    }
+)
+"""Each parameter in a vibration engineer's words."""
+
+
+def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> RotorParameters:
+    """Return the rotor with some parameters changed by a relative amount.
+
+    Parameters
+    ----------
+    rotor : RotorParameters
+        Parameters before the change.
+    relative_changes : mapping of str to float
+        Parameter (one of `PARAMETERS`) to relative change, above -1; -0.2 is a loss of 20 %.
+
+    Raises
+    ------
+    ValueError
+        For an unknown parameter or a change of -100 % and more.
+
+    Examples
+    --------
+    >>> from models.machine import load_machine
+    >>> round(changed(load_machine("lab").rotor, {"k_by": -0.2}).k_by_N_per_m)
+    40000
+    """
+    update: dict[str, float] = {}
+    for name, change in relative_changes.items():
+        if name not in FAULT_FIELDS:
+            raise ValueError(f"parameter {name!r} is not one of {', '.join(PARAMETERS)}")
+        if not change > -1:
+            raise ValueError(f"relative change of {name} is {change}, expected above -1")
+        update[FAULT_FIELDS[name]] = getattr(rotor, FAULT_FIELDS[name]) * (1 + change)
+    return rotor.model_copy(update=update)

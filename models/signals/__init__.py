@@ -1,0 +1,1 @@
+"""Sample blocks, channels, key names, wire format and recordings."""

@@ -1,0 +1,133 @@
+"""What a stream's columns are: channels, their units, and the descriptor that travels beside the blocks."""
+
+import hashlib
+import json
+from enum import StrEnum
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+__all__ = ["UNIT_TO_SI", "Channel", "ChannelDescriptor", "Quantity", "state_name"]
+
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+
+
+class Quantity(StrEnum):
+    """Physical quantity of a channel."""
+
+    DISPLACEMENT = "displacement"
+    VELOCITY = "velocity"
+    TILT = "tilt"
+    TILT_RATE = "tilt_rate"
+    SHAFT_ANGLE = "shaft_angle"
+
+
+UNIT_TO_SI: dict[Quantity, dict[str, float]] = {
+    Quantity.DISPLACEMENT: {"m": 1.0, "mm": 1e-3, "um": 1e-6, "mil": 25.4e-6},
+    Quantity.VELOCITY: {"m/s": 1.0, "mm/s": 1e-3, "in/s": 25.4e-3},
+    Quantity.TILT: {"rad": 1.0, "mrad": 1e-3},
+    Quantity.TILT_RATE: {"rad/s": 1.0, "mrad/s": 1e-3},
+    Quantity.SHAFT_ANGLE: {"rad": 1.0},
+}
+"""Accepted units of each quantity and the factor that turns them into SI."""
+
+_STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
+    (Quantity.DISPLACEMENT, "bearing", "y"): "y1",
+    (Quantity.DISPLACEMENT, "disc", "y"): "y2",
+    (Quantity.TILT, "disc", "y"): "psi",
+    (Quantity.DISPLACEMENT, "bearing", "z"): "z1",
+    (Quantity.DISPLACEMENT, "disc", "z"): "z2",
+    (Quantity.TILT, "disc", "z"): "phi",
+    (Quantity.VELOCITY, "bearing", "y"): "y1_dot",
+    (Quantity.VELOCITY, "disc", "y"): "y2_dot",
+    (Quantity.TILT_RATE, "disc", "y"): "psi_dot",
+    (Quantity.VELOCITY, "bearing", "z"): "z1_dot",
+    (Quantity.VELOCITY, "disc", "z"): "z2_dot",
+    (Quantity.TILT_RATE, "disc", "z"): "phi_dot",
+    (Quantity.SHAFT_ANGLE, "shaft", "rotation"): "theta",
+}
+
+
+class Channel(BaseModel):
+    """One column of a stream.
+
+    Attributes
+    ----------
+    name : str
+        Free name, unique in the stream ("XE-101").
+    quantity, location, direction
+        What is measured, where, and in which plane; tilt in plane y is the paper's psi, in plane z its phi.
+    unit : str
+        One of `UNIT_TO_SI` for the quantity.
+    """
+
+    model_config = _STRICT
+
+    name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.:-]+$", description="unique channel name")
+    quantity: Quantity
+    location: Literal["bearing", "disc", "shaft"]
+    direction: Literal["y", "z", "rotation"]
+    unit: str
+
+    @model_validator(mode="after")
+    def _known_unit_and_place(self) -> Self:
+        units = UNIT_TO_SI[self.quantity]
+        if self.unit not in units:
+            raise ValueError(
+                f"channel {self.name}: unit {self.unit!r} is not one of {sorted(units)} for {self.quantity}"
+            )
+        if (self.quantity, self.location, self.direction) not in _STATE_NAMES:
+            raise ValueError(
+                f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
+                "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z"
+            )
+        return self
+
+    @property
+    def to_si(self) -> float:
+        """Factor that turns samples into SI units."""
+        return UNIT_TO_SI[self.quantity][self.unit]
+
+
+def state_name(channel: Channel) -> str:
+    """Name of the state variable that a channel measures (``y1`` … ``phi_dot``, ``theta``).
+
+    Examples
+    --------
+    >>> state_name(Channel(name="XE-1", quantity="velocity", location="bearing", direction="y", unit="mm/s"))
+    'y1_dot'
+    """
+    return _STATE_NAMES[channel.quantity, channel.location, channel.direction]
+
+
+class ChannelDescriptor(BaseModel):
+    """Columns, rate and number format of one machine's stream, as served on the ``descriptor`` key."""
+
+    model_config = _STRICT
+
+    site: str
+    machine: str
+    rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
+    dtype: Literal["float32", "float64"]
+    channels: tuple[Channel, ...] = Field(min_length=1, max_length=64)
+
+    @model_validator(mode="after")
+    def _unique(self) -> Self:
+        names = [channel.name for channel in self.channels]
+        states = [state_name(channel) for channel in self.channels]
+        for what, values in (("name", names), ("measured quantity", states)):
+            twice = sorted({value for value in values if values.count(value) > 1})
+            if twice:
+                raise ValueError(f"channel {what} occurs twice: {', '.join(twice)}")
+        return self
+
+    @property
+    def schema_hash(self) -> str:
+        """Twelve hexadecimal digits that change whenever columns, units, rate or number format change."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """State variable measured by each column, in column order."""
+        return tuple(state_name(channel) for channel in self.channels)

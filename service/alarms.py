@@ -1,0 +1,194 @@
+"""Alarms on parameter changes: a pure state machine per parameter, time as an argument.
+
+::
+
+            beyond the limit              for on_delay
+    NORMAL ------------------> PENDING ------------------> ACTIVE <-----------.
+      ^                          |                            | small again   | beyond again
+      |        small again       |                            v               |
+      '--------------------------'          for off_delay  CLEARING ----------'
+      '------------------------------------------------------'
+
+A window that could not be evaluated changes nothing: missing data neither raises nor clears.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from models.machine import AlarmSettings
+from models.physics.parameters import PARAMETER_TEXT
+
+__all__ = ["Alarm", "AlarmBook", "AlarmEvent", "AlarmState", "Severity"]
+
+
+class AlarmState(StrEnum):
+    """Where an alarm is."""
+
+    NORMAL = "normal"
+    PENDING = "pending"
+    ACTIVE = "active"
+    CLEARING = "clearing"
+
+
+class Severity(StrEnum):
+    """How serious a raised alarm is."""
+
+    ALERT = "alert"
+    DANGER = "danger"
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """Alarm of one parameter.
+
+    Attributes
+    ----------
+    parameter : str
+        Which parameter.
+    state : AlarmState
+        Where it is.
+    severity : Severity
+        Of the present or last occurrence; it rises with the change and falls only by clearing.
+    since_ns : int
+        Data time at which `state` was entered.
+    raised_ns : int or None
+        Data time at which the present occurrence became active.
+    occurrence : int
+        Counts the times it became active.
+    change, standard_error : float
+        Latest relative change and its standard error.
+    """
+
+    parameter: str
+    state: AlarmState = AlarmState.NORMAL
+    severity: Severity = Severity.ALERT
+    since_ns: int = 0
+    raised_ns: int | None = None
+    occurrence: int = 0
+    change: float = 0.0
+    standard_error: float = float("inf")
+
+    @property
+    def raised(self) -> bool:
+        """Whether operators see it: active, or active and about to clear."""
+        return self.state in {AlarmState.ACTIVE, AlarmState.CLEARING}
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmEvent:
+    """One change operators hear of: ``raised``, ``escalated`` (alert to danger) or ``cleared``."""
+
+    kind: str
+    time_ns: int
+    sequence: int
+    alarm: Alarm
+
+    @property
+    def text(self) -> str:
+        """The event in a sentence."""
+        alarm = self.alarm
+        what = f"{PARAMETER_TEXT[alarm.parameter]} ({alarm.parameter})"
+        size = f"{alarm.change:+.1%} ± {1.96 * alarm.standard_error:.1%}"
+        match self.kind:
+            case "raised":
+                return f"{alarm.severity.upper()}: {what} changed by {size}"
+            case "escalated":
+                return f"{alarm.severity.upper()}: {what} changed further, now {size}"
+            case _:
+                return f"cleared: {what} is back within its limits at {size}"
+
+
+class AlarmBook:
+    """The alarms of one machine.
+
+    Parameters
+    ----------
+    settings : AlarmSettings
+        Limits and delays.
+    """
+
+    def __init__(self, settings: AlarmSettings) -> None:
+        self._settings = settings
+        self._alarms: dict[str, Alarm] = {}
+        self._sequence = 0
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Every alarm seen so far, normal ones included."""
+        return tuple(self._alarms.values())
+
+    @property
+    def severity(self) -> Severity | None:
+        """Highest severity of the raised alarms."""
+        raised = [alarm.severity for alarm in self._alarms.values() if alarm.raised]
+        if not raised:
+            return None
+        return Severity.DANGER if Severity.DANGER in raised else Severity.ALERT
+
+    def clock_stepped(self, time_ns: int) -> None:
+        """Restart all running delays: the data's clock was set, so they cannot be measured across it."""
+        for name, alarm in self._alarms.items():
+            self._alarms[name] = replace(alarm, since_ns=time_ns)
+
+    def update(self, parameter: str, change: float, standard_error: float, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Judge one evaluated parameter of one window.
+
+        Parameters
+        ----------
+        parameter : str
+            Which one.
+        change, standard_error : float
+            Relative change and standard error.
+        time_ns : int
+            Data time of the end of the window.
+
+        Returns
+        -------
+        tuple of AlarmEvent
+            None, or what operators should hear.
+        """
+        settings, limits = self._settings, self._settings.for_parameter(parameter)
+        alarm = replace(
+            self._alarms.get(parameter, Alarm(parameter, since_ns=time_ns)),
+            change=change,
+            standard_error=standard_error,
+        )
+        size, z = abs(change), abs(change) / standard_error
+        beyond = size > limits.raise_above and z > settings.raise_z
+        small = size < limits.clear_below or z < settings.clear_z
+        lasted_s = (time_ns - alarm.since_ns) / 1e9
+        kind = None
+        match alarm.state:
+            case AlarmState.NORMAL if beyond:
+                alarm = replace(alarm, state=AlarmState.PENDING, since_ns=time_ns)
+                lasted_s = 0.0
+            case AlarmState.PENDING if not beyond:
+                alarm = replace(alarm, state=AlarmState.NORMAL, since_ns=time_ns)
+            case AlarmState.ACTIVE if small:
+                alarm = replace(alarm, state=AlarmState.CLEARING, since_ns=time_ns)
+                lasted_s = 0.0
+            case AlarmState.CLEARING if not small:
+                alarm = replace(alarm, state=AlarmState.ACTIVE, since_ns=time_ns)
+        if alarm.state is AlarmState.PENDING and lasted_s >= settings.on_delay_s:
+            severity = Severity.DANGER if size > limits.danger_above else Severity.ALERT
+            alarm = replace(
+                alarm,
+                state=AlarmState.ACTIVE,
+                severity=severity,
+                since_ns=time_ns,
+                raised_ns=time_ns,
+                occurrence=alarm.occurrence + 1,
+            )
+            kind = "raised"
+        elif alarm.state is AlarmState.CLEARING and lasted_s >= settings.off_delay_s:
+            alarm = replace(alarm, state=AlarmState.NORMAL, since_ns=time_ns, raised_ns=None)
+            kind = "cleared"
+        elif alarm.state is AlarmState.ACTIVE and alarm.severity is Severity.ALERT and size > limits.danger_above:
+            alarm = replace(alarm, severity=Severity.DANGER)
+            kind = "escalated"
+        self._alarms[parameter] = alarm
+        if kind is None:
+            return ()
+        event = AlarmEvent(kind, time_ns, self._sequence, alarm)
+        self._sequence += 1
+        return (event,)

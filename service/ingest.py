@@ -1,0 +1,215 @@
+"""The gate: every block is accepted or refused here, in one place, with a reason. Trouble is a value, not an exception.
+
+::
+
+    contiguous in time and sequence ........................ accept
+    later than expected, or the publisher restarted ........ accept, gap reported
+    anything else .......................................... refuse, with a reason and a sentence
+
+Time comes from the blocks alone. A clock that was set (back, or far ahead) is believed after a number of consecutive
+blocks that agree with each other; until then its blocks are refused and counted.
+"""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from models.machine import Machine
+from models.signals.block import SampleBlock
+
+__all__ = ["Gate", "Reason", "Verdict"]
+
+
+class Reason(StrEnum):
+    """Why a block was refused."""
+
+    MALFORMED = "malformed"
+    CHANNELS = "channels"
+    RATE = "rate"
+    SHAPE = "shape"
+    NOT_FINITE = "not-finite"
+    OVERLAP = "overlap"
+    SEQUENCE = "sequence"
+    PAST = "past"
+    FUTURE = "future"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What became of a block.
+
+    Attributes
+    ----------
+    reason : Reason or None
+        Why it was refused; None if it was accepted.
+    text : str
+        A sentence naming machine, field, value and expectation; empty if there is nothing to say.
+    gap_s : float
+        Seconds of data missing before an accepted block (0 = contiguous; negative after a clock set back).
+    """
+
+    reason: Reason | None = None
+    text: str = ""
+    gap_s: float = 0.0
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the samples may be used."""
+        return self.reason is None
+
+    @property
+    def continuous(self) -> bool:
+        """Whether the samples continue the previous block."""
+        return self.accepted and not self.text
+
+
+@dataclass(slots=True)
+class _Expected:
+    """Where the stream is: what the next block should start with."""
+
+    run: int
+    sequence: int
+    start_ns: int
+
+
+class Gate:
+    """Judges the blocks of one machine in the order of their arrival.
+
+    Parameters
+    ----------
+    machine : Machine
+        What the stream must look like.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self._name = f"{machine.site}/{machine.name}"
+        self._settings = machine.ingest
+        self._rate_hz = machine.rate_hz
+        self._n_channels = len(machine.sensors)
+        self._names = tuple(channel.name for channel in machine.sensors)
+        self._schema_hash = machine.descriptor.schema_hash
+        self._tolerance_ns = round(machine.ingest.time_tolerance_s * 1e9)
+        self._expected: _Expected | None = None
+        self._candidate: _Expected | None = None
+        self._candidate_blocks = 0
+
+    def judge(self, block: SampleBlock, schema_hash: str = "") -> Verdict:
+        """Accept or refuse a block.
+
+        Parameters
+        ----------
+        block : SampleBlock
+            As decoded.
+        schema_hash : str
+            Schema hash the sender named, empty if it named none.
+        """
+        return self._form(block, schema_hash) or self._place(block)
+
+    def _refuse(self, reason: Reason, text: str) -> Verdict:
+        return Verdict(reason, f"{self._name}: {text}")
+
+    def _form(self, block: SampleBlock, schema_hash: str) -> Verdict | None:
+        """Refuse a block whose form is wrong, whatever its time."""
+        settings, n_samples = self._settings, block.samples.shape[0]
+        if schema_hash and schema_hash != self._schema_hash:
+            return self._refuse(
+                Reason.CHANNELS,
+                f"the stream's channel descriptor has hash {schema_hash}, expected {self._schema_hash} for channels "
+                f"{', '.join(self._names)}",
+            )
+        if block.samples.shape[1] != self._n_channels:
+            return self._refuse(
+                Reason.CHANNELS,
+                f"block {block.sequence} has {block.samples.shape[1]} channels, expected {self._n_channels} "
+                f"({', '.join(self._names)})",
+            )
+        if abs(block.rate_hz / self._rate_hz - 1) > settings.rate_tolerance:
+            return self._refuse(
+                Reason.RATE, f"block {block.sequence} has rate_hz {block.rate_hz:g}, expected {self._rate_hz:g}"
+            )
+        length_s = n_samples / self._rate_hz
+        if not settings.block_from_s <= length_s <= settings.block_to_s:
+            return self._refuse(
+                Reason.SHAPE,
+                f"block {block.sequence} has {n_samples} samples ({length_s:g} s), expected {settings.block_from_s:g} "
+                f"to {settings.block_to_s:g} s",
+            )
+        finite = np.isfinite(block.samples)
+        if not finite.all():
+            row, column = (int(where) for where in np.argwhere(~finite)[0])
+            return self._refuse(
+                Reason.NOT_FINITE,
+                f"block {block.sequence}, channel {self._names[column]}: sample {row} is {block.samples[row, column]}, "
+                "expected a finite number",
+            )
+        return None
+
+    def _place(self, block: SampleBlock) -> Verdict:  # noqa: PLR0911  # one return per case of the table
+        """Accept a well-formed block if its time and sequence make sense."""
+        expected = self._expected
+        if expected is None:
+            self._follow(block)
+            return Verdict()
+        late_ns = block.start_ns - expected.start_ns
+        if abs(late_ns) <= self._tolerance_ns:
+            if block.run == expected.run and block.sequence != expected.sequence:
+                return self._resynchronise(
+                    block,
+                    Reason.SEQUENCE,
+                    f"sequence is {block.sequence} in a block that continues the previous one in time, expected "
+                    f"{expected.sequence}",
+                )
+            restarted = block.run != expected.run
+            self._follow(block)
+            return Verdict(text=f"{self._name}: the publisher restarted") if restarted else Verdict()
+        late_s = late_ns / 1e9
+        if late_ns < 0:
+            same_run = block.run == expected.run
+            if same_run and block.sequence < expected.sequence:
+                return self._refuse(
+                    Reason.OVERLAP,
+                    f"block {block.sequence} starts {-late_s:.6g} s before the end of block {expected.sequence - 1}: "
+                    "a repetition or out of order",
+                )
+            return self._resynchronise(
+                block,
+                Reason.PAST,
+                f"start_ns {block.start_ns} of block {block.sequence} lies {-late_s:.6g} s before what was received "
+                "already; believed if the clock stays there",
+            )
+        if late_s > self._settings.max_jump_s:
+            return self._resynchronise(
+                block,
+                Reason.FUTURE,
+                f"start_ns {block.start_ns} of block {block.sequence} lies {late_s:.6g} s ahead, expected at most "
+                f"{self._settings.max_jump_s:g} s; believed if the clock stays there",
+            )
+        what = "the publisher restarted and " if block.run != expected.run else ""
+        missed = block.sequence - expected.sequence if block.run == expected.run else 0
+        blocks = f" ({missed} blocks)" if missed > 0 else ""
+        self._follow(block)
+        return Verdict(text=f"{self._name}: {what}{late_s:.6g} s of data are missing{blocks}", gap_s=late_s)
+
+    def _resynchronise(self, block: SampleBlock, reason: Reason, text: str) -> Verdict:
+        """Refuse, unless enough consecutive blocks agree that this is where the stream is now."""
+        candidate = self._candidate
+        if (
+            candidate is None
+            or block.run != candidate.run
+            or block.sequence != candidate.sequence
+            or abs(block.start_ns - candidate.start_ns) > self._tolerance_ns
+        ):
+            self._candidate_blocks = 0
+        self._candidate = _Expected(block.run, block.sequence + 1, block.end_ns)
+        self._candidate_blocks += 1
+        if self._candidate_blocks < self._settings.resync_blocks:
+            return self._refuse(reason, text)
+        previous = self._expected
+        step_s = 0.0 if previous is None else (block.start_ns - previous.start_ns) / 1e9
+        self._follow(block)
+        return Verdict(text=f"{self._name}: the stream's clock stepped by {step_s:.6g} s; following it", gap_s=step_s)
+
+    def _follow(self, block: SampleBlock) -> None:
+        self._expected = _Expected(block.run, block.sequence + 1, block.end_ns)
+        self._candidate, self._candidate_blocks = None, 0

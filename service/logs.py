@@ -1,0 +1,74 @@
+"""Logging to standard error: structlog for our own lines, the standard library's loggers through the same formatter."""
+
+import logging
+import sys
+import time
+from collections.abc import Callable
+
+import structlog
+from structlog.typing import FilteringBoundLogger, Processor
+
+from service.config import LogSettings
+
+__all__ = ["Limiter", "configure_logging", "logger"]
+
+_QUIET_S = 10.0
+
+
+def configure_logging(settings: LogSettings) -> None:
+    """Set up the process's logging; call it once, at start-up."""
+    shared: list[Processor] = [
+        structlog.contextvars.merge_contextvars,
+        structlog.stdlib.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    as_json = settings.format == "json"
+    final: list[Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta]
+    if as_json:
+        final += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+    else:
+        final.append(structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()))
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=final))
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(settings.level.upper())
+    # httpx and the server's own chatter are of interest only when something is wrong.
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    structlog.configure(
+        processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
+        logger_factory=structlog.stdlib.LoggerFactory(),
+        wrapper_class=structlog.stdlib.BoundLogger,
+        cache_logger_on_first_use=False,
+    )
+
+
+def logger(**context: str) -> FilteringBoundLogger:
+    """Return a logger whose lines carry `context`."""
+    bound: FilteringBoundLogger = structlog.get_logger("rotorwatch", **context)
+    return bound
+
+
+class Limiter:
+    """Lets one line of a kind through per ten seconds and says how many were left out.
+
+    Parameters
+    ----------
+    clock : callable
+        Monotonic seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._next_s: dict[str, float] = {}
+        self._withheld: dict[str, int] = {}
+
+    def admit(self, kind: str) -> int | None:
+        """How many lines of this kind were withheld before this one, or None if it is to be withheld as well."""
+        now_s = self._clock()
+        if now_s < self._next_s.get(kind, float("-inf")):
+            self._withheld[kind] = self._withheld.get(kind, 0) + 1
+            return None
+        self._next_s[kind] = now_s + _QUIET_S
+        return self._withheld.pop(kind, 0)

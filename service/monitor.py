@@ -1,0 +1,261 @@
+"""The data path of one machine: block in, report out. Read this first.
+
+::
+
+    SampleBlock -> Gate -> SlidingWindow -> WindowEvaluator -> AlarmBook -> MonitorReport
+                 (ingest)  (correlations)     (residuals)      (alarms)
+
+`MachineMonitor` knows no network, clock or thread: all times are the data's own. Live running and replay are two ways
+of feeding it, and the same blocks give the same reports.
+"""
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from models.diagnosis.bundle import Bundle
+from models.diagnosis.moments import plan_for
+from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.window import SlidingWindow
+from models.errors import EstimationError, WireError
+from models.machine import Machine
+from models.signals.block import SampleBlock
+from models.signals.wire import decode_block
+from service.alarms import Alarm, AlarmBook, AlarmEvent, Severity
+from service.ingest import Gate, Reason, Verdict
+from service.residuals import WindowEvaluator
+
+__all__ = ["DataQuality", "HealthState", "MachineHealth", "MachineMonitor", "MonitorReport", "WindowReport"]
+
+
+class HealthState(StrEnum):
+    """Health of a machine in one word."""
+
+    WARMING = "warming"
+    HEALTHY = "healthy"
+    ALERT = "alert"
+    DANGER = "danger"
+    NO_DATA = "no-data"
+    NOT_EVALUABLE = "not-evaluable"
+
+
+@dataclass(frozen=True, slots=True)
+class DataQuality:
+    """What came in since the monitor started.
+
+    Attributes
+    ----------
+    accepted : int
+        Blocks accepted.
+    refused : dict of str to int
+        Blocks refused, by reason.
+    gaps : int
+        Interruptions before accepted blocks.
+    missing_s : float
+        Data time that the gaps cost.
+    last_refusal : str
+        Latest reason for refusing a block, in a sentence.
+    last_gap : str
+        Latest gap, in a sentence.
+    """
+
+    accepted: int = 0
+    refused: tuple[tuple[str, int], ...] = ()
+    gaps: int = 0
+    missing_s: float = 0.0
+    last_refusal: str = ""
+    last_gap: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class WindowReport:
+    """One evaluation of the window, at the end of a hop.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Oldest and newest data in the window.
+    state : HealthState
+        After this window: warming, healthy, alert, danger or not-evaluable.
+    filled : float
+        Fraction of a full window.
+    speed_rad_s : float or None
+        Mean speed in the window.
+    parameters : tuple of ParameterReading
+        What the alarms are decided on.
+    equations : tuple of EquationReading
+        The networks' opinion, equation by equation.
+    misfit : float or None
+        How much more power there is than the fitted theory says (0 = none).
+    reason : str
+        Why the window was not evaluated; empty if it was.
+    """
+
+    start_ns: int
+    end_ns: int
+    state: HealthState
+    filled: float
+    speed_rad_s: float | None = None
+    parameters: tuple[ParameterReading, ...] = ()
+    equations: tuple[EquationReading, ...] = ()
+    misfit: float | None = None
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MonitorReport:
+    """What one block did.
+
+    Attributes
+    ----------
+    verdict : Verdict
+        Accepted or refused, and why.
+    windows : tuple of WindowReport
+        One per hop that the block completed.
+    events : tuple of AlarmEvent
+        What operators should hear.
+    """
+
+    verdict: Verdict
+    windows: tuple[WindowReport, ...] = ()
+    events: tuple[AlarmEvent, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class MachineHealth:
+    """Where the machine stands: the latest window, the alarms, and the quality of the data."""
+
+    state: HealthState
+    filled: float
+    latest: WindowReport | None
+    alarms: tuple[Alarm, ...]
+    quality: DataQuality
+
+
+class MachineMonitor:
+    """Monitors one machine.
+
+    Parameters
+    ----------
+    machine : Machine
+        The machine file.
+    bundle : Bundle or None
+        Trained networks; without them the equations are reported as not evaluable.
+    """
+
+    def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
+        self.machine = machine
+        self._plan = plan_for(machine)
+        self._gate = Gate(machine)
+        self._window = SlidingWindow(self._plan)
+        self._evaluator = WindowEvaluator(machine, bundle)
+        self._alarms = AlarmBook(machine.alarms)
+        self._quality = DataQuality()
+        self._refused: Counter[str] = Counter()
+        self._latest: WindowReport | None = None
+
+    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> MonitorReport:
+        """Decode a message of the stream and take it as `step` does; undecodable bytes are a refusal like any other."""
+        try:
+            block, schema_hash = decode_block(payload, attachment, encoding)
+        except WireError as error:
+            name = f"{self.machine.site}/{self.machine.name}"
+            return MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}")))
+        return self.step(block, schema_hash)
+
+    def step(self, block: SampleBlock, schema_hash: str = "") -> MonitorReport:
+        """Take one block: gate, window, evaluation, alarms.
+
+        Parameters
+        ----------
+        block : SampleBlock
+            The next block of the stream.
+        schema_hash : str
+            Hash of the channel descriptor the sender named, empty if none.
+
+        Returns
+        -------
+        MonitorReport
+            Immutable; refused blocks and gaps are stated in it, never raised.
+        """
+        verdict = self._count(self._gate.judge(block, schema_hash))
+        if not verdict.accepted:
+            return MonitorReport(verdict)
+        if not verdict.continuous:
+            self._window.gap()
+        if verdict.gap_s < 0:
+            self._window.clear()
+            self._alarms.clock_stepped(block.start_ns)
+        windows: list[WindowReport] = []
+        events: list[AlarmEvent] = []
+        for end_ns in self._window.feed(self._plan.to_si(block.samples), block.start_ns):
+            report, heard = self._evaluate(end_ns)
+            windows.append(report)
+            events.extend(heard)
+        return MonitorReport(verdict, tuple(windows), tuple(events))
+
+    def health(self) -> MachineHealth:
+        """Where the machine stands now."""
+        state = HealthState.WARMING if self._latest is None else self._latest.state
+        return MachineHealth(state, self._window.filled, self._latest, self._alarms.alarms, self._quality)
+
+    def _count(self, verdict: Verdict) -> Verdict:
+        quality = self._quality
+        if verdict.reason is not None:
+            self._refused[verdict.reason] += 1
+            self._quality = replace(quality, refused=tuple(sorted(self._refused.items())), last_refusal=verdict.text)
+        elif verdict.continuous:
+            self._quality = replace(quality, accepted=quality.accepted + 1)
+        else:
+            missing_s = quality.missing_s + max(0.0, verdict.gap_s)
+            self._quality = replace(
+                quality,
+                accepted=quality.accepted + 1,
+                gaps=quality.gaps + 1,
+                missing_s=missing_s,
+                last_gap=verdict.text,
+            )
+        return verdict
+
+    def _evaluate(self, end_ns: int) -> tuple[WindowReport, tuple[AlarmEvent, ...]]:
+        """Evaluate the window as it is after a completed hop."""
+        filled = self._window.filled
+        statistics = self._window.statistics()
+        if statistics is None:
+            report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
+            self._latest = report
+            return report, ()
+        try:
+            evaluation = self._evaluator.evaluate(statistics)
+        except EstimationError as error:
+            report = WindowReport(
+                statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
+            )
+            self._latest = report
+            return report, ()
+        events: list[AlarmEvent] = []
+        for reading in evaluation.parameters:
+            if reading.change is not None and reading.standard_error is not None:
+                events.extend(self._alarms.update(reading.name, reading.change, reading.standard_error, end_ns))
+        report = WindowReport(
+            start_ns=statistics.start_ns,
+            end_ns=end_ns,
+            state=self._state(HealthState.HEALTHY),
+            filled=filled,
+            speed_rad_s=evaluation.speed_rad_s,
+            parameters=evaluation.parameters,
+            equations=evaluation.equations,
+            misfit=evaluation.misfit,
+        )
+        self._latest = report
+        return report, tuple(events)
+
+    def _state(self, otherwise: HealthState) -> HealthState:
+        """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
+        match self._alarms.severity:
+            case Severity.DANGER:
+                return HealthState.DANGER
+            case Severity.ALERT:
+                return HealthState.ALERT
+            case None:
+                return otherwise

@@ -1,0 +1,93 @@
+"""Evaluation of one window: physical parameters by likelihood, the equations' networks beside them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.bundle import Bundle
+from models.diagnosis.equations import EQUATIONS
+from models.diagnosis.likelihood import LikelihoodFit
+from models.diagnosis.networks import read_equation
+from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine
+from models.physics.parameters import PARAMETERS
+
+__all__ = ["Evaluation", "WindowEvaluator"]
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What the diagnosticians say about a window.
+
+    Attributes
+    ----------
+    parameters : tuple of ParameterReading
+        Every parameter, by likelihood, in the order of `PARAMETERS`.
+    equations : tuple of EquationReading
+        Every equation of the table, by its network, or why not.
+    speed_rad_s : float or None
+        Mean speed.
+    misfit : float
+        How much more power there is than the fitted theory says.
+    """
+
+    parameters: tuple[ParameterReading, ...]
+    equations: tuple[EquationReading, ...]
+    speed_rad_s: float | None
+    misfit: float
+
+
+class WindowEvaluator:
+    """Evaluates the windows of one machine.
+
+    Parameters
+    ----------
+    machine : Machine
+    bundle : Bundle or None
+        Without it the equations are reported as not evaluable.
+    """
+
+    def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
+        self._machine = machine
+        self._networks = {} if bundle is None else {network.equation.number: network for network in bundle.networks}
+        self._likelihood = LikelihoodFit(machine)
+
+    def evaluate(self, window: WindowStatistics) -> Evaluation:
+        """Evaluate one window.
+
+        Raises
+        ------
+        EstimationError
+            If the window cannot be evaluated: outside the speed range, or no fluctuation in a channel.
+        """
+        operation = self._machine.operation
+        speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
+        if speed is not None and abs(speed / operation.speed_rad_s - 1) > operation.speed_tolerance:
+            raise EstimationError(
+                f"{self._machine.site}/{self._machine.name}: speed is {speed * 30 / np.pi:.0f} rpm, evaluated are "
+                f"{operation.speed_rpm:.0f} rpm ± {operation.speed_tolerance:.0%}"
+            )
+        estimate = self._likelihood.fit(window)
+        values = {
+            name: (float(change), float(error))
+            for name, change, error in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
+        }
+        parameters = tuple(
+            ParameterReading(name, "likelihood", *values[name])
+            if name in values
+            else ParameterReading(name, "likelihood", reason="no phase reference")
+            for name in PARAMETERS
+        )
+        return Evaluation(parameters, self._equations(window), speed, estimate.misfit)
+
+    def _equations(self, window: WindowStatistics) -> tuple[EquationReading, ...]:
+        readings = []
+        for equation in EQUATIONS:
+            trained = self._networks.get(equation.number)
+            if trained is None:
+                readings.append(EquationReading(equation.number, equation.title, reason="no trained network"))
+            else:
+                readings.append(read_equation(trained, window, self._machine))
+        return tuple(readings)

@@ -1,0 +1,191 @@
+"""Windows of data drawn at random: training, calibration and evaluation material.
+
+Each window is a run of the simulator in a condition of its own, through the same sensors, number format and sliding
+statistics as live data. Its random numbers come from (seed, purpose, equation, number) alone, so that windows can be
+made in any order by any number of processes, and no purpose ever shares a realisation with another.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import partial
+
+import numpy as np
+
+from models.diagnosis.moments import plan_for
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import Machine
+from models.physics.lyapunov import stochastic_covariance, synchronous_response
+from models.physics.matrices import STATE_INDEX
+from models.physics.parameters import PARAMETERS, changed
+from models.signals.channels import Channel
+from simulator.scenario import Event, NamedSource, Scenario, Sensors
+from simulator.stream import blocks
+
+__all__ = ["Draw", "Layout", "Purpose", "draw_condition", "simulate_window", "windows", "with_tilt"]
+
+_BLOCK_S = 5.0
+
+
+class Purpose(IntEnum):
+    """What a window is for; part of its seed."""
+
+    TRAINING = 1
+    CALIBRATION = 2
+    EVALUATION = 3
+
+
+class Layout(IntEnum):
+    """How the stochastic force reaches the machine."""
+
+    ONE_SOURCE = 0
+    """One source of random direction over all six degrees of freedom."""
+    INDEPENDENT = 1
+    """Independent sources of random level at bearing and disc, horizontal and vertical."""
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """A recipe for windows.
+
+    Attributes
+    ----------
+    machine : Machine
+    seed : int
+        Of the whole campaign.
+    purpose : Purpose
+    stream : int
+        Tells apart series of windows of the same purpose (equations, cells of a table).
+    kept_nominal : tuple of str
+        Parameters that do not vary.
+    spread : float
+        The others vary uniformly by up to this relative amount.
+    faults : mapping of str to float
+        Fixed relative changes on top.
+    layout : Layout or None
+        None draws one of them at random for each window.
+    """
+
+    machine: Machine
+    seed: int
+    purpose: Purpose
+    stream: int = 0
+    kept_nominal: tuple[str, ...] = PARAMETERS
+    spread: float = 0.3
+    faults: dict[str, float] = field(default_factory=dict)
+    layout: Layout | None = None
+
+
+def with_tilt(machine: Machine) -> Machine:
+    """Return the machine with tilt and tilt-rate sensors added where it has none."""
+    present = set(machine.descriptor.states)
+    added = [
+        Channel.model_validate(
+            {"name": name, "quantity": quantity, "location": "disc", "direction": direction, "unit": unit}
+        )
+        for name, quantity, direction, unit in (
+            ("psi", "tilt", "y", "rad"),
+            ("phi", "tilt", "z", "rad"),
+            ("psi_dot", "tilt_rate", "y", "rad/s"),
+            ("phi_dot", "tilt_rate", "z", "rad/s"),
+        )
+        if name not in present
+    ]
+    return machine.model_copy(update={"sensors": (*machine.sensors, *added)})
+
+
+def draw_condition(draw: Draw, number: int) -> Scenario:
+    """Draw the operating condition of one window: cutoff, layout, levels, speed, noise, and varying parameters."""
+    machine, condition = draw.machine, draw.machine.condition
+    rng = np.random.default_rng([draw.seed, draw.purpose, draw.stream, number])
+    changes = {
+        name: float(rng.uniform(-draw.spread, draw.spread)) for name in PARAMETERS if name not in draw.kept_nominal
+    } | draw.faults
+    tolerance = min(0.2, machine.operation.speed_tolerance)
+    speed_rpm = machine.operation.speed_rpm * float(rng.uniform(1 - tolerance, 1 + tolerance))
+    cutoff_hz = float(rng.uniform(*condition.cutoff_hz))
+    layout = Layout(int(rng.integers(2))) if draw.layout is None else draw.layout
+    ratio = float(rng.uniform(*condition.stochastic_to_1x))
+    sources = _scaled(_sources(layout, cutoff_hz, machine, rng), ratio, machine, changes, speed_rpm)
+    corner_hz = None if rng.random() < 0.5 else float(np.exp(rng.uniform(np.log(50), np.log(500))))
+    sensors = Sensors(noise_relative=float(rng.uniform(*condition.noise_relative)), noise_corner_hz=corner_hz)
+    events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in changes.items()]
+    plan = plan_for(machine)
+    return Scenario(
+        name=f"draw {draw.purpose.name.lower()} {draw.stream}.{number}",
+        machine=machine.name,
+        seed=int(rng.integers(2**62)),
+        duration_s=(plan.preamble + plan.hops * plan.hop) / machine.rate_hz,
+        sources=sources,
+        sensors=sensors,
+        events=(*events, Event(at_s=0, speed_rpm=speed_rpm)),
+    )
+
+
+def _sources(layout: Layout, cutoff_hz: float, machine: Machine, rng: np.random.Generator) -> tuple[NamedSource, ...]:
+    if layout is Layout.ONE_SOURCE:
+        lever = machine.rotor.shaft_length_m / 3
+        direction = rng.standard_normal(6) * np.array([1, 1, lever, 1, 1, lever])
+        parts = [(direction / np.linalg.norm(direction), 1.0)]
+    else:
+        parts = [(np.eye(6)[dof], float(rng.uniform(0.3, 1.0))) for dof in (0, 1, 3, 4)]
+    return tuple(
+        NamedSource.model_validate(
+            {"name": f"source{n}", "cutoff_hz": cutoff_hz, "direction": tuple(direction), "force_rms_N": level}
+        )
+        for n, (direction, level) in enumerate(parts)
+    )
+
+
+def _scaled(
+    sources: tuple[NamedSource, ...], ratio: float, machine: Machine, changes: dict[str, float], speed_rpm: float
+) -> tuple[NamedSource, ...]:
+    """Scale the forces so that the stochastic displacement at the disc is `ratio` times its 1x amplitude, both rms."""
+    rotor, speed_rad_s = changed(machine.rotor, changes), speed_rpm * 2 * np.pi / 60
+    variance = np.diag(stochastic_covariance(rotor, speed_rad_s, sources))
+    q1, q2 = synchronous_response(rotor, speed_rad_s)
+    disc = [STATE_INDEX["y2"], STATE_INDEX["z2"]]
+    factor = ratio * float(np.sqrt(np.sum(q1[disc] ** 2 + q2[disc] ** 2) / 2 / np.sum(variance[disc])))
+    return tuple(source.model_copy(update={"force_rms_N": source.force_rms_N * factor}) for source in sources)
+
+
+def simulate_window(draw: Draw, number: int) -> WindowStatistics:
+    """Simulate one window and return its statistics."""
+    machine = draw.machine
+    plan = plan_for(machine)
+    window = SlidingWindow(plan)
+    for block, _ in blocks(draw_condition(draw, number), machine, block_s=_BLOCK_S):
+        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
+            pass
+    statistics = window.statistics()
+    if statistics is None:
+        raise AssertionError("the drawn scenario lasts one window by construction")
+    return statistics
+
+
+def windows(
+    draw: Draw, numbers: Sequence[int], processes: int, progress: Callable[[int], None] = lambda _: None
+) -> Iterator[WindowStatistics]:
+    """Simulate windows over worker processes, in order.
+
+    Parameters
+    ----------
+    draw : Draw
+    numbers : sequence of int
+        Which windows of the series.
+    processes : int
+        1 stays in this process.
+    progress : callable
+        Called with 1 for each finished window.
+    """
+    make = partial(simulate_window, draw)
+    if processes == 1:
+        for number in numbers:
+            yield make(number)
+            progress(1)
+        return
+    with ProcessPoolExecutor(processes) as pool:
+        for statistics in pool.map(make, numbers, chunksize=2):
+            yield statistics
+            progress(1)

@@ -1,0 +1,253 @@
+"""Publishes a simulated stream over Zenoh; the only module of the simulator that does.
+
+::
+
+    waiting for a subscriber ──> sending ──> draining ──> closed
+                │                   │
+                └──── stop ─────────┴─────────────────────^
+
+Draining matters because closing a Zenoh session throws away what is still on its way: several megabytes after an
+unpaced run.
+"""
+
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from threading import Event
+
+import zenoh
+import zenoh.ext
+
+from models.errors import MachineFileError, RotorwatchError
+from models.machine import Machine
+from models.signals.keys import MachineKeys
+from models.signals.link import LinkSettings
+from simulator.messages import (
+    JSON_ENCODING,
+    BlockEncoding,
+    BlockStream,
+    RunSummary,
+    block_message,
+    descriptor_payload,
+)
+
+__all__ = ["DEFAULT_CONNECT", "PublishError", "PublishSettings", "publish"]
+
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+
+_LOCAL = LinkSettings(connect=(DEFAULT_CONNECT,))
+_CACHE_BLOCKS = 300
+_CACHE_TRUTH = 100
+_HEARTBEAT_S = 0.5
+_POLL_S = 0.02
+_BLOCKED_US = 20_000_000
+
+
+class PublishError(RotorwatchError):
+    """The stream could not be published: no session, or no subscriber in time."""
+
+
+@dataclass(frozen=True, slots=True)
+class PublishSettings:
+    """How to publish.
+
+    Attributes
+    ----------
+    link : LinkSettings
+        Endpoints; connects to a local monitor by default.
+    pace : float or None
+        Data seconds per second; None is as fast as the subscribers take it.
+    encoding : {"raw", "arrow"}
+    wait_for_subscriber_s : float or None
+        Hold the first block back until someone subscribes, at most this long.
+    linger_s : float
+        How long the session stays open after the last block, so that a subscriber can fetch what it missed.
+    drain_s : float
+        How long a monitor may take to catch up with an unpaced stream before the session closes.
+    """
+
+    link: LinkSettings = _LOCAL
+    pace: float | None = 1.0
+    encoding: BlockEncoding = "raw"
+    wait_for_subscriber_s: float | None = None
+    linger_s: float = 2.0
+    drain_s: float = 60.0
+
+
+def publish(
+    machine: Machine,
+    stream: BlockStream,
+    settings: PublishSettings,
+    *,
+    stop: Event | None = None,
+    on_block: Callable[[RunSummary], None] | None = None,
+) -> RunSummary:
+    """Publish descriptor, truth and blocks of one machine until the stream ends or `stop` is set.
+
+    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine.
+
+    Parameters
+    ----------
+    machine : Machine
+    stream : iterator of (SampleBlock, tuple of TruthRecord)
+        From `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for.
+    settings : PublishSettings
+    stop : threading.Event, optional
+        When set, publishing ends before the next block and the session closes at once.
+    on_block : callable, optional
+        Called with the summary so far after each block.
+
+    Returns
+    -------
+    RunSummary
+
+    Raises
+    ------
+    MachineFileError
+        If an endpoint is malformed.
+    PublishError
+        If the session cannot be opened, or nobody subscribed in time.
+    """
+    stop = Event() if stop is None else stop
+    with _session(settings) as session, _declared(session, machine, settings.pace) as outlets:
+        if settings.wait_for_subscriber_s is not None:
+            _wait_for_subscriber(session, machine.keys, settings.wait_for_subscriber_s, stop)
+        outlets.descriptor.put(descriptor_payload(machine))
+        summary = _send(outlets, machine, stream, settings, stop, on_block)
+        if not stop.is_set():
+            if settings.pace is None:
+                _drain(session, machine.keys, settings.drain_s)
+            stop.wait(settings.linger_s)
+        return summary
+
+
+@dataclass(frozen=True, slots=True)
+class _Outlets:
+    stream: zenoh.ext.AdvancedPublisher
+    descriptor: zenoh.ext.AdvancedPublisher
+    truth: zenoh.ext.AdvancedPublisher
+
+
+@contextmanager
+def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
+    items = settings.link.zenoh_items()
+    if settings.pace is None:
+        # By default Zenoh closes the connection to a subscriber that blocks for five seconds; a monitor that evaluates
+        # an unpaced stream may need longer.
+        items["transport/link/tx/queue/congestion_control/block/wait_before_close"] = str(_BLOCKED_US)
+    config = zenoh.Config()
+    for path, value in items.items():
+        try:
+            config.insert_json5(path, value)
+        except zenoh.ZError as error:
+            raise MachineFileError(f"link setting {path} = {value} is refused: {_reason(error)}") from error
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        raise PublishError(f"no Zenoh session (listen {list(settings.link.listen)}): {_reason(error)}") from error
+    try:
+        yield session
+    finally:
+        session.close()  # type: ignore[no-untyped-call]  # the stub says nothing of what it returns
+
+
+def _reason(error: zenoh.ZError) -> str:
+    """Error text without the source lines of the library."""
+    return re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error))
+
+
+@contextmanager
+def _declared(session: zenoh.Session, machine: Machine, pace: float | None) -> Iterator[_Outlets]:
+    keys, descriptor = machine.keys, descriptor_payload(machine)
+    # A real machine never waits for its monitor: a block that finds the queue full is dropped, and the subscriber
+    # fetches it from the cache. Without pace there is nothing to fall behind of, and a cache of any size would
+    # overflow: there, a slow subscriber slows the publisher down instead.
+    congestion = zenoh.CongestionControl.BLOCK if pace is None else zenoh.CongestionControl.DROP
+
+    def outlet(key: str, priority: zenoh.Priority, cache: int) -> zenoh.ext.AdvancedPublisher:
+        return zenoh.ext.declare_advanced_publisher(
+            session,
+            key,
+            encoding=JSON_ENCODING,
+            congestion_control=congestion,
+            priority=priority,
+            cache=zenoh.ext.CacheConfig(max_samples=cache),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+
+    def answer(query: zenoh.Query) -> None:
+        query.reply(keys.descriptor, descriptor, encoding=JSON_ENCODING)
+
+    declared: list[zenoh.ext.AdvancedPublisher | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
+    outlets = _Outlets(
+        stream=outlet(keys.stream, zenoh.Priority.DATA_HIGH, _CACHE_BLOCKS),
+        descriptor=outlet(keys.descriptor, zenoh.Priority.DATA_HIGH, 1),
+        truth=outlet(keys.truth, zenoh.Priority.DATA_HIGH, _CACHE_TRUTH),
+    )
+    declared += [outlets.stream, outlets.descriptor, outlets.truth]
+    declared.append(session.declare_queryable(keys.descriptor, answer))
+    declared.append(session.liveliness().declare_token(keys.publisher_alive))
+    try:
+        yield outlets
+    finally:
+        for item in reversed(declared):
+            item.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, timeout_s: float, stop: Event) -> None:
+    # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
+    probe = session.declare_publisher(keys.stream)
+    deadline = time.monotonic() + timeout_s
+    while not probe.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
+        if stop.wait(_POLL_S):
+            break
+        if time.monotonic() > deadline:
+            raise PublishError(f"nobody subscribed to {keys.stream} within {timeout_s:g} s")
+    probe.undeclare()  # type: ignore[no-untyped-call]
+
+
+def _send(
+    outlets: _Outlets,
+    machine: Machine,
+    stream: BlockStream,
+    settings: PublishSettings,
+    stop: Event,
+    on_block: Callable[[RunSummary], None] | None,
+) -> RunSummary:
+    schema_hash = machine.descriptor.schema_hash
+    summary = RunSummary()
+    first_ns: int | None = None
+    begin = time.monotonic()
+    for block, truth in stream:
+        first_ns = block.start_ns if first_ns is None else first_ns
+        data_s = (block.end_ns - first_ns) / 1e9
+        payload, attachment, encoding = block_message(block, schema_hash, settings.encoding)
+        if settings.pace is not None:
+            stop.wait(max(0.0, begin + data_s / settings.pace - time.monotonic()))
+        if stop.is_set():
+            break
+        for entry in truth:
+            outlets.truth.put(entry.model_dump_json())
+        outlets.stream.put(payload, attachment=attachment or None, encoding=encoding)
+        summary = RunSummary(
+            blocks=summary.blocks + 1,
+            data_s=data_s,
+            elapsed_s=time.monotonic() - begin,
+            truth=truth[-1] if truth else summary.truth,
+        )
+        if on_block is not None:
+            on_block(summary)
+    return summary
+
+
+def _drain(session: zenoh.Session, keys: MachineKeys, timeout_s: float) -> None:
+    """Wait until the monitor has received everything sent so far.
+
+    A query of lower priority leaves after all blocks, and the monitor's side handles one link in order: its answer says
+    that the blocks have arrived. Without a monitor there is no answer and no waiting.
+    """
+    for _ in session.get(keys.health, priority=zenoh.Priority.DATA_LOW, timeout=timeout_s):
+        pass

@@ -1,0 +1,284 @@
+"""The command ``rotorsim``: a simulated machine that publishes its vibration, or writes it into a recording."""
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn
+
+from models.errors import MachineFileError, RotorwatchError
+from models.machine import Machine, load_machine
+from models.signals.link import LinkSettings
+from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
+
+if TYPE_CHECKING:  # the stream imports scipy, which --help must not wait for
+    from simulator.messages import BlockStream, RunSummary
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    name="rotorsim",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    help="Simulated rotor with unbalance, random excitation and faults that begin when you say, as a sensor stream.",
+    epilog=f"Shipped scenarios: {', '.join(shipped_scenarios())}. Write your own: docs/scenario.md.",
+)
+
+
+class _Encoding(StrEnum):
+    RAW = "raw"
+    ARROW = "arrow"
+
+
+class _Mode(StrEnum):
+    PEER = "peer"
+    CLIENT = "client"
+
+
+_ScenarioArgument = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="Shipped scenario by name, or the path of a scenario file.")
+]
+_MachineOption = Annotated[
+    str | None, typer.Option("--machine", help="Another machine than the scenario's: shipped name, or path.")
+]
+_SeedOption = Annotated[int | None, typer.Option(min=0, help="Another realisation of all random forces and noise.")]
+_DurationOption = Annotated[float | None, typer.Option("--duration", help="Data seconds; the scenario's if left out.")]
+_FaultOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--fault",
+        metavar="NAME=CHANGE@SECONDS",
+        help="Add a fault: k_by=-0.25@140 takes a quarter of the horizontal bearing stiffness away after 140 s. "
+        "Names: k_by, c_by, k_bz, c_bz (bearing stiffness and damping), e (unbalance), EI (shaft). Repeatable.",
+    ),
+]
+_BlockOption = Annotated[float, typer.Option("--block-s", help="Length of a block, s; 0.02 to 0.5 is sensible.")]
+_EncodingOption = Annotated[_Encoding, typer.Option(help="Raw samples with a fixed header, or Arrow IPC streams.")]
+
+
+@app.command()
+def publish(
+    scenario: _ScenarioArgument = "healthy",
+    machine: _MachineOption = None,
+    seed: _SeedOption = None,
+    duration_s: _DurationOption = None,
+    fault: _FaultOption = None,
+    pace: Annotated[
+        str,
+        typer.Option(
+            help="Data seconds per second: 1 is real time, 20 is twenty times faster, max is back-pressure only."
+        ),
+    ] = "1",
+    block_s: _BlockOption = 0.1,
+    encoding: _EncodingOption = _Encoding.RAW,
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Endpoint to connect to, default tcp/127.0.0.1:7447. Repeatable.")
+    ] = None,
+    listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on, default none. Repeatable.")] = None,
+    mode: Annotated[_Mode, typer.Option(help="Role in the Zenoh network.")] = _Mode.PEER,
+    start: Annotated[
+        str | None, typer.Option(help="Time of the first sample, ISO 8601 (UTC if no zone); now if left out.")
+    ] = None,
+    run: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Run number; changes with every start if left out.")
+    ] = None,
+    wait_for_subscriber_s: Annotated[
+        float | None,
+        typer.Option(
+            "--wait-for-subscriber", min=0, help="Send nothing before someone listens; give up after SECONDS."
+        ),
+    ] = None,
+    linger_s: Annotated[
+        float, typer.Option("--linger", min=0, help="Stay this many seconds after the end, for subscribers that lag.")
+    ] = 2.0,
+) -> None:
+    """Publish the stream of a simulated machine.
+
+    [bold]Examples[/bold]
+
+    A healthy machine in real time, to the monitor on this computer:
+    [cyan]rotorsim publish[/cyan]
+
+    A bearing that loses stiffness after 140 s, twenty times faster:
+    [cyan]rotorsim publish k_by --pace 20[/cyan]
+
+    Two faults of your own in ten minutes, as fast as the monitor can take them:
+    [cyan]rotorsim publish --duration 600 --fault e=0.3@200 --fault c_by=-0.3@400 --pace max[/cyan]
+    """
+    with _exit_codes():
+        loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
+        factor = _pace(pace)
+        start_ns = None if start is None else _time_ns(start)
+        endpoints = tuple(connect) if connect else () if listen else None
+        from simulator.publisher import DEFAULT_CONNECT, PublishSettings  # noqa: PLC0415  # keeps --help quick
+        from simulator.publisher import publish as publish_stream  # noqa: PLC0415
+
+        link = LinkSettings(
+            mode=mode.value,
+            listen=tuple(listen or ()),
+            connect=(DEFAULT_CONNECT,) if endpoints is None else endpoints,
+        )
+        settings = PublishSettings(
+            link=link,
+            pace=factor,
+            encoding=encoding.value,
+            wait_for_subscriber_s=wait_for_subscriber_s,
+            linger_s=linger_s,
+        )
+        number = int(time.time()) % 65535 + 1 if run is None else run
+        with _stop_on_signal() as stop, _progress(loaded.duration_s) as on_block:
+            stream = _stream(loaded, rig, block_s, start_ns, number)
+            summary = publish_stream(rig, stream, settings, stop=stop, on_block=on_block)
+        typer.echo(f"published {summary.blocks} blocks, {summary.data_s:.1f} s of data, on {rig.keys.stream}")
+
+
+@app.command()
+def record(
+    scenario: _ScenarioArgument,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Recording to write (.mcap).")],
+    machine: _MachineOption = None,
+    seed: _SeedOption = None,
+    duration_s: _DurationOption = None,
+    fault: _FaultOption = None,
+    block_s: _BlockOption = 0.1,
+    encoding: _EncodingOption = _Encoding.RAW,
+    start: Annotated[str, typer.Option(help="Time of the first sample, ISO 8601 (UTC if no zone).")] = (
+        "2026-01-01T00:00:00Z"
+    ),
+    run: Annotated[int, typer.Option(min=0, max=65535, help="Run number.")] = 1,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is already there.")] = False,
+) -> None:
+    """Write the same stream into a recording, at full speed.
+
+    [bold]Examples[/bold]
+
+    Five minutes with a damping fault, ready to be replayed or trained on:
+    [cyan]rotorsim record c_by c_by.mcap[/cyan]
+
+    Another realisation of the healthy machine, ten minutes long:
+    [cyan]rotorsim record healthy healthy-7.mcap --seed 7 --duration 600[/cyan]
+    """
+    with _exit_codes():
+        loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
+        start_ns = _time_ns(start)
+        if not output.parent.is_dir():
+            raise MachineFileError(f"{output}: the folder {output.parent} does not exist")
+        if output.exists() and not overwrite:
+            raise MachineFileError(f"{output}: exists already; --overwrite replaces it")
+        from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
+
+        with _stop_on_signal() as stop, _progress(loaded.duration_s) as on_block:
+            stream = _stream(loaded, rig, block_s, start_ns, run)
+            summary = record_stream(
+                rig, stream, output, encoding=encoding.value, overwrite=overwrite, stop=stop, on_block=on_block
+            )
+        typer.echo(f"recorded {summary.blocks} blocks, {summary.data_s:.1f} s of data, in {output}")
+
+
+def _load(
+    name: str, machine: str | None, seed: int | None, duration_s: float | None, faults: list[str] | None, block_s: float
+) -> tuple[Scenario, Machine]:
+    scenario, rig = load_scenario(name)
+    if machine is not None:
+        rig = load_machine(machine)
+        scenario.check_channels(rig)
+    events = [parse_fault(text) for text in faults or ()]
+    scenario = scenario.overridden(seed=seed, duration_s=duration_s, faults=events)
+    low, high = rig.ingest.block_from_s, rig.ingest.block_to_s
+    if not max(low, 1 / rig.rate_hz) <= block_s <= high:
+        raise MachineFileError(f"--block-s is {block_s:g}, expected {low:g} to {high:g} for machine {rig.name}")
+    return scenario, rig
+
+
+def _stream(scenario: Scenario, machine: Machine, block_s: float, start_ns: int | None, run: int) -> "BlockStream":
+    """Blocks of the scenario; without a start time, "now" is when the first one is asked for."""
+    from simulator.stream import blocks  # noqa: PLC0415  # imports scipy
+
+    yield from blocks(scenario, machine, block_s, time.time_ns() if start_ns is None else start_ns, run)
+
+
+def _pace(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        pace = float(text)
+    except ValueError:
+        pace = 0.0
+    if not 0 < pace <= 1e4:
+        raise MachineFileError(f"--pace is {text!r}, expected a number above 0 (1 is real time) or max")
+    return pace
+
+
+def _time_ns(text: str) -> int:
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise MachineFileError(f"--start is {text!r}, expected ISO 8601 such as 2026-01-01T00:00:00Z") from error
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    return ((since.days * 86400 + since.seconds) * 10**6 + since.microseconds) * 1000
+
+
+@contextmanager
+def _exit_codes() -> Iterator[None]:
+    """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
+    try:
+        yield
+    except MachineFileError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(2) from error
+    except RotorwatchError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from error
+
+
+@contextmanager
+def _stop_on_signal() -> Iterator[threading.Event]:
+    """Event that SIGINT and SIGTERM set, so that a run ends between two blocks with everything closed."""
+    stop = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _ProgressLine:
+    """Data time, pace and current truth, on a terminal only."""
+
+    def __init__(self, progress: Progress, duration_s: float) -> None:
+        self._progress = progress
+        self._task = progress.add_task("", total=duration_s, pace=0.0, truth="")
+
+    def __call__(self, summary: "RunSummary") -> None:
+        truth = "" if summary.truth is None else escape(summary.truth.text)
+        self._progress.update(self._task, completed=summary.data_s, pace=summary.pace, truth=truth)
+
+
+@contextmanager
+def _progress(duration_s: float) -> Iterator[_ProgressLine]:
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(),
+        TextColumn("{task.completed:.1f} / {task.total:.1f} s"),
+        TextColumn("{task.fields[pace]:.1f} x real time"),
+        TextColumn("{task.fields[truth]}"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=5) as progress:
+        yield _ProgressLine(progress, duration_s)
+
+
+if __name__ == "__main__":
+    app()

@@ -1,0 +1,344 @@
+"""The scenario file: what happens to a simulated machine, and how well its sensors see it.
+
+Every field carries its unit in its name; unknown keys are refused. ``docs/scenario.md`` explains each field.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from models.errors import MachineFileError
+from models.machine import Machine, load_machine, read_toml, validation_text
+from models.physics.excitation import Source
+from models.physics.parameters import PARAMETERS
+from models.signals.channels import Channel, Quantity
+
+__all__ = [
+    "SENSOR_FAULTS_WITH_VALUE",
+    "ChannelSettings",
+    "Event",
+    "NamedSource",
+    "Scenario",
+    "SensorFault",
+    "SensorSettings",
+    "Sensors",
+    "load_scenario",
+    "parse_fault",
+    "shipped_scenarios",
+]
+
+_STRICT = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+_SHIPPED = Path(__file__).parent / "scenarios"
+_FAULT = re.compile(r"(?P<parameter>\w+)=(?P<change>[-+.\deE]+)@(?P<at_s>[.\deE]+)")
+
+SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "clip", "none"]
+
+SENSOR_FAULTS_WITH_VALUE = ("offset", "gain", "noise_relative", "clip")
+"""Kinds of sensor fault that have a value."""
+
+_WITH_RAMP = ("offset", "gain", "noise_relative")
+
+
+class NamedSource(Source):
+    """An independent source of coloured force with a name that events refer to."""
+
+    model_config = _STRICT
+
+    name: str = Field(min_length=1, max_length=64, description="unique name, as events refer to it")
+
+
+class SensorSettings(BaseModel):
+    """How one sensor turns the true value into samples: (value + noise) · gain + offset, rounded to a step."""
+
+    model_config = _STRICT
+
+    noise_relative: float = Field(
+        default=0.0, ge=0, le=100, description="rms of the noise over the channel's own theoretical rms at the start"
+    )
+    noise_corner_hz: float | None = Field(
+        default=None, gt=0, le=1e6, description="corner of first-order coloured noise; white if left out"
+    )
+    offset_SI: float = Field(default=0.0, description="added to every sample: m, m/s, rad or rad/s")
+    gain: float = Field(default=1.0, description="factor on every sample, 1 = true")
+    step_SI: float = Field(default=0.0, ge=0, description="quantisation step: m, m/s, rad or rad/s; 0 = none")
+
+
+class ChannelSettings(BaseModel):
+    """Settings of one channel; what is left out is as for all channels."""
+
+    model_config = _STRICT
+
+    noise_relative: float | None = Field(default=None, ge=0, le=100)
+    noise_corner_hz: float | None = Field(default=None, gt=0, le=1e6)
+    offset_SI: float | None = None
+    gain: float | None = None
+    step_SI: float | None = Field(default=None, ge=0)
+
+
+class Sensors(SensorSettings):
+    """Settings of all vibration channels, and exceptions by channel name."""
+
+    channels: dict[str, ChannelSettings] = Field(default={}, description="exceptions by channel name")
+
+    def settings(self, channel: Channel) -> SensorSettings:
+        """Return the settings that hold for one channel.
+
+        The common settings describe vibration sensors. A shaft angle is ideal unless it has its own entry, because one
+        noise level in parts of the rms makes no sense for both.
+        """
+        own = self.channels.get(channel.name, ChannelSettings()).model_dump(exclude_none=True)
+        common = {} if channel.quantity is Quantity.SHAFT_ANGLE else self.model_dump(exclude={"channels"})
+        return SensorSettings.model_validate({**common, **own})
+
+
+class Event(BaseModel):
+    """One change at one time: of a parameter, the speed, a source, or a sensor.
+
+    Attributes
+    ----------
+    at_s : float
+        Start of the change, data seconds from the first sample.
+    ramp_s : float
+        Duration of the change; 0 is a step. Ramps advance in steps of 0.1 s.
+    parameter, relative_change
+        One of k_by, c_by, k_bz, c_bz, e, EI, and its change from the *original* machine.
+    speed_rpm : float
+        New speed.
+    source, cutoff_hz, force_rms_N, direction
+        Name of a source, and exactly one new setting of it.
+    sensor, sensor_fault, value_SI
+        Channel name, kind of fault ("none" ends all faults of the channel), and its value: in the SI unit of the
+        channel for offset and clip, a plain ratio for gain and noise_relative.
+    """
+
+    model_config = _STRICT
+
+    at_s: float = Field(ge=0)
+    ramp_s: float = Field(default=0.0, ge=0)
+    parameter: str | None = None
+    relative_change: float | None = Field(default=None, gt=-1, le=100)
+    speed_rpm: float | None = Field(default=None, gt=0, le=1e6)
+    source: str | None = None
+    cutoff_hz: float | None = Field(default=None, gt=0, le=1e5)
+    force_rms_N: float | None = Field(default=None, ge=0, le=1e9)
+    direction: tuple[float, float, float, float, float, float] | None = None
+    sensor: str | None = None
+    sensor_fault: SensorFault | None = None
+    value_SI: float | None = None
+
+    @model_validator(mode="after")
+    def _one_change(self) -> Self:
+        kinds = [name for name in ("parameter", "speed_rpm", "source", "sensor") if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            found = " and ".join(kinds) or "none"
+            raise ValueError(f"expected exactly one of parameter, speed_rpm, source, sensor; found {found}")
+        allowed = {
+            "parameter": ("relative_change",),
+            "speed_rpm": (),
+            "source": ("cutoff_hz", "force_rms_N", "direction"),
+            "sensor": ("sensor_fault", "value_SI"),
+        }
+        for kind, fields in allowed.items():
+            stray = [field for field in fields if kind != kinds[0] and getattr(self, field) is not None]
+            if stray:
+                raise ValueError(f"{stray[0]} belongs to an event with {kind}, this one has {kinds[0]}")
+        self._check_parameter()
+        self._check_source()
+        self._check_sensor()
+        return self
+
+    def _check_parameter(self) -> None:
+        if self.parameter is None:
+            return
+        if self.parameter not in PARAMETERS:
+            raise ValueError(f"parameter {self.parameter!r} is not one of {', '.join(PARAMETERS)}")
+        if self.relative_change is None:
+            raise ValueError(f"change of parameter {self.parameter} without relative_change")
+
+    def _check_source(self) -> None:
+        if self.source is None:
+            return
+        given = [name for name in ("cutoff_hz", "force_rms_N", "direction") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(
+                f"change of source {self.source!r}: expected exactly one of cutoff_hz, force_rms_N, direction; "
+                f"found {' and '.join(given) or 'none'}"
+            )
+
+    def _check_sensor(self) -> None:
+        if self.sensor is None:
+            return
+        if self.sensor_fault is None:
+            raise ValueError(f"sensor {self.sensor!r} without sensor_fault")
+        if (self.sensor_fault in SENSOR_FAULTS_WITH_VALUE) != (self.value_SI is not None):
+            need = "needs" if self.sensor_fault in SENSOR_FAULTS_WITH_VALUE else "has no"
+            raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} value_SI")
+        if self.sensor_fault in ("noise_relative", "clip") and (self.value_SI or 0.0) < 0:
+            raise ValueError(f"value_SI of sensor_fault {self.sensor_fault!r} is {self.value_SI}, expected 0 or more")
+        if self.ramp_s > 0 and self.sensor_fault not in _WITH_RAMP:
+            raise ValueError(f"sensor_fault {self.sensor_fault!r} cannot ramp, only {', '.join(_WITH_RAMP)} can")
+
+
+class Scenario(BaseModel):
+    """A machine, what excites it, how its sensors are, and what happens when."""
+
+    model_config = _STRICT
+
+    name: str = Field(default="scenario", description="shown in truth records; the file's name if left out")
+    description: str = ""
+    machine: str = Field(min_length=1, description="shipped machine, or path of a machine file beside the scenario")
+    seed: int = Field(ge=0, description="of all random numbers; the same seed gives the same samples")
+    duration_s: float = Field(gt=0, le=1e8, description="data seconds from first to last sample")
+    sources: tuple[NamedSource, ...] = Field(default=(), max_length=16)
+    sensors: Sensors = Sensors()
+    events: tuple[Event, ...] = ()
+
+    @model_validator(mode="after")
+    def _references(self) -> Self:
+        names = [source.name for source in self.sources]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"source name occurs twice: {', '.join(twice)}")
+        for number, event in enumerate(self.events):
+            if event.source is not None and event.source not in names:
+                known = ", ".join(names) or "none"
+                raise ValueError(f"events.{number}.source: {event.source!r} is not among the sources ({known})")
+            if event.at_s + event.ramp_s > self.duration_s:
+                raise ValueError(
+                    f"events.{number}: ends at {event.at_s + event.ramp_s:g} s, after duration_s {self.duration_s:g}"
+                )
+        return self
+
+    def check_channels(self, machine: Machine) -> None:
+        """Check that every channel the scenario names is one of the machine's.
+
+        Raises
+        ------
+        MachineFileError
+            Naming the scenario, the field, the unknown channel, and the channels the machine has.
+        """
+        known = [channel.name for channel in machine.sensors]
+        named = [(f"sensors.channels.{name}", name) for name in self.sensors.channels]
+        named += [(f"events.{n}.sensor", e.sensor) for n, e in enumerate(self.events) if e.sensor is not None]
+        for field, name in named:
+            if name not in known:
+                raise MachineFileError(
+                    f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
+                    f"({', '.join(known)})"
+                )
+
+    def overridden(
+        self, *, seed: int | None = None, duration_s: float | None = None, faults: Sequence[Event] = ()
+    ) -> "Scenario":
+        """Return the scenario with another seed or duration and with events added, checked again.
+
+        Raises
+        ------
+        MachineFileError
+            If the result is not a valid scenario (an event after the new end, say).
+        """
+        fields = self.model_dump(exclude={"events"})
+        fields["events"] = [event.model_dump() for event in (*self.events, *faults)]
+        if seed is not None:
+            fields["seed"] = seed
+        if duration_s is not None:
+            fields["duration_s"] = duration_s
+        try:
+            return Scenario.model_validate(fields)
+        except ValidationError as error:
+            raise MachineFileError(validation_text(Path(self.name), error)) from error
+
+
+def shipped_scenarios() -> tuple[str, ...]:
+    """Names of the scenarios that come with the program."""
+    return tuple(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
+
+
+def load_scenario(name_or_path: str | Path) -> tuple[Scenario, Machine]:
+    """Load a scenario by path, or a shipped one by name, together with its machine.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        "healthy", "k_by", ... (shipped), or the path of a TOML file.
+
+    Returns
+    -------
+    scenario : Scenario
+    machine : Machine
+        The one the scenario names; a path is relative to the scenario file.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
+    """
+    path = _locate(name_or_path, Path())
+    fields = _merged(path, ())
+    fields.setdefault("name", path.stem)
+    try:
+        scenario = Scenario.model_validate(fields)
+    except ValidationError as error:
+        raise MachineFileError(validation_text(path, error)) from error
+    beside = path.parent / scenario.machine
+    machine = load_machine(beside if beside.suffix == ".toml" else scenario.machine)
+    try:
+        scenario.check_channels(machine)
+    except MachineFileError as error:
+        raise MachineFileError(f"{path}: {error}") from error
+    return scenario, machine
+
+
+def parse_fault(text: str) -> Event:
+    """Turn ``PARAMETER=RELATIVE_CHANGE@AT_SECONDS`` into an event.
+
+    Raises
+    ------
+    MachineFileError
+        If the text does not have this form or names no parameter.
+
+    Examples
+    --------
+    >>> parse_fault("k_by=-0.25@140").relative_change
+    -0.25
+    """
+    match = _FAULT.fullmatch(text.strip())
+    if match is None:
+        raise MachineFileError(f"fault {text!r}: expected PARAMETER=CHANGE@SECONDS, for example k_by=-0.25@140")
+    fields = {"parameter": match["parameter"], "relative_change": match["change"], "at_s": match["at_s"]}
+    try:
+        return Event.model_validate(fields)
+    except ValidationError as error:
+        raise MachineFileError(validation_text(Path(f"fault {text!r}"), error)) from error
+
+
+def _locate(name_or_path: str | Path, folder: Path) -> Path:
+    shipped = _SHIPPED / f"{name_or_path}.toml"
+    if str(name_or_path) in shipped_scenarios():
+        return shipped
+    path = folder / name_or_path
+    if not path.is_file():
+        raise MachineFileError(f"{path}: no such scenario file; shipped scenarios: {', '.join(shipped_scenarios())}")
+    return path
+
+
+def _merged(path: Path, seen: tuple[Path, ...]) -> dict[str, object]:
+    """Fields of a file on top of those it extends: tables are merged key by key, anything else is replaced."""
+    if path.resolve() in seen:
+        raise MachineFileError(f"{path}: extends itself, directly or through another scenario")
+    own = read_toml(path)
+    base_name = own.pop("extends", None)
+    if base_name is None:
+        return own
+    if not isinstance(base_name, str):
+        raise MachineFileError(f"{path}: extends: expected the name or path of a scenario (found {base_name!r})")
+    base = _merged(_locate(base_name, path.parent), (*seen, path.resolve()))
+    base.pop("name", None)
+    base.pop("description", None)
+    for key, value in own.items():
+        below = base.get(key)
+        base[key] = {**below, **value} if isinstance(below, dict) and isinstance(value, dict) else value
+    return base

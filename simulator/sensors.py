@@ -1,0 +1,176 @@
+"""Sensors: from rotor states and shaft angle to samples in the channel's unit, with noise, errors and faults."""
+
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+import scipy.signal
+
+from models.machine import Machine
+from models.physics.matrices import STATE_INDEX
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, Quantity, state_name
+from simulator.integrator import PlantSamples
+from simulator.scenario import Sensors, SensorSettings
+from simulator.timeline import SensorFaults
+
+__all__ = ["Sensor", "SensorBank"]
+
+_TURN = 2 * np.pi
+_NO_FAULT: SensorFaults = {}
+
+
+class Sensor:
+    """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
+
+    Parameters
+    ----------
+    channel : Channel
+    settings : SensorSettings
+    rms_SI : float
+        What ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
+    rate_hz : float
+    rng : numpy.random.Generator
+        Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
+        change without changing the noise.
+    """
+
+    def __init__(
+        self, channel: Channel, settings: SensorSettings, rms_SI: float, rate_hz: float, rng: np.random.Generator
+    ) -> None:
+        self.channel = channel
+        self._settings = settings
+        self._rms_SI = rms_SI
+        self._rng = rng
+        corner_hz = settings.noise_corner_hz
+        self._memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / rate_hz))
+        self._noise: float | None = None
+        self._held: float | None = None
+
+    def noise(self, n_samples: int) -> FloatArray:
+        """Draw the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
+        white = self._rng.standard_normal(n_samples)
+        innovation = float(np.sqrt(1 - self._memory**2))
+        # Stationary from the first sample on: it has the full variance instead of one innovation's.
+        carried = white[0] * (1 - innovation) if self._noise is None else self._memory * self._noise
+        coloured, _ = scipy.signal.lfilter([innovation], [1.0, -self._memory], white, zi=[carried])
+        self._noise = float(coloured[-1])
+        return np.asarray(coloured, dtype=np.float64)
+
+    def measure(self, value_SI: FloatArray, noise: FloatArray, faults: SensorFaults) -> FloatArray:
+        """Return samples in the channel's unit while the same faults are active; NaN after a dropout.
+
+        Parameters
+        ----------
+        value_SI : ndarray, shape (n,)
+            True values, n ≥ 1.
+        noise : ndarray, shape (n,)
+            From `noise`.
+        faults : mapping
+            Active faults, kind to value.
+        """
+        settings = self._settings
+        level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
+        seen = value_SI + level * noise
+        seen = seen * settings.gain * _value(faults, "gain", 1.0) + settings.offset_SI + _value(faults, "offset", 0.0)
+        if "clip" in faults:
+            limit = _value(faults, "clip", np.inf)
+            seen = np.clip(seen, -limit, limit)
+        if settings.step_SI > 0:
+            seen = np.round(seen / settings.step_SI) * settings.step_SI
+        if "stuck" in faults:
+            seen = np.full_like(seen, seen[0] if self._held is None else self._held)
+        self._held = float(seen[-1])
+        if "dropout" in faults:
+            return np.full_like(seen, np.nan)
+        return np.asarray(seen / self.channel.to_si, dtype=np.float64)
+
+
+class SensorBank:
+    """All channels of a machine, in the order of its file.
+
+    Parameters
+    ----------
+    machine : Machine
+    sensors : Sensors
+        Settings from the scenario.
+    rms : ndarray, shape (12,)
+        Theoretical rms of the states at the start, SI.
+    faults : mapping of channel name to (sample number, active faults), ascending
+    rngs : sequence of numpy.random.Generator
+        One per channel.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        sensors: Sensors,
+        rms: FloatArray,
+        faults: Mapping[str, Sequence[tuple[int, SensorFaults]]],
+        rngs: Sequence[np.random.Generator],
+    ) -> None:
+        self._dtype = np.dtype(machine.dtype)
+        self._faults = faults
+        self._sensors = [
+            Sensor(channel, sensors.settings(channel), _reference(channel, rms), machine.rate_hz, rng)
+            for channel, rng in zip(machine.sensors, rngs, strict=True)
+        ]
+
+    def measure(self, plant: PlantSamples, first: int) -> npt.NDArray[np.float32] | FloatArray:
+        """Return all channels of consecutive plant samples; shape (n_samples, n_channels), the machine's dtype.
+
+        Parameters
+        ----------
+        plant : PlantSamples
+        first : int
+            Sample number of the first one.
+        """
+        n_samples = plant.theta_rad.size
+        samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)
+        for column, sensor in enumerate(self._sensors):
+            angle = sensor.channel.quantity is Quantity.SHAFT_ANGLE
+            value = plant.theta_rad if angle else plant.states[:, STATE_INDEX[state_name(sensor.channel)]]
+            noise = sensor.noise(n_samples)
+            for begin, end, faults in self._stretches(sensor.channel.name, first, n_samples):
+                samples[begin:end, column] = sensor.measure(value[begin:end], noise[begin:end], faults)
+            if angle:
+                samples[:, column] = _wrapped(samples[:, column])
+        return samples
+
+    def faults_at(self, sample: int) -> dict[str, SensorFaults]:
+        """Active faults by channel name at a sample; channels without any are left out."""
+        active = {name: _in_force(states, sample) for name, states in self._faults.items()}
+        return {name: faults for name, faults in active.items() if faults}
+
+    def _stretches(self, name: str, first: int, n_samples: int) -> list[tuple[int, int, SensorFaults]]:
+        """Rows during which one channel's faults stay the same."""
+        states = self._faults.get(name, ())
+        begin, end = (bisect_right(states, sample, key=_sample) for sample in (first, first + n_samples - 1))
+        cuts = [0, *(sample - first for sample, _ in states[begin:end]), n_samples]
+        return [(begin, end, _in_force(states, first + begin)) for begin, end in pairwise(cuts)]
+
+
+def _in_force(states: Sequence[tuple[int, SensorFaults]], sample: int) -> SensorFaults:
+    past = bisect_right(states, sample, key=_sample)
+    return states[past - 1][1] if past else _NO_FAULT
+
+
+def _sample(state: tuple[int, SensorFaults]) -> int:
+    return state[0]
+
+
+def _value(faults: SensorFaults, kind: str, otherwise: float) -> float:
+    value = faults.get(kind)
+    return otherwise if value is None else value
+
+
+def _reference(channel: Channel, rms: FloatArray) -> float:
+    return _TURN if channel.quantity is Quantity.SHAFT_ANGLE else float(rms[STATE_INDEX[state_name(channel)]])
+
+
+def _wrapped(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Bring angles into [0, 2π); in float32 the angle just below 2π rounds up to above it and becomes 0."""
+    wrapped = np.mod(angle, _TURN)
+    return np.where(wrapped >= _TURN, 0.0, wrapped)

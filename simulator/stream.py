@@ -1,0 +1,156 @@
+"""A scenario as a stream of sample blocks and truth records.
+
+The same scenario and seed give bit-identical samples whatever the length of the blocks: samples are made in pieces on a
+grid of their own and only then cut into blocks. The pieces end at changes of the plant but not at those of a sensor,
+so that a sensor's fault or setting never changes how the machine moves.
+"""
+
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from models.machine import Machine
+from models.signals.block import FloatArray, SampleBlock
+from simulator.integrator import Plant, theoretical_rms
+from simulator.scenario import Scenario
+from simulator.sensors import SensorBank
+from simulator.timeline import Condition, compile_timeline
+from simulator.truth import TruthRecord
+
+__all__ = ["DEFAULT_START_NS", "blocks"]
+
+DEFAULT_START_NS = 1_767_225_600_000_000_000
+"""2026-01-01T00:00:00Z: a fixed start, so that the same scenario makes the same bytes."""
+
+_PIECE_S = 0.5
+
+
+def blocks(
+    scenario: Scenario,
+    machine: Machine,
+    block_s: float = 0.1,
+    start_ns: int = DEFAULT_START_NS,
+    run: int = 1,
+) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
+    """Simulate a scenario, block by block.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    machine : Machine
+        The original machine; its channels, rate and number format shape the blocks.
+    block_s : float
+        Length of a block, s; the last one may be shorter.
+    start_ns : int
+        Acquisition time of the first sample, ns since 1970-01-01 UTC.
+    run : int
+        Run number in every block, 0 to 65535.
+
+    Yields
+    ------
+    block : SampleBlock
+    truth : tuple of TruthRecord
+        Records that begin within the block, ascending.
+
+    Raises
+    ------
+    MachineFileError
+        If the scenario names a channel the machine does not have.
+    ValueError
+        If a block would hold no sample.
+    """
+    scenario.check_channels(machine)
+    n_block = round(block_s * machine.rate_hz)
+    if n_block < 1:
+        raise ValueError(f"block_s {block_s} holds no sample at {machine.rate_hz} Hz")
+    return _cut(scenario, machine, n_block, start_ns, run)
+
+
+def _cut(
+    scenario: Scenario, machine: Machine, n_block: int, start_ns: int, run: int
+) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
+    simulation = _Simulation(scenario, machine, start_ns, run)
+    for sequence, first in enumerate(range(0, simulation.n_samples, n_block)):
+        last = min(first + n_block, simulation.n_samples)
+        samples = simulation.take(last - first)
+        truth = simulation.truth(last)
+        start = simulation.time_ns(first)
+        yield SampleBlock(start, sequence, run, machine.rate_hz, samples), truth
+
+
+class _Simulation:
+    """Plant, sensors and truth of one run, in pieces."""
+
+    def __init__(self, scenario: Scenario, machine: Machine, start_ns: int, run: int) -> None:
+        self._scenario, self._machine, self._start_ns, self._run = scenario, machine, start_ns, run
+        self.n_samples = max(1, round(scenario.duration_s * machine.rate_hz))
+        timeline = compile_timeline(scenario, machine)
+        self._conditions = deque(timeline.conditions)
+        self._past: list[tuple[int, Condition]] = [self._conditions.popleft()]
+        self._truth = deque(entry for entry in timeline.truth if entry[0] < self.n_samples)
+        plant_seed, *sensor_seeds = np.random.SeedSequence(scenario.seed).spawn(1 + len(machine.sensors))
+        initial = self._past[0][1]
+        self._plant = Plant(machine, initial, np.random.default_rng(plant_seed))
+        self._sensors = SensorBank(
+            machine,
+            scenario.sensors,
+            theoretical_rms(machine, initial),
+            timeline.sensor_faults,
+            [np.random.default_rng(seed) for seed in sensor_seeds],
+        )
+        self._piece = max(1, round(_PIECE_S * machine.rate_hz))
+        self._made = 0
+        self._rest = np.empty((0, len(machine.sensors)), dtype=machine.dtype)
+
+    def take(self, n_samples: int) -> npt.NDArray[np.float32] | FloatArray:
+        """Next samples of all channels."""
+        parts = [self._rest]
+        held = len(self._rest)
+        while held < n_samples:
+            parts.append(self._make())
+            held += len(parts[-1])
+        samples = np.concatenate(parts)
+        self._rest = samples[n_samples:]
+        return samples[:n_samples]
+
+    def _make(self) -> npt.NDArray[np.float32] | FloatArray:
+        first = self._made
+        if self._conditions and self._conditions[0][0] == first:
+            self._past.append(self._conditions.popleft())
+            self._plant.change(self._past[-1][1])
+        end = (first // self._piece + 1) * self._piece
+        if self._conditions:
+            end = min(end, self._conditions[0][0])
+        self._made = end
+        return self._sensors.measure(self._plant.advance(end - first), first)
+
+    def truth(self, last: int) -> tuple[TruthRecord, ...]:
+        """Take the records that are due before sample `last`."""
+        records = []
+        while self._truth and self._truth[0][0] < last:
+            records.append(self._record(*self._truth.popleft()))
+        while len(self._past) > 1 and self._past[1][0] <= last:
+            del self._past[0]
+        return tuple(records)
+
+    def _record(self, sample: int, ramping: tuple[str, ...]) -> TruthRecord:
+        condition = [condition for at, condition in self._past if at <= sample][-1]
+        return TruthRecord(
+            time_ns=self.time_ns(sample),
+            data_s=sample / self._machine.rate_hz,
+            run=self._run,
+            machine=self._machine.name,
+            scenario=self._scenario.name,
+            seed=self._scenario.seed,
+            relative_changes=dict(condition.relative_changes),
+            speed_rpm=condition.speed_rpm,
+            sources=condition.sources,
+            sensor_faults={name: dict(faults) for name, faults in self._sensors.faults_at(sample).items()},
+            ramping=ramping,
+        )
+
+    def time_ns(self, sample: int) -> int:
+        """Acquisition time of a sample."""
+        return self._start_ns + round(sample * 1e9 / self._machine.rate_hz)

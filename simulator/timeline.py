@@ -1,0 +1,226 @@
+"""A scenario's events as conditions that hold from one sample to the next.
+
+A ramp becomes a staircase of 0.1 s steps, each at the value the ramp has in its middle::
+
+    value                 ┌──  end
+                       ┌──┘
+                    ┌──┘
+    start ──────────┘
+                    at_s   at_s + ramp_s
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import get_args
+
+from models.machine import Machine
+from models.physics.parameters import PARAMETERS
+from simulator.scenario import SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Scenario, SensorFault
+
+__all__ = ["RAMP_STEP_S", "Condition", "SensorFaults", "Timeline", "compile_timeline"]
+
+RAMP_STEP_S = 0.1
+"""Length of the steps a ramp is made of."""
+
+_TRUTH_STEP_S = 1.0
+
+SensorFaults = Mapping[str, float | None]
+"""Active faults of one sensor: kind to value, None where the kind has no value."""
+
+_Target = tuple[str, ...]
+_Values = tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What the plant is made of, from one change to the next.
+
+    Attributes
+    ----------
+    relative_changes : mapping of str to float
+        Every diagnosed parameter's change from the original machine.
+    speed_rpm : float
+    sources : tuple of NamedSource
+        Always as many and in the same order, so that the state carries over.
+    """
+
+    relative_changes: Mapping[str, float]
+    speed_rpm: float
+    sources: tuple[NamedSource, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """Everything that happens, by sample number.
+
+    Attributes
+    ----------
+    conditions : tuple of (sample number, Condition)
+        Ascending, the first at 0; each holds from its sample on.
+    sensor_faults : mapping of channel name to a tuple of (sample number, SensorFaults)
+        Ascending; channels without events are absent.
+    truth : tuple of (sample number, targets that are ramping then)
+        When a truth record is due: at the start, at every change, and every second during a ramp.
+    """
+
+    conditions: tuple[tuple[int, Condition], ...]
+    sensor_faults: Mapping[str, tuple[tuple[int, SensorFaults], ...]]
+    truth: tuple[tuple[int, tuple[str, ...]], ...]
+
+
+def compile_timeline(scenario: Scenario, machine: Machine) -> Timeline:
+    """Turn a scenario's events into conditions by sample number.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    machine : Machine
+        Its nominal speed holds until an event changes it; events start at the nearest sample of its rate.
+    """
+    rate_hz = machine.rate_hz
+    events = sorted(scenario.events, key=lambda event: event.at_s)  # stable: equal times keep the file's order
+    plant_events = [event for event in events if event.sensor is None]
+    return Timeline(
+        conditions=_conditions(plant_events, scenario.sources, machine.operation.speed_rpm, rate_hz),
+        sensor_faults={
+            channel.name: _sensor_faults(
+                [event for event in events if event.sensor == channel.name],
+                scenario.sensors.settings(channel).noise_relative,
+                rate_hz,
+            )
+            for channel in machine.sensors
+            if any(event.sensor == channel.name for event in events)
+        },
+        truth=_truth_times(events, rate_hz),
+    )
+
+
+def _conditions(
+    events: list[Event], sources: tuple[NamedSource, ...], speed_rpm: float, rate_hz: float
+) -> tuple[tuple[int, Condition], ...]:
+    values: dict[_Target, _Values] = {("parameter", name): (0.0,) for name in PARAMETERS}
+    values["speed_rpm",] = (speed_rpm,)
+    for source in sources:
+        values["source", source.name, "cutoff_hz"] = (source.cutoff_hz,)
+        values["source", source.name, "force_rms_N"] = (source.force_rms_N,)
+        values["source", source.name, "direction"] = source.direction
+    changes = _steps(values, [(event, *_plant_target(event)) for event in events], rate_hz)
+    conditions = [(0, _condition(values, sources))]
+    for sample, due in _by_sample(changes):
+        values.update(due)
+        conditions.append((sample, _condition(values, sources)))
+    return tuple(conditions[1:] if len(conditions) > 1 and conditions[1][0] == 0 else conditions)
+
+
+def _condition(values: Mapping[_Target, _Values], sources: tuple[NamedSource, ...]) -> Condition:
+    def current(source: NamedSource) -> NamedSource:
+        cutoff_hz, force_rms_N, direction = (
+            values["source", source.name, field] for field in ("cutoff_hz", "force_rms_N", "direction")
+        )
+        return source.model_copy(
+            update={"cutoff_hz": cutoff_hz[0], "force_rms_N": force_rms_N[0], "direction": direction}
+        )
+
+    return Condition(
+        relative_changes={name: values["parameter", name][0] for name in PARAMETERS},
+        speed_rpm=values["speed_rpm",][0],
+        sources=tuple(current(source) for source in sources),
+    )
+
+
+def _plant_target(event: Event) -> tuple[_Target, _Values]:
+    if event.parameter is not None and event.relative_change is not None:
+        return ("parameter", event.parameter), (event.relative_change,)
+    if event.speed_rpm is not None:
+        return ("speed_rpm",), (event.speed_rpm,)
+    if event.cutoff_hz is not None:
+        return ("source", str(event.source), "cutoff_hz"), (event.cutoff_hz,)
+    if event.force_rms_N is not None:
+        return ("source", str(event.source), "force_rms_N"), (event.force_rms_N,)
+    return ("source", str(event.source), "direction"), event.direction or ()
+
+
+def _steps(
+    start: Mapping[_Target, _Values], events: list[tuple[Event, _Target, _Values]], rate_hz: float
+) -> dict[_Target, list[tuple[int, _Values]]]:
+    """Staircase of each target; a later event cuts an unfinished ramp off and starts from where it stands."""
+    steps: dict[_Target, list[tuple[int, _Values]]] = {}
+    for event, target, end in events:
+        first = round(event.at_s * rate_hz)
+        kept = [step for step in steps.get(target, []) if step[0] < first]
+        begin = (kept[-1][1] if kept else ()) or start.get(target, ())
+        steps[target] = kept + [(sample, _between(begin, end, part)) for sample, part in _ramp(event, rate_hz)]
+    return steps
+
+
+def _by_sample(steps: Mapping[_Target, list[tuple[int, _Values]]]) -> list[tuple[int, dict[_Target, _Values]]]:
+    due: dict[int, dict[_Target, _Values]] = {}
+    for target, staircase in steps.items():
+        for sample, value in staircase:
+            due.setdefault(sample, {})[target] = value
+    return sorted(due.items(), key=lambda entry: entry[0])
+
+
+def _ramp(event: Event, rate_hz: float) -> list[tuple[int, float]]:
+    """Sample numbers at which the steps of a change begin, and how much of it is done then."""
+    stairs: dict[int, float] = {}
+    begin_s = 0.0
+    number = 0
+    while begin_s < event.ramp_s - 1e-9:
+        end_s = min(begin_s + RAMP_STEP_S, event.ramp_s)
+        stairs[round((event.at_s + begin_s) * rate_hz)] = (begin_s + end_s) / 2 / event.ramp_s
+        number += 1
+        begin_s = number * RAMP_STEP_S
+    stairs[round((event.at_s + event.ramp_s) * rate_hz)] = 1.0
+    return list(stairs.items())
+
+
+def _between(begin: _Values, end: _Values, part: float) -> _Values:
+    if part == 1.0:
+        return end
+    return tuple(b + (e - b) * part for b, e in zip(begin, end, strict=True))
+
+
+def _sensor_faults(events: list[Event], noise_relative: float, rate_hz: float) -> tuple[tuple[int, SensorFaults], ...]:
+    """Active faults of one sensor by sample number; a kind that is not active has no values."""
+    neutral: dict[_Target, _Values] = {("offset",): (0.0,), ("gain",): (1.0,), ("noise_relative",): (noise_relative,)}
+    kinds = tuple(kind for kind in get_args(SensorFault) if kind != "none")
+    changes: list[tuple[Event, _Target, _Values]] = []
+    for event in events:
+        if event.sensor_fault == "none":
+            changes += [(event, (kind,), ()) for kind in kinds]
+        else:
+            changes.append((event, (str(event.sensor_fault),), (event.value_SI or 0.0,)))
+    steps = _steps(neutral, changes, rate_hz)
+    states: list[tuple[int, SensorFaults]] = []
+    active: dict[str, float | None] = {}
+    for sample, due in _by_sample(steps):
+        for (kind,), value in due.items():
+            active.pop(kind, None)
+            if value:
+                active[kind] = value[0] if kind in SENSOR_FAULTS_WITH_VALUE else None
+        states.append((sample, dict(active)))
+    return tuple(states)
+
+
+def _truth_times(events: list[Event], rate_hz: float) -> tuple[tuple[int, tuple[str, ...]], ...]:
+    due: dict[int, set[str]] = {0: set()}
+    for event in events:
+        seconds = 0.0
+        while seconds < event.ramp_s:
+            due.setdefault(round((event.at_s + seconds) * rate_hz), set())
+            seconds += _TRUTH_STEP_S
+        due.setdefault(round((event.at_s + event.ramp_s) * rate_hz), set())
+    for sample, names in due.items():
+        names.update(
+            _label(event)
+            for event in events
+            if round(event.at_s * rate_hz) <= sample < round((event.at_s + event.ramp_s) * rate_hz)
+        )
+    return tuple((sample, tuple(sorted(names))) for sample, names in sorted(due.items()))
+
+
+def _label(event: Event) -> str:
+    if event.speed_rpm is not None:
+        return "speed"
+    return str(event.parameter or event.source or event.sensor)

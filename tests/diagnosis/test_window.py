@@ -1,0 +1,186 @@
+"""Sliding correlations: online equals batch for any splitting; offsets, gaps and the synchronous part."""
+
+from dataclasses import fields
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.diagnosis.moments import Plan, plan_for
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import load_machine
+from models.signals.block import FloatArray
+
+RATE = 200.0
+
+
+def small_plan(*, angle: bool = True, hops: int = 4) -> Plan:
+    return Plan(
+        rate_hz=RATE,
+        states=("y1", "y1_dot"),
+        columns=np.array([0, 1]),
+        scales=np.array([1.0, 1.0]),
+        angle_column=2 if angle else None,
+        hop=100,
+        preamble=50,
+        segment=100,
+        lags=np.arange(0, 21, 2),
+        bins=np.arange(2, 40),
+        hops=hops,
+        max_span_ns=10**12,
+    )
+
+
+def signal(n_samples: int, seed: int, *, offset: float = 0.0, angle: bool = True) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((n_samples + 5, 2))
+    x = np.stack([noise[5 - lag : n_samples + 5 - lag] for lag in range(5)]).sum(axis=0) + offset
+    if not angle:
+        return x
+    theta = np.mod(0.4 + 2 * np.pi * 7.3 / RATE * np.arange(n_samples), 2 * np.pi)
+    x = x + np.outer(np.cos(theta), [2.0, 0.5]) + np.outer(np.sin(theta), [-1.0, 0.3])
+    return np.column_stack([x, theta])
+
+
+def feed(window: SlidingWindow, samples: FloatArray, start: int = 0) -> list[WindowStatistics]:
+    got = []
+    for _ in window.feed(samples, round(start * 1e9 / RATE)):
+        statistics = window.statistics()
+        if statistics is not None:
+            got.append(statistics)
+    return got
+
+
+def assert_identical(a: WindowStatistics, b: WindowStatistics) -> None:
+    for field in fields(WindowStatistics):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if isinstance(x, np.ndarray):
+            np.testing.assert_array_equal(x, y, err_msg=field.name)
+        else:
+            assert x == y or (x != x and y != y), field.name
+
+
+def batch_correlation(plan: Plan, samples: FloatArray, end: int) -> FloatArray:
+    """Straight from the definition: regress the window on mean and rotation, correlate what is left."""
+    start = end - plan.hops * plan.hop
+    n = 2
+    regressors = np.ones((samples.shape[0], 1))
+    if samples.shape[1] > n:
+        theta = samples[:, n]
+        regressors = np.column_stack([regressors, np.cos(theta), np.sin(theta)])
+    x = samples[:, :n] - samples[start:end, :n].mean(axis=0)
+    beta = np.linalg.lstsq(regressors[start:end], x[start:end], rcond=None)[0]
+    rest = x - regressors @ beta
+    return np.stack([rest[start - lag : end - lag].T @ rest[start:end] / (end - start) for lag in plan.lags])
+
+
+@settings(max_examples=30, deadline=None)
+@given(cuts=st.lists(st.integers(1, 1199), max_size=40), seed=st.integers(0, 1000))
+def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[int], seed: int) -> None:
+    plan, samples = small_plan(), signal(1200, seed)
+    whole = feed(SlidingWindow(plan), samples)
+    window, split = SlidingWindow(plan), []
+    edges = [0, *sorted(set(cuts)), 1200]
+    for begin, end in pairwise(edges):
+        split += feed(window, samples[begin:end], begin)
+        complete = max(0, (end - plan.preamble) // plan.hop - plan.hops + 1)
+        assert len(split) == complete
+        if split:
+            stop = plan.preamble + plan.hop * (complete + plan.hops - 1)
+            np.testing.assert_allclose(split[-1].correlation, batch_correlation(plan, samples, stop), atol=1e-11)
+    assert len(split) == len(whole) == 8
+    for a, b in zip(split, whole, strict=True):
+        assert_identical(a, b)
+
+
+def test_ten_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
+    """After every block of 100 000 samples the sliding estimate is the batch estimate of the same window."""
+    plan = Plan(
+        rate_hz=1e4, states=("y1", "y1_dot"), columns=np.array([0, 1]), scales=np.ones(2), angle_column=None,
+        hop=25_000, preamble=50, segment=100, lags=np.array([0, 5, 20]), bins=np.arange(2, 5), hops=4, max_span_ns=10**13,
+    )  # fmt: skip
+    window, tail, checked = SlidingWindow(plan), np.empty((0, 2)), 0
+    for block in range(100):
+        samples = signal(100_000, block, offset=2e6, angle=False)
+        statistics = [*[None], *[window.statistics() for _ in window.feed(samples, round(block * 1e10))]][-1]
+        tail = np.concatenate([tail, samples])[-160_000:]
+        end = tail.shape[0] - (100_000 * (block + 1) - plan.preamble) % plan.hop
+        if statistics is None or end < 100_020:
+            continue
+        expected = batch_correlation(plan, tail, end)
+        np.testing.assert_allclose(statistics.correlation, expected, atol=1e-9 * expected[0, 0, 0])
+        checked += 1
+    assert checked >= 98
+
+
+def test_synchronous_part_and_speed_are_recovered_and_removed() -> None:
+    plan, samples = small_plan(hops=20), signal(2100, 1)
+    statistics = feed(SlidingWindow(plan), samples)[-1]
+    assert statistics.synchronous is not None
+    assert statistics.hop_synchronous is not None
+    # Least squares over 2000 samples of noise with density 25 at low frequency: standard error √(2·25/2000)·√2 ≈ 0.22.
+    np.testing.assert_allclose(statistics.synchronous, [2.0 + 1.0j, 0.5 - 0.3j], atol=0.9)
+    assert statistics.speed_rad_s == pytest.approx(2 * np.pi * 7.3, rel=1e-9)
+    assert statistics.hop_synchronous.shape == (20, 2)
+    clean = signal(2100, 1)
+    theta = clean[:, 2]
+    clean[:, :2] += 50 * np.cos(theta)[:, None]
+    louder = feed(SlidingWindow(plan), clean)[-1]
+    np.testing.assert_allclose(louder.correlation, statistics.correlation, atol=1e-10)
+    np.testing.assert_allclose(louder.spectrum, statistics.spectrum, atol=1e-10)
+
+
+def test_spectrum_is_the_two_sided_density() -> None:
+    """White noise of unit variance has density 1/rate; 400 averages make the standard error of the mean 0.1 %."""
+    plan = small_plan(angle=False, hops=200)
+    x = np.random.default_rng(5).standard_normal((plan.preamble + 200 * plan.hop, 2))
+    statistics = feed(SlidingWindow(plan), x)[-1]
+    power = np.einsum("fii->i", statistics.spectrum).real / statistics.spectrum.shape[0]
+    np.testing.assert_allclose(power, 1 / RATE, rtol=0.03)
+    np.testing.assert_allclose(statistics.spectrum, statistics.spectrum.conj().transpose(0, 2, 1))
+
+
+def test_a_gap_costs_the_hop_it_falls_into_and_no_more() -> None:
+    plan, samples = small_plan(), signal(1200, 2)
+    window = SlidingWindow(plan)
+    feed(window, samples[:530])  # four hops and 80 samples
+    assert window.filled == 1.0
+    before = window.statistics()
+    window.gap()
+    later = signal(1200, 3)
+    feed(window, later[:140], 1000)
+    assert before is not None
+    now = window.statistics()
+    assert now is not None
+    assert_identical(now, before)
+    feed(window, later[140:150], 1140)
+    now = window.statistics()
+    assert now is not None
+    assert now.start_ns == before.start_ns + round(0.5e9)
+    assert now.end_ns == round(1150e9 / RATE)
+
+
+def test_hops_too_old_leave_the_window() -> None:
+    plan = small_plan()
+    short = Plan(**{field.name: getattr(plan, field.name) for field in fields(Plan)} | {"max_span_ns": 3 * 10**9})
+    window = SlidingWindow(short)
+    feed(window, signal(450, 2))
+    assert window.filled == 1.0
+    window.gap()
+    feed(window, signal(150, 3), 2000)
+    assert window.filled == 0.25
+    assert window.statistics() is None
+
+
+def test_plan_of_a_machine_names_its_states_in_the_order_of_the_theory() -> None:
+    machine = load_machine("lab")
+    plan = plan_for(machine)
+    assert plan.states == ("y1", "y2", "z1", "z2", "y1_dot", "y2_dot", "z1_dot", "z2_dot")
+    raw = np.arange(18, dtype=np.float32).reshape(2, 9)
+    si = plan.to_si(raw)
+    order = [machine.descriptor.states.index(name) for name in plan.states]
+    np.testing.assert_allclose(si[:, :4], raw[:, order[:4]] * 1e-6)
+    np.testing.assert_allclose(si[:, 4:8], raw[:, order[4:]] * 1e-3)
+    np.testing.assert_allclose(si[:, 8], raw[:, 8])

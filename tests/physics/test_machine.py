@@ -1,0 +1,85 @@
+"""The machine file: shipped ones, bounds, unknown keys, messages."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.errors import MachineFileError
+from models.machine import Machine, load_machine
+from models.physics.matrices import system_A
+from models.physics.parameters import PARAMETERS, changed
+
+LAB = (Path(__file__).parents[2] / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_shipped_machines_have_the_documented_modes() -> None:
+    for name, expected_hz in (
+        ("lab", (28.2, 30.3, 90.1, 94.3, 472, 507)),
+        ("heavy", (17.1, 18.4, 75.6, 92.6, 242, 254)),
+    ):
+        machine = load_machine(name)
+        values = np.linalg.eigvals(system_A(machine.rotor, machine.operation.speed_rad_s))
+        modes_hz = np.sort(np.abs(values[values.imag > 0])) / (2 * np.pi)
+        np.testing.assert_allclose(modes_hz, expected_hz, rtol=0.005)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("m1_kg = 0.5", "m1_kg = -0.5", "rotor.m1_kg: .*greater than 0.*-0.5"),
+        ("m1_kg = 0.5", "mass = 0.5", "rotor.mass: Extra inputs"),
+        ("rate_hz = 2000.0", "rate_hz = 2000.1", "whole number"),
+        ("band_hz = [3.0, 150.0]", "band_hz = [3.0, 1500.0]", "half of rate_hz"),
+        ('unit = "um"', 'unit = "furlong"', "furlong"),
+        ('name = "lab"', 'name = "la/b"', "'la/b' cannot be part of a key"),
+        ("hop_s = 5.0", "hop_s = 7.0", "multiple of hop_s"),
+        ("on_delay_s = 60.0", "on_delay_s = -1.0", "alarms.on_delay_s"),
+        ('name = "z1"', 'name = "y1"', "channel name occurs twice: y1"),
+        ("[rotor]", "[rotor", "not a TOML file"),
+    ],
+)
+def test_a_wrong_machine_file_is_refused_by_name(tmp_path: Path, old: str, new: str, message: str) -> None:
+    assert old in LAB
+    path = write(tmp_path, LAB.replace(old, new, 1))
+    with pytest.raises(MachineFileError, match=message) as caught:
+        load_machine(path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_machine_file_names_the_shipped_ones(tmp_path: Path) -> None:
+    with pytest.raises(MachineFileError, match="shipped machines: heavy, lab"):
+        load_machine(tmp_path / "none.toml")
+
+
+def test_physics_hash_follows_what_networks_depend_on(tmp_path: Path) -> None:
+    lab = load_machine("lab")
+    alarm = load_machine(write(tmp_path, LAB.replace("on_delay_s = 60.0", "on_delay_s = 61.0")))
+    rotor = load_machine(write(tmp_path, LAB.replace("m1_kg = 0.5", "m1_kg = 0.51")))
+    assert alarm.physics_hash == lab.physics_hash
+    assert rotor.physics_hash != lab.physics_hash
+
+
+def test_changed_parameters() -> None:
+    rotor = load_machine("lab").rotor
+    for name in PARAMETERS:
+        assert changed(rotor, {name: 0.1}) != rotor
+    assert changed(rotor, {"EI": 0.25}).EI_N_m2 == pytest.approx(1.25 * rotor.EI_N_m2)
+    assert rotor.EI_N_m2 == pytest.approx(2.1e11 * math.pi * 0.01**4 / 64)
+    with pytest.raises(ValueError, match="'k11' is not one of"):
+        changed(rotor, {"k11": 0.1})
+    with pytest.raises(ValueError, match="expected above -1"):
+        changed(rotor, {"k_by": -1.0})
+
+
+def test_machine_is_frozen() -> None:
+    machine: Machine = load_machine("lab")
+    with pytest.raises(ValueError, match="frozen"):
+        machine.rate_hz = 1.0

@@ -1,0 +1,102 @@
+"""Alarm scenarios in compact notation: one character per window of five seconds.
+
+``.`` nothing, ``x`` beyond the limit, ``X`` beyond danger, ``o`` between the limits, ``_`` not evaluated.
+Events: ``^`` raised, ``!`` escalated, ``v`` cleared.
+"""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.machine import AlarmSettings
+from service.alarms import AlarmBook, AlarmEvent, AlarmState, Severity
+
+CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "X": 0.6}
+MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}
+SETTINGS = AlarmSettings(on_delay_s=10, off_delay_s=15)
+
+
+def play(
+    story: str, settings: AlarmSettings = SETTINGS, error: float = 0.01
+) -> tuple[str, AlarmBook, list[AlarmEvent]]:
+    book, marks, events = AlarmBook(settings), "", []
+    for number, character in enumerate(story):
+        heard: tuple[AlarmEvent, ...] = ()
+        if character != "_":
+            heard = book.update("k_by", CHANGES[character], error, number * 5_000_000_000)
+        marks += MARKS[heard[0].kind] if heard else " "
+        events += heard
+    return marks, book, events
+
+
+@pytest.mark.parametrize(
+    ("story", "expected"),
+    [
+        ("..xx......", "          "),  # shorter than the on-delay
+        ("..xxx.....", "    ^   v "),
+        ("..xx.xxx..", "       ^  "),  # interrupted: the delay starts anew
+        ("..xxxxx.....", "    ^     v "),
+        ("..xxx.x.....", "    ^     v "),  # chattering while clearing does not raise again
+        ("..xxxoooooo", "    ^      "),  # between the limits: neither clears nor raises
+        ("oooooooo", "        "),
+        ("..xxxXX....", "    ^!    v"),
+        ("XXX.....", "  ^   v "),  # straight to danger: one event
+        ("..xxx____....", "    ^       v"),  # missing data clears nothing
+        ("..x____xx", "       ^ "),  # and does not stop a pending delay, which is data time
+        ("..xxx....xxx", "    ^   v  ^"),
+    ],
+)
+def test_stories(story: str, expected: str) -> None:
+    assert play(story)[0] == expected
+
+
+def test_a_change_must_exceed_its_own_uncertainty() -> None:
+    assert "^" not in play("xxxxxxxx", error=0.041)[0]  # 4.9 standard errors
+    assert "^" in play("xxxxxxxx", error=0.039)[0]
+
+
+def test_a_large_uncertain_change_clears_an_alarm_only_when_it_is_insignificant() -> None:
+    _, book, _ = play("xxx")
+    for number in range(3, 10):
+        book.update("k_by", -0.2, 0.05, number * 5_000_000_000)  # 4 standard errors: above clear_z
+    assert book.alarms[0].state is AlarmState.ACTIVE
+
+
+def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
+    _, book, events = play("xxx....xxxX....")
+    assert [event.sequence for event in events] == [0, 1, 2, 3, 4]
+    assert [event.alarm.occurrence for event in events] == [1, 1, 2, 2, 2]
+    assert events[0].text == "ALERT: bearing stiffness, horizontal (k_by) changed by -20.0% ± 2.0%"
+    assert events[3].text.startswith("DANGER: bearing stiffness, horizontal (k_by) changed further, now +60.0%")
+    assert events[4].text.startswith("cleared: ")
+    assert book.severity is None
+
+
+def test_severity_is_the_highest_of_the_raised_alarms() -> None:
+    _, book, _ = play("xxx")
+    assert book.severity is Severity.ALERT
+    for number in range(4):
+        book.update("e", 0.9, 0.01, number * 5_000_000_000)
+    assert book.severity is Severity.DANGER
+
+
+def test_own_limits_of_a_parameter() -> None:
+    settings = AlarmSettings.model_validate({"on_delay_s": 0, "parameters": {"k_by": {"raise_above": 0.3}}})
+    assert "^" not in play("xxx", settings)[0]
+    assert "^" in play("X", settings)[0]
+
+
+def test_a_stepped_clock_restarts_the_delays() -> None:
+    book = AlarmBook(SETTINGS)
+    assert not book.update("k_by", -0.2, 0.01, 10**18)
+    book.clock_stepped(10**9)
+    assert not book.update("k_by", -0.2, 0.01, 2 * 10**9)
+    assert book.update("k_by", -0.2, 0.01, 12 * 10**9)[0].kind == "raised"
+
+
+@given(story=st.text(".oxX_", max_size=80))
+def test_raised_and_cleared_alternate(story: str) -> None:
+    _, book, events = play(story)
+    kinds = [event.kind for event in events if event.kind != "escalated"]
+    assert kinds == ["raised", "cleared"] * (len(kinds) // 2) + ["raised"] * (len(kinds) % 2)
+    assert any(alarm.raised for alarm in book.alarms) == (len(kinds) % 2 == 1)

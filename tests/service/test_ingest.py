@@ -1,0 +1,117 @@
+"""The gate: each reason to refuse, gaps, restarts, stepped clocks, as a table of blocks."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.machine import load_machine
+from models.signals.block import SampleBlock
+from service.ingest import Gate, Reason, Verdict
+
+MACHINE = load_machine("lab")
+START_NS = 1_800_000_000_000_000_000
+LENGTH = 200
+STEP_NS = 100_000_000
+
+
+def block(number: int, *, sequence: int | None = None, run: int = 1, shift_ns: int = 0) -> SampleBlock:
+    samples = np.random.default_rng(number).standard_normal((LENGTH, 9)).astype(np.float32)
+    start_ns = START_NS + number * STEP_NS + shift_ns
+    return SampleBlock(start_ns, number if sequence is None else sequence, run, 2000.0, samples)
+
+
+def judge(*blocks: SampleBlock) -> list[Verdict]:
+    gate = Gate(MACHINE)
+    return [gate.judge(each) for each in blocks]
+
+
+def test_contiguous_blocks_are_accepted_silently() -> None:
+    verdicts = judge(*(block(number) for number in range(5)))
+    assert verdicts == [Verdict()] * 5
+    assert all(verdict.continuous for verdict in verdicts)
+
+
+def test_jitter_within_the_tolerance_is_no_gap() -> None:
+    assert judge(block(0), block(1, shift_ns=400_000), block(2))[1:] == [Verdict(), Verdict()]
+
+
+def not_finite(value: float) -> SampleBlock:
+    bad = block(1)
+    bad.samples[7, 2] = value
+    return bad
+
+
+@pytest.mark.parametrize(
+    ("bad", "reason", "says"),
+    [
+        (replace(block(1), samples=np.zeros((LENGTH, 8), np.float32)), Reason.CHANNELS, "8 channels, expected 9"),
+        (replace(block(1), rate_hz=1999.0), Reason.RATE, "rate_hz 1999, expected 2000"),
+        (replace(block(1), samples=np.zeros((1, 9), np.float32)), Reason.SHAPE, "1 samples"),
+        (replace(block(1), samples=np.zeros((5000, 9), np.float32)), Reason.SHAPE, "5000 samples"),
+        (not_finite(np.nan), Reason.NOT_FINITE, "channel y1_dot: sample 7 is nan"),
+        (not_finite(np.inf), Reason.NOT_FINITE, "channel y1_dot: sample 7 is inf"),
+        (block(0), Reason.OVERLAP, "repetition"),
+        (block(1, sequence=5), Reason.SEQUENCE, "sequence is 5 .* expected 1"),
+        (block(1, shift_ns=-10 * STEP_NS), Reason.PAST, "before what was received"),
+        (block(1, shift_ns=7200 * 10**9), Reason.FUTURE, "7200 s ahead, expected at most 3600 s"),
+    ],
+)
+def test_a_bad_block_is_refused_with_a_reason_and_the_next_good_one_accepted(
+    bad: SampleBlock, reason: Reason, says: str
+) -> None:
+    first, refused, after = judge(block(0), bad, block(1))
+    assert first.accepted
+    assert refused.reason is reason
+    assert refused.text.startswith("demo/lab: ")
+    assert re.search(says, refused.text)
+    assert after == Verdict()
+
+
+def test_another_channel_descriptor_is_refused() -> None:
+    gate = Gate(MACHINE)
+    assert gate.judge(block(0), MACHINE.descriptor.schema_hash).accepted
+    verdict = gate.judge(block(1), "0123456789ab")
+    assert verdict.reason is Reason.CHANNELS
+    assert "0123456789ab" in verdict.text
+    assert gate.judge(block(1)).accepted  # a sender may leave the hash out
+
+
+def test_a_gap_is_accepted_and_measured() -> None:
+    verdict = judge(block(0), block(4))[1]
+    assert verdict.accepted
+    assert not verdict.continuous
+    assert verdict.gap_s == pytest.approx(0.3)
+    assert "0.3 s of data are missing (3 blocks)" in verdict.text
+
+
+def test_a_restarted_publisher_is_followed_forward_in_time() -> None:
+    gapless, later = judge(block(0), block(1, sequence=0, run=2))[1], judge(block(0), block(9, sequence=0, run=2))[1]
+    assert gapless.accepted
+    assert "restarted" in gapless.text
+    assert not gapless.continuous
+    assert later.gap_s == pytest.approx(0.8)
+    assert "restarted" in later.text
+
+
+@pytest.mark.parametrize(("shift_s", "reason"), [(-5000, Reason.PAST), (5000, Reason.FUTURE)])
+def test_a_stepped_clock_is_believed_after_ten_blocks_that_agree(shift_s: int, reason: Reason) -> None:
+    stepped = [block(n, sequence=n - 1, run=2, shift_ns=shift_s * 10**9) for n in range(1, 13)]
+    verdicts = judge(block(0), *stepped)[1:]
+    assert [verdict.reason for verdict in verdicts] == [reason] * 9 + [None] * 3
+    assert "clock stepped" in verdicts[9].text
+    assert verdicts[9].gap_s == pytest.approx(shift_s + 0.9)
+    assert verdicts[10].continuous
+
+
+def test_scattered_wild_times_never_move_the_clock() -> None:
+    wild = [block(n, run=2, shift_ns=n * 9000 * 10**9) for n in range(1, 40)]
+    assert all(verdict.reason is Reason.FUTURE for verdict in judge(block(0), *wild)[1:])
+
+
+def test_repeated_history_of_the_same_run_never_moves_the_clock() -> None:
+    blocks = [block(n) for n in range(30)]
+    verdicts = judge(*blocks, *blocks, block(30))
+    assert all(verdict.reason is Reason.OVERLAP for verdict in verdicts[30:60])
+    assert verdicts[60] == Verdict()

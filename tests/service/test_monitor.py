@@ -1,0 +1,138 @@
+"""The data path of one machine, fed by the simulator's blocks without any transport."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from models.diagnosis.bundle import load_bundle
+from models.physics.parameters import PARAMETERS
+from models.signals.block import SampleBlock
+from models.signals.wire import encode_block
+from service.alarms import AlarmEvent
+from service.ingest import Reason
+from service.monitor import HealthState, MachineMonitor, WindowReport
+from simulator.scenario import Scenario, load_scenario
+from simulator.stream import blocks
+
+SEED = 7_700_002
+
+
+def scenario(name: str, duration_s: float, seed: int = SEED) -> Scenario:
+    loaded, _ = load_scenario(name)
+    events = [event for event in loaded.events if event.at_s < duration_s]
+    fields = loaded.model_dump() | {"duration_s": duration_s, "seed": seed, "events": [e.model_dump() for e in events]}
+    return Scenario.model_validate(fields)
+
+
+def monitor() -> MachineMonitor:
+    _, machine = load_scenario("healthy")
+    return MachineMonitor(machine, load_bundle("lab", machine))
+
+
+def feed(target: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[WindowReport], list[AlarmEvent]]:
+    windows, events = [], []
+    for block in stream:
+        report = target.step(block)
+        windows += report.windows
+        events += report.events
+    return windows, events
+
+
+def stream(name: str, duration_s: float, block_s: float = 0.1) -> list[SampleBlock]:
+    _, machine = load_scenario(name)
+    return [block for block, _ in blocks(scenario(name, duration_s), machine, block_s=block_s)]
+
+
+def test_reports_do_not_depend_on_the_blocks() -> None:
+    """Tenths of a second, uneven lengths, 1.9 s blocks, and encoded bytes: the same reports to the last bit."""
+    fine = stream("healthy", 72.0)
+    expected, _ = feed(monitor(), fine)
+    assert [report.state for report in expected[:11]] == [HealthState.WARMING] * 11
+    assert [report.state for report in expected[11:]] == [HealthState.HEALTHY] * 3
+    coarse, _ = feed(monitor(), stream("healthy", 72.0, block_s=1.9))
+    assert coarse == expected
+    samples = np.concatenate([block.samples for block in fine])
+    cuts = np.cumsum(np.random.default_rng(0).integers(10, 3000, 200))
+    cuts = np.array([0, *cuts[cuts < samples.shape[0]], samples.shape[0]])
+    uneven = [
+        SampleBlock(fine[0].start_ns + int(begin) * 500_000, number, 1, 2000.0, samples[begin:end])
+        for number, (begin, end) in enumerate(pairwise(cuts))
+    ]
+    assert feed(monitor(), uneven)[0] == expected
+    target = monitor()
+    decoded = [target.step_payload(*encode_block(block, target.machine.descriptor.schema_hash)) for block in fine]
+    assert [window for report in decoded for window in report.windows] == expected
+
+
+def test_every_parameter_and_equation_is_accounted_for() -> None:
+    window = feed(monitor(), stream("healthy", 62.0))[0][-1]
+    assert [reading.name for reading in window.parameters] == list(PARAMETERS)
+    for reading in window.parameters:
+        assert reading.by == "likelihood"
+        assert reading.interval is not None
+        assert abs(reading.z or 0.0) < 4.5
+    verdicts = {equation.equation: equation for equation in window.equations}
+    assert list(verdicts) == ["28", "29", "30", "31"]
+    assert verdicts["30"].reason == "not measured: psi_dot, psi, phi_dot"
+    assert verdicts["30"].parameters == ()
+    for number in ("28", "29", "31"):
+        assert verdicts[number].evaluable
+        assert verdicts[number].msd is not None
+        assert all(abs(reading.z or 0.0) < 4.5 for reading in verdicts[number].parameters)
+
+
+def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
+    everything = stream("healthy", 180.0)
+    target = monitor()
+    before, _ = feed(target, everything[:650])
+    assert before[-1].state is HealthState.HEALTHY
+    after, events = feed(target, everything[1050:])  # 40 s are lost: too much for the window's span
+    quality = target.health().quality
+    assert quality.gaps == 1
+    assert quality.missing_s == pytest.approx(40.0)
+    assert "40 s of data are missing" in quality.last_gap
+    assert not events
+    states = [report.state for report in after]
+    refilled = states.index(HealthState.HEALTHY)
+    assert states[:refilled] == [HealthState.WARMING] * refilled
+    assert refilled >= 5
+    assert set(states[refilled:]) == {HealthState.HEALTHY}
+
+
+def test_undecodable_bytes_are_a_refusal_like_any_other() -> None:
+    target = monitor()
+    report = target.step_payload(b"abc", b"too short", "application/x-rotorwatch-block")
+    assert report.verdict.reason is Reason.MALFORMED
+    assert "demo/lab: header (attachment) has 9 bytes, expected 32" in report.verdict.text
+    assert target.health().quality.refused == (("malformed", 1),)
+
+
+def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
+    loaded, machine = load_scenario("healthy")
+    fields = loaded.model_dump() | {"duration_s": 75.0, "seed": SEED, "events": [{"at_s": 0, "speed_rpm": 2000}]}
+    stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
+    windows, events = feed(MachineMonitor(machine, None), stream_)
+    assert windows[-1].state is HealthState.NOT_EVALUABLE
+    assert "speed is 2000 rpm, evaluated are 1320 rpm ± 25%" in windows[-1].reason
+    assert windows[-1].parameters == ()
+    assert not events
+
+
+def test_without_a_bundle_the_equations_say_so() -> None:
+    _, machine = load_scenario("healthy")
+    window = feed(MachineMonitor(machine, None), stream("healthy", 62.0))[0][-1]
+    assert {equation.reason for equation in window.equations} == {"no trained network"}
+
+
+@pytest.mark.slow
+def test_a_stiffness_fault_is_named_sized_and_the_only_alarm() -> None:
+    windows, events = feed(monitor(), stream("k_by", 300.0))
+    assert [(event.kind, event.alarm.parameter) for event in events] == [("raised", "k_by")]
+    assert events[0].alarm.change == pytest.approx(-0.25, abs=0.02)
+    assert windows[-1].state is HealthState.ALERT
+    # The network of equation 28 says so too, that of equation 31 sees nothing.
+    seen = {reading.name: reading for equation in windows[-1].equations for reading in equation.parameters}
+    assert seen["k_by"].change == pytest.approx(-0.25, abs=0.08)
+    assert (seen["k_by"].z or 0.0) < -3
+    assert abs(seen["k_bz"].z or 0.0) < 4.5

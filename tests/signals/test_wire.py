@@ -1,0 +1,306 @@
+"""Wire format: round trips, every refusal, and the page that describes it (``docs/wire.md``), whose examples run here."""
+
+import ctypes
+import json
+import re
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import zenoh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from models.errors import WireError
+from models.signals.block import SampleBlock
+from models.signals.channels import UNIT_TO_SI, ChannelDescriptor
+from models.signals.wire import (
+    ARROW_ENCODING,
+    BLOCK_ENCODING,
+    HEADER_BYTES,
+    decode_block,
+    encode_arrow,
+    encode_block,
+)
+
+PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
+Encoder = Callable[[SampleBlock, str], tuple[bytes, bytes, str]]
+
+
+def _page_blocks(language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+
+
+def _block(samples: npt.NDArray[Any] | None = None) -> SampleBlock:
+    if samples is None:
+        samples = np.arange(12, dtype=np.float32).reshape(4, 3)
+    return SampleBlock(start_ns=1_767_225_600_000_000_123, sequence=7, run=3, rate_hz=2000.0, samples=samples)
+
+
+def _header(**fields: float) -> bytes:
+    values: dict[str, Any] = {
+        "start_ns": 0, "sequence": 0, "rate_hz": 2000.0, "dtype": 1, "channels": 3, "run": 1, "samples": 4,
+    }  # fmt: skip
+    values.update(fields)
+    return struct.pack("<qQdBBHI", *values.values())
+
+
+_samples = st.one_of(
+    [
+        arrays(
+            dtype,
+            st.tuples(st.integers(1, 40), st.integers(1, 64)),
+            elements=st.floats(width=width, allow_nan=True, allow_infinity=True),
+        )
+        for dtype, width in ((np.float32, 32), (np.float64, 64))
+    ]
+)
+
+
+@pytest.mark.parametrize("encode", [encode_block, encode_arrow])
+@settings(deadline=None, max_examples=60)
+@given(
+    samples=_samples,
+    start_ns=st.integers(-(2**63), 2**63 - 1),
+    sequence=st.integers(0, 2**64 - 1),
+    run=st.integers(0, 2**16 - 1),
+    rate_hz=st.floats(1e-3, 1e6),
+    schema_hash=st.sampled_from(["", "0123456789ab"]),
+)
+def test_any_block_survives_the_round_trip(
+    encode: Encoder,
+    samples: npt.NDArray[Any],
+    start_ns: int,
+    sequence: int,
+    run: int,
+    rate_hz: float,
+    schema_hash: str,
+) -> None:
+    sent = SampleBlock(start_ns, sequence, run, rate_hz, samples)
+    received, received_hash = decode_block(*encode(sent, schema_hash))
+    assert (received.start_ns, received.sequence, received.run, received.rate_hz) == (start_ns, sequence, run, rate_hz)
+    assert received_hash == schema_hash
+    assert received.samples.dtype == samples.dtype
+    assert received.samples.tobytes() == samples.tobytes()  # bit by bit: NaN payloads and signed zeros too
+    assert received.samples.shape == samples.shape
+
+
+@pytest.mark.parametrize("encode", [encode_block, encode_arrow])
+@pytest.mark.parametrize(
+    "view",
+    [
+        np.asfortranarray(np.arange(12, dtype=np.float32).reshape(4, 3)),
+        np.arange(24, dtype=np.float64).reshape(4, 6)[:, ::2],
+    ],
+    ids=["fortran", "strided"],
+)
+def test_layout_in_memory_does_not_matter(encode: Encoder, view: npt.NDArray[Any]) -> None:
+    received, _ = decode_block(*encode(_block(view), ""))
+    np.testing.assert_array_equal(received.samples, view)
+
+
+def test_big_endian_samples_are_sent_little_endian() -> None:
+    samples = np.arange(12, dtype=">f4").reshape(4, 3)
+    payload, _, _ = encode_block(_block(samples), "")
+    assert payload == samples.astype("<f4").tobytes()
+
+
+def test_an_encoding_without_hash_is_accepted() -> None:
+    payload, header, _ = encode_block(_block(), "0123456789ab")
+    _, schema_hash = decode_block(payload, header, BLOCK_ENCODING)
+    assert schema_hash == ""
+
+
+def test_end_is_one_sample_after_the_last() -> None:
+    assert _block().end_ns - _block().start_ns == 2_000_000
+
+
+PAYLOAD = b"\0" * 48
+
+
+@pytest.mark.parametrize(
+    ("payload", "header", "encoding", "message"),
+    [
+        (PAYLOAD, _header(), "text/plain", "encoding 'text/plain' is not"),
+        (PAYLOAD, _header()[:-1], BLOCK_ENCODING, "header .* has 31 bytes, expected 32"),
+        (PAYLOAD, b"", BLOCK_ENCODING, "header .* has 0 bytes, expected 32"),
+        (PAYLOAD, _header(dtype=0), BLOCK_ENCODING, "dtype is 0, expected 1"),
+        (PAYLOAD, _header(dtype=3), BLOCK_ENCODING, "dtype is 3, expected 1"),
+        (b"", _header(samples=0), BLOCK_ENCODING, "samples is 0, expected 1 to 1000000"),
+        (b"", _header(samples=1_000_001), BLOCK_ENCODING, "samples is 1000001, expected 1 to 1000000"),
+        (b"", _header(channels=0), BLOCK_ENCODING, "channels is 0, expected at least 1"),
+        (PAYLOAD[:-1], _header(), BLOCK_ENCODING, "payload has 47 bytes, expected 48 for 4 samples × 3 channels"),
+        (PAYLOAD, _header(dtype=2), BLOCK_ENCODING, "payload has 48 bytes, expected 96"),
+        (PAYLOAD, _header(rate_hz=0.0), BLOCK_ENCODING, "rate_hz is 0.0, expected above 0"),
+        (PAYLOAD, _header(rate_hz=1e7), BLOCK_ENCODING, "rate_hz is 10000000.0"),
+        (PAYLOAD, _header(rate_hz=float("nan")), BLOCK_ENCODING, "rate_hz is nan"),
+        (b"", b"", ARROW_ENCODING, "Arrow stream"),
+        (b"not an arrow stream at all", b"", ARROW_ENCODING, "Arrow stream"),
+    ],
+)
+def test_what_is_not_a_block_is_refused(payload: bytes, header: bytes, encoding: str, message: str) -> None:
+    with pytest.raises(WireError, match=message):
+        decode_block(payload, header, encoding)
+
+
+def _arrow(column: Any, name: str = "samples", **metadata: str) -> bytes:
+    import pyarrow as pa
+
+    fields = {"start_ns": "0", "sequence": "0", "run": "1", "rate_hz": "2000.0", **metadata}
+    schema = pa.schema([pa.field(name, column.type)], metadata={k: v for k, v in fields.items() if v})
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, schema) as writer:
+        writer.write_batch(pa.record_batch([column], schema=schema))
+    return bytes(sink.getvalue())
+
+
+def _arrow_column(values: list[Any], kind: str) -> Any:
+    import pyarrow as pa
+
+    return pa.FixedSizeListArray.from_arrays(pa.array(values, getattr(pa, kind)()), 3)
+
+
+@pytest.mark.parametrize("field", ["start_ns", "sequence", "run", "rate_hz"])
+@pytest.mark.parametrize("text", ["", "soon"])
+def test_arrow_metadata_must_be_numbers(field: str, text: str) -> None:
+    payload = _arrow(_arrow_column([1.0] * 6, "float32"), **{field: text})
+    with pytest.raises(WireError, match=f"metadata field '{field}'"):
+        decode_block(payload, b"", ARROW_ENCODING)
+
+
+def test_arrow_columns_must_be_lists_of_floats() -> None:
+    import pyarrow as pa
+
+    with pytest.raises(WireError, match="'samples'"):
+        decode_block(_arrow(_arrow_column([1.0] * 6, "float32"), name="other"), b"", ARROW_ENCODING)
+    with pytest.raises(WireError, match="'samples'"):
+        decode_block(_arrow(pa.array([1.0, 2.0])), b"", ARROW_ENCODING)
+    with pytest.raises(WireError, match="holds int32"):
+        decode_block(_arrow(_arrow_column([1] * 6, "int32")), b"", ARROW_ENCODING)
+    with pytest.raises(WireError, match="samples is 0"):
+        decode_block(_arrow(_arrow_column([], "float32")), b"", ARROW_ENCODING)
+
+
+@settings(deadline=None, max_examples=100)
+@given(
+    payload=st.binary(max_size=200),
+    header=st.binary(max_size=40),
+    encoding=st.sampled_from([BLOCK_ENCODING, ARROW_ENCODING]),
+)
+def test_arbitrary_bytes_make_a_block_or_a_wire_error(payload: bytes, header: bytes, encoding: str) -> None:
+    try:
+        block, _ = decode_block(payload, header, encoding)
+    except WireError:
+        return
+    assert block.samples.ndim == 2
+
+
+def test_a_truncated_arrow_stream_is_refused() -> None:
+    payload, _, encoding = encode_arrow(_block(), "")
+    refused = 0
+    for cut in range(len(payload)):
+        try:
+            block, _ = decode_block(payload[:cut], b"", encoding)
+        except WireError:
+            refused += 1
+        else:  # only the end-of-stream mark may be missing
+            np.testing.assert_array_equal(block.samples, _block().samples)
+    assert refused > len(payload) * 0.9
+
+
+# The page -------------------------------------------------------------------------------------------------------------
+
+
+_C_TYPES = {
+    "int64_t": ctypes.c_int64, "uint64_t": ctypes.c_uint64, "double": ctypes.c_double,
+    "uint8_t": ctypes.c_uint8, "uint16_t": ctypes.c_uint16, "uint32_t": ctypes.c_uint32,
+}  # fmt: skip
+_C_FIELDS = [
+    (name, _C_TYPES[kind]) for kind, name in re.findall(r"^ +(\w+) +(\w+);", _page_blocks("c")[0], re.MULTILINE)
+]
+
+
+class _CHeader(ctypes.LittleEndianStructure):
+    """The C struct of the page, built from its text."""
+
+    _fields_ = _C_FIELDS
+
+
+def test_the_page_c_struct_and_table_are_the_header() -> None:
+    header = _CHeader.from_buffer_copy(encode_block(_block(), "")[1])
+    assert ctypes.sizeof(_CHeader) == HEADER_BYTES
+    assert (header.start_ns, header.sequence, header.rate_hz) == (1_767_225_600_000_000_123, 7, 2000.0)
+    assert (header.dtype, header.channels, header.run, header.samples) == (1, 3, 3, 4)
+    rows = re.findall(r"^\| (\d+) \| (\d) \| \w+ \| (\w+) \|", PAGE, re.MULTILINE)
+    table = [(name, int(offset), int(size)) for offset, size, name in rows]
+    in_c = [(name, getattr(_CHeader, name)) for name, _ in _C_FIELDS]
+    assert table == [(name, field.offset, field.size) for name, field in in_c]
+
+
+def test_the_page_names_encodings_and_units() -> None:
+    assert BLOCK_ENCODING in PAGE
+    assert ARROW_ENCODING in PAGE
+    for quantity, units in UNIT_TO_SI.items():
+        row = re.search(rf"^\| {quantity} \|.*\| ([^|]+) \|$", PAGE, re.MULTILINE)
+        assert row is not None
+        assert row[1].split(", ") == list(units)
+
+
+def test_the_page_arrow_example_is_a_block() -> None:
+    names: dict[str, Any] = {}
+    exec(_page_blocks("python")[1], names)  # noqa: S102  # our own page
+    block, schema_hash = decode_block(names["payload"], b"", ARROW_ENCODING)
+    np.testing.assert_array_equal(block.samples, np.array([[1, 2, 3], [4, 5, 6]], dtype=np.float32))
+    assert (block.start_ns, block.sequence, block.run, block.rate_hz) == (1_767_225_600_000_000_000, 0, 1, 2000.0)
+    assert schema_hash == ""
+
+
+def test_the_page_python_example_is_received(tmp_path: Path) -> None:
+    script = tmp_path / "example.py"
+    script.write_text(_page_blocks("python")[0], encoding="utf-8")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    received: list[tuple[str, bytes, bytes, str]] = []
+    complete = threading.Event()
+
+    def keep(sample: zenoh.Sample) -> None:
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        received.append((str(sample.key_expr), sample.payload.to_bytes(), attachment, str(sample.encoding)))
+        if sum(key.endswith("/stream") for key, *_ in received) == 4:
+            complete.set()
+
+    with zenoh.open(config) as session:
+        session.declare_subscriber("rotorwatch/demo/rig7/*", keep)
+        begin = time.time_ns()
+        with subprocess.Popen([sys.executable, str(script), endpoint, "4"]) as process:
+            assert complete.wait(30)
+            assert process.wait(30) == 0
+    descriptors = [payload for key, payload, _, _ in received if key.endswith("/descriptor")]
+    descriptor = ChannelDescriptor.model_validate_json(descriptors[0])
+    assert descriptor == ChannelDescriptor.model_validate_json(_page_blocks("json")[0])
+    stream = [decode_block(*rest) for key, *rest in received if key.endswith("/stream")]
+    assert [block.sequence for block, _ in stream] == [0, 1, 2, 3]
+    assert {schema_hash for _, schema_hash in stream} == {descriptor.schema_hash}
+    assert len({block.run for block, _ in stream}) == 1
+    for (earlier, _), (later, _) in zip(stream, stream[1:], strict=False):
+        assert later.start_ns == earlier.end_ns
+    assert stream[0][0].start_ns >= begin
+    samples = np.concatenate([block.samples for block, _ in stream])
+    angle = 2 * np.pi * 22.0 * np.arange(800) / 2000.0
+    # float32 resolves 10 um to 1e-6 um
+    np.testing.assert_allclose(samples[:, 0], 10 * np.cos(angle), atol=2e-6)
+    np.testing.assert_allclose(samples[:, 2], angle % (2 * np.pi), atol=1e-6)

@@ -1,0 +1,170 @@
+"""The command line: recordings, exit codes, messages, signals, and a quick start."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from typer.testing import CliRunner, Result
+
+from models.signals.recording import read_recording, summarize_recording
+from models.signals.wire import decode_block
+from simulator.rotorsim import app
+from simulator.scenario import load_scenario
+from simulator.stream import DEFAULT_START_NS, blocks
+from simulator.truth import TruthRecord
+
+ROOT = Path(__file__).parents[2]
+
+
+def _run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = (
+        "import sys; sys.argv = ['rotorsim', 'publish', '--help']\n"
+        "from simulator.rotorsim import app\n"
+        "try:\n    app()\nexcept SystemExit as end:\n    assert end.code == 0\n"
+        "heavy = {'scipy', 'torch', 'zenoh', 'pyarrow', 'mcap'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "back-pressure" in done.stdout
+
+
+def test_help_of_the_module_shows_examples_and_scenarios() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "simulator.rotorsim", "record", "--help"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "rotorsim record c_by c_by.mcap" in done.stdout
+    assert "k_bz" in _run("--help").output
+
+
+def test_a_recording_holds_what_the_publisher_would_send(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    result = _run("record", "k_by", path, "--duration", 12, "--seed", 5, "--fault", "e=0.3@3", "--block-s", 0.25)
+    assert (result.exit_code, result.stdout) == (2, "")  # the scenario's own fault comes at 140 s
+    assert "ends at 140 s, after duration_s 12" in result.stderr
+    result = _run("record", "healthy", path, "--duration", 12, "--seed", 5, "--fault", "e=0.3@3", "--block-s", 0.25)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"recorded 48 blocks, 12.0 s of data, in {path}\n"
+    scenario, machine = load_scenario("healthy")
+    scenario = scenario.overridden(seed=5, duration_s=12.0)
+    messages = list(read_recording(path))
+    keys = machine.keys
+    assert summarize_recording(path).messages == {keys.descriptor: 1, keys.truth: 2, keys.stream: 48}
+    assert messages[0].key == keys.descriptor
+    assert json.loads(messages[0].payload) == machine.descriptor.model_dump(mode="json")
+    times = [message.log_time_ns for message in messages]
+    assert times == sorted(times)
+    assert times[0] == DEFAULT_START_NS
+    stream = [m for m in messages if m.key == keys.stream]
+    for message, (block, _) in zip(stream, blocks(scenario, machine, 0.25), strict=True):
+        received, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        assert (received.start_ns, received.sequence, received.run) == (block.start_ns, block.sequence, 1)
+        assert schema_hash == machine.descriptor.schema_hash
+        assert message.log_time_ns == message.publish_time_ns == block.end_ns
+        if block.end_ns <= DEFAULT_START_NS + 3_000_000_000:  # the same as without the fault, as it has not come yet
+            np.testing.assert_array_equal(received.samples, block.samples)
+    truth = [TruthRecord.model_validate_json(m.payload) for m in messages if m.key == keys.truth]
+    assert [entry.relative_changes["e"] for entry in truth] == [0.0, 0.3]
+    assert {entry.seed for entry in truth} == {5}
+
+
+def test_the_same_command_makes_the_same_bytes(tmp_path: Path) -> None:
+    paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
+    for path in paths:
+        assert _run("record", "healthy", path, "--duration", 3).exit_code == 0
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+
+
+def test_start_run_machine_and_arrow_are_options(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    result = _run(
+        "record", "healthy", path, "--duration", 1, "--machine", "heavy", "--start", "2027-03-04T05:06:07.5+01:00",
+        "--run", 9, "--encoding", "arrow",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    stream = [m for m in read_recording(path) if m.key == "rotorwatch/demo/heavy/stream"]
+    block, _ = decode_block(stream[0].payload, stream[0].attachment, stream[0].encoding)
+    assert (block.start_ns, block.run) == (1_804_133_167_500_000_000, 9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["publish", "nothing"], "nothing: no such scenario file; shipped scenarios: c_by, c_bz, e, healthy"),
+        (["publish", "--fault", "k_by=0.1"], "fault 'k_by=0.1': expected PARAMETER=CHANGE@SECONDS"),
+        (["publish", "--duration", "-1"], "duration_s"),
+        (["publish", "--machine", "none.toml"], "none.toml: cannot be read"),
+        (["publish", "--pace", "fast"], "--pace is 'fast', expected a number above 0"),
+        (["publish", "--pace", "0"], "--pace is '0', expected a number above 0"),
+        (["publish", "--start", "yesterday"], "--start is 'yesterday', expected ISO 8601"),
+        (["publish", "--block-s", "5"], "--block-s is 5, expected 0.001 to 2 for machine lab"),
+        (["publish", "--connect", "here"], "connect/endpoints"),
+        (["record", "healthy", "/nowhere/run.mcap"], "/nowhere/run.mcap: the folder /nowhere does not exist"),
+        (["record", "healthy", str(Path(__file__))], "exists already; --overwrite replaces it"),
+        (["publish", "--run", "70000"], "--run"),
+        (["publish", "--speed", "1"], "--speed"),
+    ],
+)
+def test_unusable_arguments_exit_2_with_one_message(arguments: list[str], message: str) -> None:
+    result = _run(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr
+    assert result.stdout == ""
+
+
+def test_a_run_time_failure_exits_1() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        result = _run("publish", "--duration", 1, "--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}")
+    assert result.exit_code == 1
+    assert "no Zenoh session" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    config = zenoh.Config()
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    three = threading.Event()
+    gone = threading.Event()
+
+    def keep(sample: zenoh.Sample) -> None:
+        assert sample.attachment is not None
+        if decode_block(sample.payload.to_bytes(), sample.attachment.to_bytes(), str(sample.encoding))[0].sequence >= 3:
+            three.set()
+
+    def watch(sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE:
+            gone.set()
+
+    with zenoh.open(config) as session:
+        session.declare_subscriber("rotorwatch/demo/lab/stream", keep)
+        session.liveliness().declare_subscriber("rotorwatch/demo/lab/alive/publisher", watch)
+        command = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", endpoint, "--block-s", "0.05"]
+        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            assert three.wait(60)
+            process.send_signal(number)
+            out, err = process.communicate(timeout=60)
+        assert gone.wait(30)
+    assert (process.returncode, err) == (0, "")
+    assert out.startswith("published ")
+    assert out.endswith("s of data, on rotorwatch/demo/lab/stream\n")
+    assert len(out.splitlines()) == 1

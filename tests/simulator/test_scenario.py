@@ -1,0 +1,226 @@
+"""Scenario files: what is shipped, what is refused and how, and the page that describes them (``docs/scenario.md``)."""
+
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from models.errors import MachineFileError
+from models.machine import Machine
+from models.physics.lyapunov import stochastic_covariance, synchronous_response
+from models.physics.matrices import STATE_INDEX
+from models.physics.parameters import PARAMETERS
+from simulator.scenario import (
+    ChannelSettings,
+    Event,
+    NamedSource,
+    Scenario,
+    SensorFault,
+    SensorSettings,
+    load_scenario,
+    parse_fault,
+    shipped_scenarios,
+)
+from simulator.truth import TruthRecord
+
+PAGE = (Path(__file__).parents[2] / "docs" / "scenario.md").read_text(encoding="utf-8")
+
+MINIMAL = """
+machine = "lab"
+seed = 1
+duration_s = 10.0
+[[sources]]
+name = "disc y"
+cutoff_hz = 90.0
+direction = [0, 1, 0, 0, 0, 0]
+force_rms_N = 1.0
+"""
+
+
+def _file(folder: Path, text: str, name: str = "mine.toml") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_the_shipped_scenarios_are_what_they_are_called() -> None:
+    faults = {"k_by": -0.25, "c_by": -0.3, "k_bz": -0.25, "c_bz": -0.3, "e": 0.3}
+    assert set(shipped_scenarios()) == {"healthy", *faults}
+    healthy, _ = load_scenario("healthy")
+    assert (healthy.name, healthy.duration_s, healthy.events) == ("healthy", 3600.0, ())
+    seeds = {healthy.seed}
+    for name, change in faults.items():
+        scenario, machine = load_scenario(name)
+        assert machine.name == "lab"
+        assert (scenario.name, scenario.duration_s) == (name, 300.0)
+        (event,) = scenario.events
+        assert (event.parameter, event.relative_change, event.at_s, event.ramp_s) == (name, change, 140.0, 0.0)
+        assert scenario.sources == healthy.sources
+        assert scenario.sensors == healthy.sensors
+        seeds.add(scenario.seed)
+    assert len(seeds) == 6  # independent realisations
+
+
+def test_the_shipped_disc_moves_twice_its_1x_amplitude() -> None:
+    scenario, machine = load_scenario("healthy")
+    speed = machine.operation.speed_rad_s
+    q1, q2 = synchronous_response(machine.rotor, speed)
+    variance = np.diag(stochastic_covariance(machine.rotor, speed, scenario.sources))
+    disc = [STATE_INDEX["y2"], STATE_INDEX["z2"]]
+    ratio = np.sqrt(variance[disc].sum() / ((q1**2 + q2**2) / 2)[disc].sum())
+    assert ratio == pytest.approx(2.0, rel=0.05)
+    assert len(scenario.sources) == 4
+
+
+def test_a_file_extends_another_table_by_table(tmp_path: Path) -> None:
+    base = _file(tmp_path, MINIMAL + "[sensors]\nnoise_relative = 0.02\nnoise_corner_hz = 300.0\n", "base.toml")
+    mine = _file(tmp_path, f'extends = "{base.name}"\nseed = 9\n[sensors]\nnoise_relative = 0.5\n')
+    scenario, _ = load_scenario(mine)
+    assert (scenario.name, scenario.seed, scenario.duration_s) == ("mine", 9, 10.0)
+    assert (scenario.sensors.noise_relative, scenario.sensors.noise_corner_hz) == (0.5, 300.0)
+    assert [source.name for source in scenario.sources] == ["disc y"]
+
+
+def test_a_machine_file_lies_beside_the_scenario(tmp_path: Path) -> None:
+    shipped = Path(__file__).parents[2] / "models" / "machines" / "lab.toml"
+    _file(tmp_path, shipped.read_text(encoding="utf-8").replace('name = "lab"', 'name = "twin"'), "twin.toml")
+    _, machine = load_scenario(_file(tmp_path, MINIMAL.replace('"lab"', '"twin.toml"')))
+    assert machine.name == "twin"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("machine = 3 =", "not a TOML file"),
+        (MINIMAL.replace("seed = 1\n", ""), r"mine\.toml: seed: Field required"),
+        (MINIMAL.replace("seed = 1", "seed = -1"), r"seed: .* \(found -1\)"),
+        (MINIMAL.replace("duration_s", "duration"), "duration: Extra inputs are not permitted"),
+        (MINIMAL.replace("duration_s = 10.0", "duration_s = inf"), "duration_s: .* finite"),
+        (MINIMAL.replace('"lab"', '"nowhere"'), "nowhere: cannot be read"),
+        (MINIMAL.replace("cutoff_hz = 90.0", "cutoff_hz = 0.0"), r"sources\.0\.cutoff_hz: .* \(found 0\.0\)"),
+        (MINIMAL.replace("[0, 1, 0, 0, 0, 0]", "[0, 1]"), r"sources\.0\.direction"),
+        (MINIMAL + MINIMAL[MINIMAL.index("[[") :], "source name occurs twice: disc y"),
+        (MINIMAL + "[sensors]\nnoise = 0.1", r"sensors\.noise: Extra inputs"),
+        (MINIMAL + "[sensors.channels.y9]\ngain = 2.0", r"mine\.toml: .*'y9' is not a channel of machine lab \(y1, z1"),
+        ('extends = "nothing"', "nothing: no such scenario file; shipped scenarios: c_by"),
+        ('extends = "mine.toml"', "extends itself"),
+        ("extends = 3", r"extends: expected the name or path of a scenario \(found 3\)"),
+    ],
+)
+def test_unusable_files_are_refused_with_file_field_and_value(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(MachineFileError, match=message):
+        load_scenario(_file(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        ("speed_rpm = 900.0", r"events\.0\.at_s: Field required"),
+        ("at_s = 1.0", "expected exactly one of parameter, speed_rpm, source, sensor; found none"),
+        ('at_s = 1.0\nspeed_rpm = 900.0\nparameter = "e"\nrelative_change = 0.1', "found parameter and speed_rpm"),
+        ('at_s = 1.0\nparameter = "k_xx"\nrelative_change = 0.1', "parameter 'k_xx' is not one of k_by, c_by"),
+        ('at_s = 1.0\nparameter = "e"', "change of parameter e without relative_change"),
+        ('at_s = 1.0\nparameter = "e"\nrelative_change = -1.0', r"relative_change: .* \(found -1\.0\)"),
+        (
+            'at_s = 1.0\nparameter = "e"\nrelative_change = 0.1\ncutoff_hz = 3.0',
+            "cutoff_hz belongs to an event with source",
+        ),
+        ("at_s = 1.0\nspeed_rpm = 0.0", r"speed_rpm: .* \(found 0\.0\)"),
+        ("at_s = 11.0\nspeed_rpm = 900.0", r"events\.0: ends at 11 s, after duration_s 10"),
+        ("at_s = 9.0\nramp_s = 2.0\nspeed_rpm = 900.0", r"events\.0: ends at 11 s, after duration_s 10"),
+        (
+            'at_s = 1.0\nsource = "fan"\ncutoff_hz = 3.0',
+            r"events\.0\.source: 'fan' is not among the sources \(disc y\)",
+        ),
+        ('at_s = 1.0\nsource = "disc y"', "expected exactly one of cutoff_hz, force_rms_N, direction; found none"),
+        ('at_s = 1.0\nsource = "disc y"\ncutoff_hz = 3.0\nforce_rms_N = 1.0', "found cutoff_hz and force_rms_N"),
+        (
+            'at_s = 1.0\nsensor = "y9"\nsensor_fault = "stuck"',
+            r"events\.0\.sensor: 'y9' is not a channel of machine lab",
+        ),
+        ('at_s = 1.0\nsensor = "y1"', "sensor 'y1' without sensor_fault"),
+        ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "dead"', "sensor_fault: Input should be"),
+        ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "gain"', "sensor_fault 'gain' needs value_SI"),
+        ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "stuck"\nvalue_SI = 1.0', "sensor_fault 'stuck' has no value_SI"),
+        ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "clip"\nvalue_SI = -1.0', "'clip' is -1.0, expected 0 or more"),
+        ('at_s = 1.0\nramp_s = 1.0\nsensor = "y1"\nsensor_fault = "stuck"', "'stuck' cannot ramp"),
+    ],
+)
+def test_unusable_events_are_refused(tmp_path: Path, event: str, message: str) -> None:
+    with pytest.raises(MachineFileError, match=message):
+        load_scenario(_file(tmp_path, f"{MINIMAL}[[events]]\n{event}"))
+
+
+def test_overrides_are_checked_again() -> None:
+    scenario, _ = load_scenario("k_by")
+    other = scenario.overridden(seed=77, duration_s=200.0, faults=[parse_fault("e=3e-1@150.5")])
+    assert (other.seed, other.duration_s, len(other.events)) == (77, 200.0, 2)
+    assert (other.events[1].parameter, other.events[1].relative_change, other.events[1].at_s) == ("e", 0.3, 150.5)
+    assert other.sources == scenario.sources
+    with pytest.raises(MachineFileError, match="ends at 140 s, after duration_s 100"):
+        scenario.overridden(duration_s=100.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("k_by", "expected PARAMETER=CHANGE@SECONDS"),
+        ("k_by=-0.25", "expected PARAMETER=CHANGE@SECONDS"),
+        ("k_by=much@3", "expected PARAMETER=CHANGE@SECONDS"),
+        ("k_by=--1@3", "relative_change"),
+        ("k_by=-1@3", "relative_change"),
+        ("k_zz=0.1@3", "'k_zz' is not one of k_by"),
+    ],
+)
+def test_unusable_fault_options_are_refused(text: str, message: str) -> None:
+    with pytest.raises(MachineFileError, match=message):
+        parse_fault(text)
+
+
+def test_common_sensor_settings_leave_the_shaft_angle_alone(tmp_path: Path) -> None:
+    text = MINIMAL + "[sensors]\nnoise_relative = 0.1\ngain = 1.5\n[sensors.channels.y1]\ngain = 2.0\n"
+    scenario, machine = load_scenario(_file(tmp_path, text))
+    settings = {channel.name: scenario.sensors.settings(channel) for channel in machine.sensors}
+    assert (settings["y1"].gain, settings["y1"].noise_relative) == (2.0, 0.1)
+    assert (settings["z1"].gain, settings["z1"].noise_relative) == (1.5, 0.1)
+    assert settings["theta"] == SensorSettings()
+
+
+# The page -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_example_loads(tmp_path: Path) -> None:
+    (text,) = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
+    scenario, machine = load_scenario(_file(tmp_path, text))
+    assert isinstance(machine, Machine)
+    assert [event.at_s for event in scenario.events] == [60.0, 60.0, 130.0, 140.0, 150.0, 200.0]
+    assert scenario.sensors.noise_relative == 0.02
+
+
+@pytest.mark.parametrize("model", [Scenario, NamedSource, SensorSettings, ChannelSettings, Event, TruthRecord])
+def test_the_page_explains_every_field(model: type[BaseModel]) -> None:
+    cells = " ".join(re.findall(r"^\| ([^|]+) \|", PAGE, re.MULTILINE))
+    missing = [field for field in model.model_fields if f"`{field}`" not in cells]
+    if model is Event:  # a source's settings are explained where the source is
+        assert all(f"`{field}`" in PAGE for field in missing)
+        missing = [field for field in missing if field not in NamedSource.model_fields]
+    assert missing == []
+
+
+def test_the_page_names_every_scenario_fault_and_parameter() -> None:
+    names: list[Any] = [*shipped_scenarios(), *get_args(SensorFault), *PARAMETERS]
+    assert [name for name in names if f"`{name}`" not in PAGE] == []
+
+
+def test_the_page_says_what_the_shipped_scenarios_do() -> None:
+    for name in shipped_scenarios():
+        scenario, _ = load_scenario(name)
+        row = re.search(rf"^\| `{name}` \| (\d+) s \| (.*) \|$", PAGE, re.MULTILINE)
+        assert row is not None
+        assert float(row[1]) == scenario.duration_s
+        for event in scenario.events:
+            assert f"{event.relative_change:+.0%}".replace("%", " %").replace("-", "−") in row[2]
+            assert f"at {event.at_s:g} s" in row[2]

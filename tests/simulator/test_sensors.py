@@ -1,0 +1,193 @@
+"""Sensors: units, columns, noise level and colour, and each fault."""
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from models.machine import Machine, load_machine
+from models.physics.matrices import STATES
+from models.signals.block import FloatArray
+from models.signals.channels import Channel
+from simulator.integrator import PlantSamples
+from simulator.scenario import ChannelSettings, Sensors, SensorSettings
+from simulator.sensors import Sensor, SensorBank
+from simulator.timeline import SensorFaults
+
+RATE_HZ = 2000.0
+DISPLACEMENT = Channel.model_validate(
+    {"name": "XE", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"}
+)
+
+
+def _sensor(settings: SensorSettings, seed: int = 0, rms_SI: float = 1e-5) -> Sensor:
+    return Sensor(DISPLACEMENT, settings, rms_SI, RATE_HZ, np.random.default_rng(seed))
+
+
+def _machine(*channels: dict[str, str], dtype: str = "float64") -> Machine:
+    sensors = tuple(Channel.model_validate(channel) for channel in channels)
+    return load_machine("lab").model_copy(update={"sensors": sensors, "dtype": dtype})
+
+
+def _bank(
+    machine: Machine, sensors: Sensors, faults: dict[str, list[tuple[int, SensorFaults]]] | None = None
+) -> SensorBank:
+    rngs = [np.random.default_rng(seed) for seed in range(len(machine.sensors))]
+    return SensorBank(machine, sensors, np.full(12, 1e-5), faults or {}, rngs)
+
+
+def _plant(n_samples: int = 50) -> PlantSamples:
+    states = 1e-6 * (np.arange(12)[None, :] + 0.01 * np.arange(n_samples)[:, None])
+    return PlantSamples(states, np.linspace(0, 2 * np.pi, n_samples, endpoint=False))
+
+
+TILT = {"name": "T", "quantity": "tilt", "location": "disc", "direction": "z", "unit": "mrad"}
+TILT_RATE = {"name": "R", "quantity": "tilt_rate", "location": "disc", "direction": "y", "unit": "rad/s"}
+VELOCITY = {"name": "V", "quantity": "velocity", "location": "disc", "direction": "z", "unit": "in/s"}
+ANGLE = {"name": "A", "quantity": "shaft_angle", "location": "shaft", "direction": "rotation", "unit": "rad"}
+
+
+def test_channels_come_in_the_file_order_in_their_units() -> None:
+    plant = _plant()
+    samples = _bank(_machine(ANGLE, VELOCITY, TILT, TILT_RATE), Sensors()).measure(plant, 0)
+    expected = np.stack(
+        [
+            plant.theta_rad,
+            plant.states[:, STATES.index("z2_dot")] / 0.0254,
+            plant.states[:, STATES.index("phi")] * 1e3,
+            plant.states[:, STATES.index("psi_dot")],
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(samples, expected, rtol=1e-12)
+    assert samples.dtype == np.float64
+    assert _bank(_machine(ANGLE, dtype="float32"), Sensors()).measure(plant, 0).dtype == np.float32
+
+
+@pytest.mark.parametrize("corner_hz", [None, 30.0, 300.0])
+def test_noise_has_the_level_and_the_colour_asked_for(corner_hz: float | None) -> None:
+    n_samples = 200_000
+    sensor = _sensor(SensorSettings(noise_relative=0.02, noise_corner_hz=corner_hz))
+    pieces = [sensor.measure(np.zeros(1000), sensor.noise(1000), {}) for _ in range(n_samples // 1000)]
+    noise = np.concatenate(pieces) * 1e-6
+    memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / RATE_HZ))
+    # Effective number of independent squares of first-order noise is n (1 - a²) / (1 + a²).
+    spread = np.sqrt(2 / n_samples * (1 + memory**2) / (1 - memory**2))
+    assert noise.var() == pytest.approx((0.02 * 1e-5) ** 2, rel=5 * spread)
+    for lag in (1, 2, 5):
+        correlation = noise[lag:] @ noise[:-lag] / (noise @ noise)
+        assert correlation == pytest.approx(memory**lag, abs=5 * np.sqrt((1 + memory**2) / (1 - memory**2) / n_samples))
+
+
+def test_noise_is_stationary_from_the_first_sample() -> None:
+    settings = SensorSettings(noise_relative=1.0, noise_corner_hz=10.0)
+    first = np.array([_sensor(settings, seed).noise(1)[0] for seed in range(4000)])
+    assert first.var() == pytest.approx(1.0, rel=5 * np.sqrt(2 / 4000))  # one innovation alone would have 0.06
+
+
+def test_noise_does_not_depend_on_the_pieces() -> None:
+    settings = SensorSettings(noise_corner_hz=100.0)
+    whole = _sensor(settings).noise(1000)
+    sensor = _sensor(settings)
+    np.testing.assert_allclose(np.concatenate([sensor.noise(n) for n in (1, 500, 499)]), whole, rtol=1e-12, atol=1e-14)
+
+
+def test_settings_act_in_order() -> None:
+    sensor = _sensor(SensorSettings(gain=2.0, offset_SI=1e-4, step_SI=3e-6))
+    samples = sensor.measure(np.array([0.0, 1e-6, 3e-6]), np.zeros(3), {})
+    np.testing.assert_allclose(samples, [99.0, 102.0, 105.0], rtol=1e-12)  # 100, 102, 106 um on steps of 3 um
+
+
+VALUES = np.array([-3e-6, 1e-6, 5e-6])
+
+
+@pytest.mark.parametrize(
+    ("faults", "expected"),
+    [
+        ({}, [-3.0, 1.0, 5.0]),
+        ({"offset": 2e-6}, [-1.0, 3.0, 7.0]),
+        ({"gain": 0.5}, [-1.5, 0.5, 2.5]),
+        ({"offset": 2e-6, "gain": 0.5}, [0.5, 2.5, 4.5]),
+        ({"clip": 2e-6}, [-2.0, 1.0, 2.0]),
+        ({"clip": 0.0}, [0.0, 0.0, 0.0]),
+        ({"noise_relative": 0.1}, [-2.0, 0.0, 6.0]),
+        ({"stuck": None}, [7.0, 7.0, 7.0]),
+        ({"stuck": None, "dropout": None}, [np.nan, np.nan, np.nan]),
+        ({"dropout": None}, [np.nan, np.nan, np.nan]),
+    ],
+    ids=lambda value: "+".join(value) or "healthy" if isinstance(value, dict) else "",
+)
+def test_each_fault(faults: SensorFaults, expected: list[float]) -> None:
+    sensor = _sensor(SensorSettings())
+    sensor.measure(np.array([7e-6]), np.zeros(1), {})  # what a stuck sensor repeats
+    samples = sensor.measure(VALUES, np.array([1.0, -1.0, 1.0]), faults)
+    np.testing.assert_allclose(samples, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_stuck_sensor_holds_until_it_is_released() -> None:
+    sensor = _sensor(SensorSettings())
+    stuck: SensorFaults = {"stuck": None}
+    zero = np.zeros(3)
+    np.testing.assert_allclose(sensor.measure(VALUES, zero, stuck), -3.0)  # from the first sample on: its own
+    np.testing.assert_allclose(sensor.measure(VALUES, zero, {}), VALUES * 1e6)
+    np.testing.assert_allclose(sensor.measure(2 * VALUES, zero, stuck), 5.0)
+    np.testing.assert_allclose(sensor.measure(3 * VALUES, zero, stuck), 5.0)
+    np.testing.assert_allclose(sensor.measure(VALUES, zero, {}), VALUES * 1e6)
+
+
+def test_faults_begin_and_end_at_their_samples() -> None:
+    channel = DISPLACEMENT.model_dump()
+    other = {**channel, "name": "ZE", "direction": "z"}
+    faults: dict[str, list[tuple[int, SensorFaults]]] = {
+        "XE": [(103, {"offset": 1.0}), (110, {"offset": 1.0, "dropout": None}), (120, {})]
+    }
+    bank = _bank(_machine(channel, other), Sensors(), faults)
+    plant = PlantSamples(np.zeros((10, 12)), np.zeros(10))
+    column = np.concatenate([bank.measure(plant, first)[:, 0] for first in (90, 100, 110, 120)])
+    expected = np.zeros(40)
+    expected[13:20], expected[20:30] = 1e6, np.nan
+    np.testing.assert_array_equal(column, expected)
+    assert bank.faults_at(102) == {}
+    assert bank.faults_at(103) == {"XE": {"offset": 1.0}}
+    assert bank.faults_at(115) == {"XE": {"offset": 1.0, "dropout": None}}
+    assert bank.faults_at(120) == {}
+
+
+def test_one_sensor_does_not_touch_another() -> None:
+    machine = load_machine("lab")
+    quiet = Sensors(noise_relative=0.02, noise_corner_hz=300.0)
+    loud = quiet.model_copy(update={"channels": {"z1": ChannelSettings(noise_relative=3.0, gain=2.0)}})
+    one = _bank(machine, quiet).measure(_plant(), 0)
+    other = _bank(machine, loud, {"y1": [(5, {"dropout": None})]}).measure(_plant(), 0)
+    names = [channel.name for channel in machine.sensors]
+    changed = [name for name, a, b in zip(names, one.T, other.T, strict=True) if not np.array_equal(a, b)]
+    assert changed == ["y1", "z1"]
+
+
+def test_an_unused_noise_is_drawn_all_the_same() -> None:
+    """A sensor whose noise begins later has the noise it would have had anyway."""
+    channel = DISPLACEMENT.model_dump()
+    noisy = _bank(_machine(channel), Sensors(noise_relative=0.1)).measure(_plant(), 0)
+    later = _bank(_machine(channel), Sensors(), {"XE": [(20, {"noise_relative": 0.1})]}).measure(_plant(), 0)
+    np.testing.assert_array_equal(later[20:], noisy[20:])
+    assert not np.any(later[:20] == noisy[:20])
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_the_shaft_angle_stays_below_one_revolution(dtype: str) -> None:
+    just_below = np.nextafter(2 * np.pi, 0)  # float32 rounds it up to a number above 2π
+    theta = np.array([0.0, 1.0, just_below])
+    plant = PlantSamples(np.zeros((3, 12)), theta)
+    samples = _bank(_machine(ANGLE, dtype=dtype), Sensors()).measure(plant, 0)[:, 0]
+    assert np.all((samples >= 0) & (samples.astype(np.float64) < 2 * np.pi))
+    assert samples[1] == 1.0
+
+
+def test_a_shaft_angle_with_errors_wraps() -> None:
+    sensors = Sensors(channels={"A": ChannelSettings(noise_relative=0.01, offset_SI=-0.5)})
+    theta: npt.NDArray[np.float64] = np.tile(np.linspace(0, 6.28, 100), 100)
+    samples: FloatArray = np.asarray(
+        _bank(_machine(ANGLE), sensors).measure(PlantSamples(np.zeros((10_000, 12)), theta), 0)[:, 0], dtype=np.float64
+    )
+    assert np.all((samples >= 0) & (samples < 2 * np.pi))
+    error = np.angle(np.exp(1j * (samples - theta + 0.5)))
+    assert error.std() == pytest.approx(0.01 * 2 * np.pi, rel=5 / np.sqrt(2 * 10_000))
