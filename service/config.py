@@ -108,7 +108,8 @@ class ServiceSettings(BaseSettings):
     )
 
     link: LinkSettings = Field(
-        default=LinkSettings(listen=(DEFAULT_LISTEN,)), description="Zenoh: role and endpoints; loopback only if left out"
+        default=LinkSettings(listen=(DEFAULT_LISTEN,)),
+        description="Zenoh: role and endpoints; loopback only if left out",
     )
     http: HttpSettings = Field(default=HttpSettings(), description="HTTP API")
     machines: tuple[MachineEntry, ...] = Field(

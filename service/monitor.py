@@ -86,7 +86,8 @@ class WindowReport:
     equations : tuple of EquationReading
         The networks' opinion, equation by equation.
     misfit : float or None
-        How much more power there is than the fitted theory says (0 = none).
+        How much worse the theory fits than sampling alone explains (0 = as well as it can). Not calibrated: only its
+        change from the healthy value of the same machine means something.
     reason : str
         Why the window was not evaluated; empty if it was.
     """

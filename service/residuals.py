@@ -30,7 +30,7 @@ class Evaluation:
     speed_rad_s : float or None
         Mean speed.
     misfit : float
-        How much more power there is than the fitted theory says.
+        How much worse the theory fits than sampling alone explains.
     """
 
     parameters: tuple[ParameterReading, ...]

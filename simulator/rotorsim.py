@@ -173,8 +173,9 @@ def record(
         start_ns = _time_ns(start)
         if not output.parent.is_dir():
             raise MachineFileError(f"{output}: the folder {output.parent} does not exist")
-        if output.exists() and not overwrite:
-            raise MachineFileError(f"{output}: exists already; --overwrite replaces it")
+        for existing in (output, output.with_name(output.name + ".part")):
+            if existing.exists() and not overwrite:
+                raise MachineFileError(f"{existing}: exists already; --overwrite replaces it")
         from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
 
         with _stop_on_signal() as stop, _progress(loaded.duration_s) as on_block:

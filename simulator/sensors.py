@@ -171,6 +171,6 @@ def _reference(channel: Channel, rms: FloatArray) -> float:
 
 
 def _wrapped(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
-    """Bring angles into [0, 2π); in float32 the angle just below 2π rounds up to above it and becomes 0."""
+    """Bring angles into [0, 2π); a remainder that rounds up to 2π, as that of an angle just below 0 does, becomes 0."""
     wrapped = np.mod(angle, _TURN)
     return np.where(wrapped >= _TURN, 0.0, wrapped)

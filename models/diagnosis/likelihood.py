@@ -6,12 +6,14 @@ P. Whittle, "Estimation and information in stationary time series", Arkiv för M
 the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 """
 
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import digamma
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.scoring import LOG_NOISE, FisherScoring
+from models.diagnosis.scoring import FisherScoring, Maximum
 from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -24,8 +26,14 @@ _AVERAGES_PER_SEGMENT = 0.53
 """Independent averages per half-overlapped Hann segment and bin: 1 / Σ of the squared correlations of neighbouring
 segments (|ρ|² = 1/36) and bins (|ρ|² = 4/9, 1/36)."""
 
-_COLD_STEPS, _WARM_STEPS = 120, 20
+_COLD_STEPS, _WARM_STEPS = 200, 20
 _SYNCHRONOUS_BINS = 3
+
+_TIME_OVERLAP = 0.947
+"""Independent averages per half-overlapped Hann segment at one frequency, 1 / (1 + 2/36)."""
+
+_START_NOISE = 0.3
+"""Noise where a cold search starts: with much of it the spectra stay positive definite while the levels are far off."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +51,7 @@ class LikelihoodEstimate:
     steps : int
         Scoring steps taken.
     misfit : float
-        Mean of (trace(S⁻¹ Ŝ) / n - 1): how much more power there is than the fitted theory says.
+        How much worse the theory fits than sampling alone explains: 0 = as well as it can.
     """
 
     names: tuple[str, ...]
@@ -51,15 +59,6 @@ class LikelihoodEstimate:
     standard_error: FloatArray
     steps: int
     misfit: float
-
-
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """Where a search starts: the parameter point and the units it is in."""
-
-    theta: FloatArray
-    scale: FloatArray
-    force_scale: float
 
 
 class LikelihoodFit:
@@ -76,11 +75,12 @@ class LikelihoodFit:
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
-        self._start: _Start | None = None
+        self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
+        self._last: FloatArray | None = None
 
     def reset(self) -> None:
         """Start the next window cold."""
-        self._start = None
+        self._last = None
 
     def fit(self, window: WindowStatistics) -> LikelihoodEstimate:
         """Estimate the parameters of one window.
@@ -99,23 +99,18 @@ class LikelihoodFit:
                 f"{self._machine.name}: no fluctuation in {', '.join(dead)}: nothing to compare with theory"
             )
         speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
-        cold = self._start is None
-        start = (
-            self._cold_start(window.states, window.frequencies_hz[keep], observed, power, speed)
-            if (self._start is None)
-            else self._start
-        )
-        model = SpectralModel(self._machine, window.states, window.frequencies_hz[keep], start.scale, start.force_scale)
-        observed = observed / np.outer(start.scale, start.scale)
+        model = self._model(window.states, window.frequencies_hz[keep], np.sqrt(power), speed)
+        observed = observed / np.outer(model.scale, model.scale)
         averages = _AVERAGES_PER_SEGMENT * window.n_segments
-        search = FisherScoring(model, observed, averages, speed)
+        search = FisherScoring(model, observed, averages, speed, self._usual_cutoff_hz)
         try:
-            theta, information, steps = search.maximise(start.theta, _COLD_STEPS if cold else _WARM_STEPS)
-            covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+            found = self._maximise(model, search)
+            covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
             raise EstimationError(f"{self._machine.name}: the likelihood has no maximum for this window") from error
-        self._start = replace(start, theta=theta)
+        theta, steps = found.theta, found.steps
+        self._last = theta
         n = len(STRUCTURAL)
         ratio = np.exp(theta[:n])
         change = np.asarray(ratio - 1, dtype=np.float64)
@@ -124,9 +119,7 @@ class LikelihoodFit:
         if window.synchronous is not None:
             e, e_error = self._eccentricity(model, theta, covariance[:n, :n], window, speed)
             names, change, deviation = (*names, "e"), np.append(change, e), np.append(deviation, e_error)
-        point = model.at(theta, speed)
-        trace = np.einsum("fij,fji->f", np.linalg.inv(point.S), observed).real
-        return LikelihoodEstimate(names, change, deviation, steps, float(np.mean(trace) / model.n - 1))
+        return LikelihoodEstimate(names, change, deviation, steps, _misfit(model.at(theta, speed).S, observed, window))
 
     def _usable_bins(self, window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """All bins but the neighbourhood of the rotation: what is left of its line there is not stochastic."""
@@ -134,25 +127,37 @@ class LikelihoodFit:
         width = _SYNCHRONOUS_BINS * (window.frequencies_hz[1] - window.frequencies_hz[0])
         return np.asarray(np.abs(window.frequencies_hz - speed / (2 * np.pi)) > width)
 
-    def _cold_start(
-        self,
-        states: tuple[str, ...],
-        frequencies_hz: FloatArray,
-        observed: ComplexArray,
-        power: FloatArray,
-        speed: float,
-    ) -> "_Start":
-        """Nominal rotor, mid cutoff, a little noise, equal independent sources that explain the mean power."""
-        scale = np.sqrt(power)
+    def _model(
+        self, states: tuple[str, ...], frequencies_hz: FloatArray, scale: FloatArray, speed: float
+    ) -> SpectralModel:
+        """Spectral model in this window's own units.
+
+        In these units equal independent sources of level one, through the nominal rotor, explain the mean power. A
+        parameter point therefore stays a good start when the machine merely becomes louder.
+        """
         model = SpectralModel(self._machine, states, frequencies_hz, scale)
+        theta = self._usual(model)
+        theta[model.noise_at] = -np.inf
+        explained = np.einsum("fii->", model.at(theta, speed).S).real / (model.n * frequencies_hz.size)
+        return SpectralModel(self._machine, states, frequencies_hz, scale, float(explained**-0.5))
+
+    def _usual(self, model: SpectralModel) -> FloatArray:
+        """Where a cold search starts: nominal rotor, mid cutoff, a little noise, equal independent sources."""
         theta = np.zeros(model.size)
-        low, high = self._machine.condition.cutoff_hz
-        theta[model.cutoff_at] = np.log(np.sqrt(low * high))
-        theta[model.noise_at] = LOG_NOISE
+        theta[model.cutoff_at] = np.log(self._usual_cutoff_hz)
+        theta[model.noise_at] = np.log(_START_NOISE)
         theta[model.level_at] = np.eye(6)[np.tril_indices(6)]
-        bare = model.at(theta, speed).S - np.exp(LOG_NOISE) * np.eye(model.n)
-        explained = np.einsum("fii->", bare).real / np.einsum("fii,i->", observed, 1 / power).real
-        return _Start(theta, scale, float(explained**-0.5))
+        return theta
+
+    def _maximise(self, model: SpectralModel, search: FisherScoring) -> Maximum:
+        """Search from the last window's maximum, or from the usual point.
+
+        Where an excitation of low rank makes the last steps small, a warm search may end before it has converged; the
+        next window carries on from there.
+        """
+        if self._last is not None:
+            return search.maximise(self._last, _WARM_STEPS)
+        return search.maximise(self._usual(model), _COLD_STEPS)
 
     def _eccentricity(
         self, model: SpectralModel, theta: FloatArray, covariance: FloatArray, window: WindowStatistics, speed: float
@@ -196,3 +201,19 @@ class LikelihoodFit:
         weight = np.linalg.solve(total, g2)
         precision = float(weight @ g2)
         return float(weight @ q2) / precision - 1, precision**-0.5
+
+
+def _misfit(S: ComplexArray, observed: ComplexArray, window: WindowStatistics) -> float:
+    """Deviance of the observed spectra from S over its expectation for complex Wishart matrices, less one.
+
+    With ν averages of n channels, tr W - log det W - n of W = S⁻¹Ŝ has the expectation n ln ν - Σ ψ(ν - i), i < n (and
+    is infinite for ν < n, where nothing can be said).
+    """
+    n = S.shape[1]
+    nu = _TIME_OVERLAP * window.n_segments
+    if nu <= n:
+        return float("nan")
+    W = np.linalg.solve(S, observed)
+    deviance = np.einsum("fii->f", W).real - np.linalg.slogdet(W)[1] - n
+    expected = n * np.log(nu) - float(np.sum(digamma(nu - np.arange(n))))
+    return float(np.mean(deviance) / expected - 1)

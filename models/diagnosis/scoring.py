@@ -1,12 +1,14 @@
 """Fisher scoring: the search for the maximum of one window's Whittle likelihood."""
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.spectral_model import SpectralModel
 from models.signals.block import FloatArray
 
-__all__ = ["LOG_NOISE", "FisherScoring"]
+__all__ = ["LOG_NOISE", "FisherScoring", "Maximum"]
 
 LOG_NOISE = float(np.log(1e-3))
 """Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
@@ -16,7 +18,32 @@ _WEAK, _COLOUR = 0.05, 1.0
 excitation of low rank, or a channel without visible noise, leaves them undetermined."""
 
 _GAIN = 5e-3
-"""Converged when a full step would gain less than this in log-likelihood: 0.1 standard errors over all parameters together."""
+"""Converged when a full step would gain less than this: 0.1 standard errors over all parameters together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Maximum:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (size,)
+        The parameter point.
+    information : ndarray, shape (size, size)
+        Fisher information there.
+    value : float
+        Log-likelihood there, up to a constant.
+    steps : int
+        Steps tried.
+    converged : bool
+        Whether it is the maximum.
+    """
+
+    theta: FloatArray
+    information: FloatArray
+    value: float
+    steps: int
+    converged: bool
 
 
 class FisherScoring:
@@ -30,27 +57,29 @@ class FisherScoring:
     averages : float
         Independent averages in each of them.
     speed_rad_s : float
+    usual_cutoff_hz : float
+        Where the cutoff is pulled, weakly, if the band does not show it.
     """
 
-    def __init__(self, model: SpectralModel, observed: ComplexArray, averages: float, speed_rad_s: float) -> None:
+    def __init__(
+        self,
+        model: SpectralModel,
+        observed: ComplexArray,
+        averages: float,
+        speed_rad_s: float,
+        usual_cutoff_hz: float,
+    ) -> None:
         self._model, self._observed, self._averages, self._speed_rad_s = model, observed, averages, speed_rad_s
         self._ridge = np.zeros(model.size)
-        self._ridge[model.level_at] = self._ridge[model.noise_at] = _WEAK
+        self._ridge[:] = _WEAK
+        self._ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
         self._ridge[model.colour_at] = _COLOUR
         self._centre = np.zeros(model.size)
         self._centre[model.noise_at] = LOG_NOISE
+        self._centre[model.cutoff_at] = np.log(usual_cutoff_hz)
 
-    def maximise(self, theta: FloatArray, most_steps: int) -> tuple[FloatArray, FloatArray, int]:
+    def maximise(self, theta: FloatArray, most_steps: int) -> Maximum:
         """Search from a starting point.
-
-        Returns
-        -------
-        theta : ndarray, shape (size,)
-            The maximum.
-        information : ndarray, shape (size, size)
-            Fisher information there.
-        steps : int
-            Steps tried.
 
         Raises
         ------
@@ -61,11 +90,15 @@ class FisherScoring:
         value = self._value(theta)
         gradient, information = self._scores(theta)
         steps = 0
-        while steps < most_steps and gradient @ np.linalg.solve(information, gradient) / 2 > _GAIN:
+        while True:
+            converged = bool(gradient @ np.linalg.solve(information, gradient) / 2 < _GAIN)
+            if converged or steps == most_steps:
+                break
             steps += 1
             damped = information + damping * np.diag(np.diag(information))
             step = np.linalg.solve(damped, gradient)
-            step *= min(1.0, 1.0 / float(np.max(np.abs(step))))  # e-fold at most: far from the data theory misleads
+            # Logarithms move by one at most, for far from the data the theory misleads; levels are linear and free.
+            step *= min(1.0, 1.0 / float(np.max(np.abs(step[: self._model.level_at.start]))))
             trial_value = self._value(theta + step)
             if trial_value > value:
                 theta, value = theta + step, trial_value
@@ -75,7 +108,7 @@ class FisherScoring:
                 break
             else:
                 damping *= 8
-        return theta, information, steps
+        return Maximum(theta, information, value, steps, converged)
 
     def _value(self, theta: FloatArray) -> float:
         """Log-likelihood and the weak pulls, up to a constant."""

@@ -14,8 +14,9 @@ a complete file. What a crash left behind is a ``.part`` file, which `recover_re
 
 import struct
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -110,19 +111,20 @@ class RecordingWriter:
     path : Path
         Final name.
     overwrite : bool
-        Replace a recording that is already there.
+        Replace a recording that is already there, or a ``.part`` that a crash left.
 
     Raises
     ------
     RecordingError
-        If the file exists, or cannot be written; the message names it.
+        If one of them exists, or cannot be written; the message names it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self.path = path
         self.part = path.with_name(path.name + ".part")
-        if path.exists() and not overwrite:
-            raise RecordingError(f"{path}: exists already and is not overwritten")
+        for existing in (self.path, self.part):
+            if existing.exists() and not overwrite:
+                raise RecordingError(f"{existing}: exists already and is not overwritten")
         self._channels: dict[tuple[str, str, str], int] = {}
         self._counts: dict[int, int] = {}
         with _writing(self.part):
@@ -251,9 +253,9 @@ def recover_recording(damaged: Path, target: Path) -> int:
     Parameters
     ----------
     damaged : Path
-        Usually the ``.part`` file of a program that was killed.
+        Usually the ``.part`` file of a program that was killed; it stays.
     target : Path
-        Must not exist.
+        Must not exist; may be the name that `damaged` was to get.
 
     Returns
     -------
@@ -263,23 +265,34 @@ def recover_recording(damaged: Path, target: Path) -> int:
     Raises
     ------
     RecordingError
-        If `damaged` is missing or no recording at all, or `target` exists.
+        If `damaged` is missing or nothing of it can be read, or `target` exists.
     """
-    count = 0
-    with RecordingWriter(target) as writer, _reading(damaged), damaged.open("rb") as file:
-        channels: dict[int, Channel] = {}
-        records = StreamReader(file, validate_crcs=True).records
-        try:
-            for record in records:
-                if isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    writer.write(_unpacked(channels[record.channel_id], record))
-                    count += 1
-        except _DAMAGE:
-            if not channels:  # not even one channel: this is no recording, not an interrupted one
-                raise
+    messages = _salvaged(damaged)
+    first = next(messages, None)
+    if first is None:
+        raise RecordingError(f"{damaged}: nothing to recover: not a recording, or no part of it was completed")
+    if target.exists():
+        raise RecordingError(f"{target}: exists already and is not overwritten")
+    # Not under target's own .part name, which is what the damaged file usually has.
+    with RecordingWriter(target.with_name(target.name + ".recovered"), overwrite=True) as writer:
+        count = 0
+        for message in chain([first], messages):
+            writer.write(message)
+            count += 1
+    with _writing(target):
+        writer.path.replace(target)
     return count
+
+
+def _salvaged(damaged: Path) -> Iterator[RecordedMessage]:
+    """Messages in the order in which they were written, up to the damage."""
+    channels: dict[int, Channel] = {}
+    with _reading(damaged), damaged.open("rb") as file, suppress(*_DAMAGE):
+        for record in StreamReader(file, validate_crcs=True).records:
+            if isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                yield _unpacked(channels[record.channel_id], record)
 
 
 def _unpacked(channel: Channel, message: Message) -> RecordedMessage:

@@ -31,11 +31,9 @@ messages = st.builds(
 
 def _some(count: int, size: int = 7200) -> list[RecordedMessage]:
     """Messages that do not compress, so that several chunks arise."""
-    block = np.random.default_rng(1).bytes(size)
+    rng = np.random.default_rng(1)
     return [
-        RecordedMessage(
-            "m/stream", block[n % 97 :] + block[: n % 97], bytes(32), "x;1", 1000 * n, 1000 * n - 5 if n else 0
-        )
+        RecordedMessage("m/stream", rng.bytes(size), rng.bytes(32), "x;1", 1000 * n, max(0, 1000 * n - 5))
         for n in range(count)
     ]
 
@@ -146,9 +144,9 @@ def test_another_kind_of_file_is_named(tmp_path: Path) -> None:
     for read in (lambda path: list(read_recording(path)), summarize_recording):
         with pytest.raises(RecordingError, match=r"photo\.mcap: not a complete recording"):
             read(path)
-    with pytest.raises(RecordingError, match=r"photo\.mcap"):
+    with pytest.raises(RecordingError, match=r"photo\.mcap: nothing to recover"):
         recover_recording(path, tmp_path / "new.mcap")
-    assert not (tmp_path / "new.mcap").exists()
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("part", [0.0, 0.001, 0.3, 0.7, 0.999])
@@ -161,13 +159,29 @@ def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, par
     with pytest.raises(RecordingError, match=r"cut\.mcap"):
         list(read_recording(cut))
     if part < 0.01:  # not one chunk is left
-        with pytest.raises(RecordingError, match=r"cut\.mcap"):
+        with pytest.raises(RecordingError, match=r"cut\.mcap: nothing to recover"):
             recover_recording(cut, new)
         return
     count = recover_recording(cut, new)
     # Chunks are 256 KiB, so at most that many messages are lost.
     assert part * len(content) - 256 * 1024 / 7200 - 1 <= count <= len(content)
     assert list(read_recording(new)) == content[:count]
+
+
+def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> None:
+    path, part = tmp_path / "run.mcap", tmp_path / "run.mcap.part"
+    _write(path, _some(400))
+    path.rename(part)
+    part.write_bytes(part.read_bytes()[:-1000])
+    with pytest.raises(RecordingError, match=r"run\.mcap\.part: exists already"):
+        RecordingWriter(path)
+    assert recover_recording(part, path) == 400
+    assert list(read_recording(path)) == _some(400)
+    assert sorted(tmp_path.iterdir()) == [path, part]
+    with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
+        recover_recording(part, path)
+    with pytest.raises(RecordingError, match=r"none\.part: cannot be read"):
+        recover_recording(tmp_path / "none.part", tmp_path / "none")
 
 
 def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
@@ -180,12 +194,17 @@ def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
         list(read_recording(path))
 
 
-def test_finished_chunks_reach_the_disk_while_writing(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    content = _some(400)
-    with RecordingWriter(path) as writer:
-        for message in content:
-            writer.write(message)
-        count = recover_recording(tmp_path / "run.mcap.part", tmp_path / "new.mcap")
-    assert count >= len(content) - 256 * 1024 / 7200 - 1
-    assert list(read_recording(tmp_path / "new.mcap")) == content[:count]
+def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
+    """Without a write more, without closing: what a killed process leaves behind."""
+    part, new = tmp_path / "run.mcap.part", tmp_path / "new.mcap"
+    still = RecordedMessage("m/stream", bytes(7200), bytes(32), "x;1", 1, 1)  # compresses to less than a file buffer
+    content = [still] * 100
+    with RecordingWriter(tmp_path / "run.mcap") as writer:
+        writer.write(still)
+        begin, count = part.stat().st_size, 1
+        while part.stat().st_size == begin:
+            writer.write(content[count])
+            count += 1
+        assert recover_recording(part, new) == count
+        assert 30 < count < 50  # 256 KiB
+    assert list(read_recording(new)) == content[:count]

@@ -23,7 +23,7 @@ from simulator.truth import TruthRecord
 ROOT = Path(__file__).parents[2]
 
 
-def _run(*arguments: str | Path) -> Result:
+def _run(*arguments: str | float | Path) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.errors import MachineFileError
-from models.machine import Machine
+from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import ChannelSettings, Event, Scenario, Sensors, load_scenario
 from simulator.stream import DEFAULT_START_NS, blocks
@@ -142,8 +142,6 @@ def test_a_machine_without_the_channel_is_refused(scenario: Scenario, machine: M
 
 
 def test_both_shipped_machines_run(scenario: Scenario) -> None:
-    from models.machine import load_machine
-
     for name in ("lab", "heavy"):
         machine = load_machine(name).model_copy(update={"dtype": "float64"})
         samples, _ = _all(scenario.model_copy(update={"events": ()}), machine)

@@ -1,0 +1,324 @@
+"""JSON that leaves the monitor, on Zenoh keys and over HTTP: its fields and what they mean.
+
+Every number is finite or null; every field with a unit has it in its name. Relative changes, standard errors and
+intervals are plain ratios: 0.01 is one per cent. Times in ns count from 1970-01-01 UTC.
+"""
+
+import json
+from typing import Annotated, Literal, get_args, get_origin
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from models.signals.channels import Channel
+from service.alarms import AlarmState, Severity
+from service.monitor import HealthState
+
+__all__ = [
+    "Alarm",
+    "AlarmCloudEvent",
+    "AlarmEventData",
+    "AlarmStates",
+    "Equation",
+    "Health",
+    "MachineDescription",
+    "MachineReadiness",
+    "Parameter",
+    "Problem",
+    "Quality",
+    "Readiness",
+    "Report",
+    "StreamStatus",
+    "example",
+]
+
+_JSON = ConfigDict(extra="forbid", frozen=True)
+_NS = 1767225805000000000
+
+Interval = tuple[float, float]
+_Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
+_Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
+_Bundle = Annotated[
+    str | None,
+    Field(description="identity of the trained networks in use; null without", examples=["lab-3f9c1e0b7a52"]),
+]
+_MachineHash = Annotated[
+    str,
+    Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
+]
+_Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]
+_State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
+
+
+class Parameter(BaseModel):
+    """One physical parameter's relative change in one window."""
+
+    model_config = _JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    by: str = Field(description="who says so: likelihood or network", examples=["likelihood"])
+    relative_change: float | None = Field(
+        description="relative change from nominal; null if not evaluable", examples=[-0.247]
+    )
+    standard_error: float | None = Field(description="standard error of the relative change", examples=[0.0071])
+    interval_95: Interval | None = Field(
+        description="95 % interval of the relative change", examples=[(-0.261, -0.233)]
+    )
+    z: float | None = Field(description="relative change in standard errors", examples=[-34.8])
+    reason: _Reason
+
+
+class Equation(BaseModel):
+    """Residual of one compatibility equation in one window."""
+
+    model_config = _JSON
+
+    equation: str = Field(description="number of the compatibility equation: 28 to 31", examples=["28"])
+    title: str = Field(description="what the equation is about", examples=["bearing, horizontal"])
+    evaluable: bool = Field(description="whether the window allowed an evaluation", examples=[True])
+    msd: float | None = Field(
+        description="mean squared deviation between network and estimated correlation, over the target's mean square",
+        examples=[0.0613],
+    )
+    msd_healthy: float | None = Field(description="the same on healthy windows, mean", examples=[0.0018])
+    parameters: tuple[Parameter, ...] = Field(description="the residual projected on the equation's own parameters")
+    reason: _Reason
+
+
+class Report(BaseModel):
+    """One evaluation of the sliding window."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    start_ns: int = Field(description="oldest data in the window", examples=[_NS - 60_000_000_000])
+    end_ns: int = Field(description="end of the newest data in the window", examples=[_NS])
+    state: _State
+    filled: float = Field(description="fraction of a full window", examples=[1.0])
+    speed_rad_s: float | None = Field(description="mean speed in the window", examples=[138.23])
+    misfit: float | None = Field(
+        description="power beyond what the fitted theory says, relative; 0 is none", examples=[0.004]
+    )
+    parameters: tuple[Parameter, ...] = Field(description="what the alarms are decided on")
+    equations: tuple[Equation, ...] = Field(description="the networks' opinion, equation by equation")
+    reason: _Reason
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class Alarm(BaseModel):
+    """Alarm of one parameter."""
+
+    model_config = _JSON
+
+    parameter: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    state: AlarmState = Field(
+        description="normal, pending (must last before it is raised), active, clearing (must last before it ends)",
+        examples=["active"],
+    )
+    raised: bool = Field(description="whether operators should see it: active or clearing", examples=[True])
+    severity: Severity = Field(
+        description="of the present occurrence while raised; otherwise of the last one", examples=["alert"]
+    )
+    since_ns: int = Field(description="data time at which `state` was entered", examples=[_NS])
+    raised_ns: int | None = Field(description="data time at which the present occurrence was raised", examples=[_NS])
+    occurrence: int = Field(description="how often it was raised since the monitor started", examples=[1])
+    relative_change: float | None = Field(description="latest relative change", examples=[-0.247])
+    standard_error: float | None = Field(description="its standard error", examples=[0.0071])
+
+
+class AlarmStates(BaseModel):
+    """The alarms of one machine that are not normal (or all of them, if asked for)."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    alarms: tuple[Alarm, ...] = Field(description="one entry per parameter")
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class Quality(BaseModel):
+    """What came in since the monitor started."""
+
+    model_config = _JSON
+
+    accepted_blocks: int = Field(description="blocks accepted", examples=[2051])
+    refused_blocks: dict[str, int] = Field(description="blocks refused, by reason", examples=[{"not-finite": 3}])
+    gaps: int = Field(description="interruptions before accepted blocks", examples=[1])
+    missing_s: float = Field(description="data time the gaps cost", examples=[0.3])
+    queue_dropped_blocks: int = Field(description="blocks dropped because the monitor could not keep up", examples=[0])
+    link_missed_blocks: int = Field(description="blocks lost on the way, as far as the link knows", examples=[0])
+    last_refusal: str = Field(
+        description="latest reason for refusing a block",
+        examples=["demo/lab: block 740, channel y1: sample 12 is nan, expected a finite number"],
+    )
+    last_gap: str = Field(description="latest gap", examples=["demo/lab: 0.3 s of data are missing (3 blocks)"])
+
+
+class StreamStatus(BaseModel):
+    """What is known about whoever publishes the stream."""
+
+    model_config = _JSON
+
+    publisher_alive: bool = Field(
+        description="a publisher's liveliness token is there; publishers need not have one", examples=[True]
+    )
+    data_age_s: float | None = Field(
+        description="time since the last accepted block was processed; null before the first", examples=[0.04]
+    )
+    descriptor_mismatch: tuple[str, ...] = Field(
+        description="fields of the announced channel descriptor that differ from the machine file", examples=[()]
+    )
+
+
+class Health(BaseModel):
+    """Where a machine stands: state, latest window, alarms, quality of the data."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    state: HealthState = Field(
+        description="warming, healthy, alert, danger, no-data (silence; outranks everything, see `alarms`) or "
+        "not-evaluable",
+        examples=["alert"],
+    )
+    reason: str = Field(description="why the state is no-data or not-evaluable; empty otherwise", examples=[""])
+    filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
+    window_start_ns: int | None = Field(description="oldest data of the latest window", examples=[_NS - 60_000_000_000])
+    window_end_ns: int | None = Field(description="end of the latest window", examples=[_NS])
+    speed_rad_s: float | None = Field(description="mean speed in the latest window", examples=[138.23])
+    misfit: float | None = Field(description="power beyond what the fitted theory says, relative", examples=[0.004])
+    parameters: tuple[Parameter, ...] = Field(description="parameters in the latest window")
+    equations: tuple[Equation, ...] = Field(description="equations in the latest window")
+    alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
+    quality: Quality = Field(description="what came in")
+    stream: StreamStatus = Field(description="what is known about the publisher")
+    worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
+    last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class AlarmEventData(BaseModel):
+    """What happened to an alarm."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    parameter: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(
+        description="the event in a sentence",
+        examples=["ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%"],
+    )
+    kind: Literal["raised", "escalated", "cleared"] = Field(description="what happened", examples=["raised"])
+    severity: Severity = Field(description="alert or danger", examples=["alert"])
+    time_ns: int = Field(description="data time of the event", examples=[_NS])
+    raised_ns: int | None = Field(description="data time at which this occurrence was raised", examples=[_NS])
+    occurrence: int = Field(description="how often the alarm was raised since the monitor started", examples=[1])
+    sequence: int = Field(description="counts the machine's events since the monitor started, from 0", examples=[0])
+    relative_change: float | None = Field(description="relative change that decided", examples=[-0.247])
+    standard_error: float | None = Field(description="its standard error", examples=[0.0071])
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class AlarmCloudEvent(BaseModel):
+    """An alarm event as a CloudEvent 1.0 in structured JSON form."""
+
+    model_config = _JSON
+
+    specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
+    id: str = Field(
+        description="the same however often the event is delivered: machine, parameter, occurrence, kind, data time",
+        examples=[f"demo/lab/k_by/1/raised/{_NS}"],
+    )
+    source: str = Field(description="the machine", examples=["/rotorwatch/demo/lab"])
+    type: str = Field(description="org.rotorwatch.alarm.<kind>", examples=["org.rotorwatch.alarm.raised"])
+    subject: str = Field(description="the parameter", examples=["k_by"])
+    time: str = Field(description="data time, RFC 3339, microseconds", examples=["2026-01-01T00:03:25.000000Z"])
+    datacontenttype: Literal["application/json"] = Field(description="of `data`", examples=["application/json"])
+    sequence: str = Field(
+        description="CloudEvents extension: order of the machine's events since the monitor started; sorts as text",
+        examples=["00000000000000000000"],
+    )
+    data: AlarmEventData = Field(description="what happened")
+
+
+class MachineDescription(BaseModel):
+    """A monitored machine: what it is, what its stream looks like, where to find what is said about it."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    description: str = Field(description="from the machine file", examples=["Rotor kit with an overhung disc"])
+    state: _State
+    speed_rpm: float = Field(description="nominal speed", examples=[1320.0])
+    rate_hz: float = Field(description="samples per second and channel", examples=[2000.0])
+    channels: tuple[Channel, ...] = Field(
+        description="columns of the stream",
+        examples=[({"name": "y1", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"},)],
+    )
+    window_length_s: float = Field(description="length of the sliding window", examples=[60.0])
+    window_hop_s: float = Field(description="data time between reports", examples=[5.0])
+    keys: dict[str, str] = Field(
+        description="Zenoh keys by name",
+        examples=[{"stream": "rotorwatch/demo/lab/stream", "health": "rotorwatch/demo/lab/health"}],
+    )
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class MachineReadiness(BaseModel):
+    """Whether one machine's monitor works."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    state: _State
+    worker_alive: bool = Field(description="the thread that evaluates the machine's blocks runs", examples=[True])
+    worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
+    last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
+
+
+class Readiness(BaseModel):
+    """Whether the service can do its work; machines without data are no reason against it."""
+
+    model_config = _JSON
+
+    ready: bool = Field(description="session open and every worker alive", examples=[True])
+    session_open: bool = Field(description="the Zenoh session is open", examples=[True])
+    machines: tuple[MachineReadiness, ...] = Field(description="machine by machine")
+
+
+class Problem(BaseModel):
+    """What went wrong with a request, after RFC 9457."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    type: str = Field(default="about:blank", description="kind of problem", examples=["about:blank"])
+    title: str = Field(description="short, the same for every problem of the kind", examples=["Not Found"])
+    status: int = Field(description="HTTP status", examples=[404])
+    detail: str = Field(description="what went wrong this time", examples=["no machine demo/pump; there are: demo/lab"])
+    instance: str = Field(description="path of the request", examples=["/api/v1/machines/demo/pump"])
+
+
+def example(model: type[BaseModel]) -> dict[str, object]:
+    """Build one valid JSON object of a model out of the examples of its fields."""
+    return {name: _field_example(field.examples, field.annotation) for name, field in model.model_fields.items()}
+
+
+def _field_example(examples: list[object] | None, annotation: object) -> object:
+    if examples:
+        return json.loads(json.dumps(examples[0]))
+    item = next((part for part in get_args(annotation) if part is not Ellipsis), annotation)
+    if not (isinstance(item, type) and issubclass(item, BaseModel)):
+        raise TypeError(f"no example for {annotation}")
+    return [example(item)] if get_origin(annotation) is tuple else example(item)

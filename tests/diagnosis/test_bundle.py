@@ -1,0 +1,150 @@
+"""Training in small, the bundle's round trip, and every way to refuse a bundle."""
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from models.diagnosis.bundle import Training, load_bundle, save_bundle
+from models.diagnosis.equations import EQUATIONS
+from models.diagnosis.networks import EquationNetwork, read_equation
+from models.diagnosis.training import calibrate, train_network
+from models.errors import BundleError
+from models.machine import Machine, load_machine
+from simulator.campaign import Draw, Layout, Purpose, simulate_window, with_tilt
+
+SEED = 7_700_003
+LAB = load_machine("lab")
+SHIPPED = Path(__file__).parents[2] / "models" / "bundles" / "lab"
+MADE = Training(seed=SEED, training_windows=24, calibration_windows=10, versions={})
+
+
+def windows(machine: Machine, purpose: Purpose, count: int, kept: tuple[str, ...]) -> list[Any]:
+    draw = Draw(machine, SEED, purpose, 0, kept)
+    return [simulate_window(draw, number) for number in range(count)]
+
+
+@pytest.fixture(scope="module")
+def trained() -> EquationNetwork:
+    equation = EQUATIONS[0]
+    network = train_network(equation, windows(LAB, Purpose.TRAINING, 24, equation.kept_nominal), LAB, SEED)
+    return calibrate(network, windows(LAB, Purpose.CALIBRATION, 10, equation.kept_nominal), LAB)
+
+
+@pytest.mark.slow
+def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(trained: EquationNetwork) -> None:
+    draw = Draw(LAB, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
+    readings = [read_equation(trained, simulate_window(draw, number), LAB).parameters for number in range(8)]
+    k_by = np.array([reading[0].change for reading in readings], dtype=np.float64)
+    assert np.median(k_by) == pytest.approx(-0.2, abs=0.04)
+    assert all((reading[0].z or 0.0) < -2 for reading in readings)
+    assert abs(np.median([reading[1].z or 0.0 for reading in readings])) < 2  # c_by did not change
+
+
+def test_training_is_reproducible_and_progress_is_told() -> None:
+    equation, told = EQUATIONS[1], list[float]()
+    material = windows(LAB, Purpose.TRAINING, 6, equation.kept_nominal)
+    first = train_network(equation, material, LAB, SEED, told.append)
+    second = train_network(equation, material, LAB, SEED)
+    np.testing.assert_array_equal(first.network.W1, second.network.W1)
+    assert told[-1] == 1.0
+    assert told == sorted(told)
+
+
+def test_round_trip(trained: EquationNetwork, tmp_path: Path) -> None:
+    saved = save_bundle(tmp_path / "bundle", LAB, (trained,), MADE)
+    loaded = load_bundle(tmp_path / "bundle", LAB)
+    assert loaded.identity == saved.identity
+    assert loaded.manifest == saved.manifest
+    x = np.random.default_rng(0).standard_normal((5, 4))
+    np.testing.assert_array_equal(loaded.networks[0].network(x), trained.network(x))
+    assert loaded.networks[0].healthy == trained.healthy
+
+
+def test_an_uncalibrated_network_is_not_saved(trained: EquationNetwork, tmp_path: Path) -> None:
+    with pytest.raises(BundleError, match="equation 28 has no healthy spread"):
+        save_bundle(tmp_path, LAB, (EquationNetwork(trained.equation, trained.network, None),), MADE)
+
+
+def edit_manifest(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+    def edit(directory: Path) -> None:
+        manifest = json.loads((directory / "manifest.json").read_text())
+        change(manifest)
+        (directory / "manifest.json").write_text(json.dumps(manifest))
+
+    return edit
+
+
+def edit_weights(change: Callable[[dict[str, Any]], None]) -> Callable[[Path], None]:
+    def edit(directory: Path) -> None:
+        weights = directory / "weights.safetensors"
+        arrays = load_file(weights)
+        change(arrays)
+        save_file(arrays, weights)
+        digest = hashlib.sha256(weights.read_bytes()).hexdigest()
+        edit_manifest(lambda manifest: manifest.update(weights_sha256=digest))(directory)
+
+    return edit
+
+
+def flip_a_byte(directory: Path) -> None:
+    data = bytearray((directory / "weights.safetensors").read_bytes())
+    data[-1] ^= 1
+    (directory / "weights.safetensors").write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (flip_a_byte, "sha256 is .* the manifest says"),
+        (lambda d: (d / "weights.safetensors").unlink(), "not a bundle: weights.safetensors"),
+        (lambda d: (d / "manifest.json").write_text("{"), "manifest.json: .*Invalid JSON"),
+        (edit_manifest(lambda m: m.update(format=2)), "format is 2, this program reads 1"),
+        (edit_manifest(lambda m: m.update(code="import os")), "code.*Extra inputs"),
+        (edit_manifest(lambda m: m["physics"]["rotor"].update(m1_kg=0.6)), "rotor.m1_kg is 0.5, trained for 0.6"),
+        (edit_manifest(lambda m: m["physics"].update(rate_hz=4000.0)), "rate_hz is 2000.0, trained for 4000.0"),
+        (edit_manifest(lambda m: m["physics"]["window"].update(lag_to_s=0.2)), "window.lag_to_s is 0.125, trained"),
+        (edit_manifest(lambda m: m["equations"][0].update(number="99")), "equation 99 is not in this program's table"),
+        (edit_manifest(lambda m: m["equations"][0].update(inputs=["R[i,y1]"])), "equation 28: inputs are"),
+        (edit_weights(lambda a: a.update({"28.W1": np.zeros((3, 15))})), r"28: weight W1 is float64\(3, 15\)"),
+        (edit_weights(lambda a: a.update({"28.b2": np.array([np.nan])})), "28: weight b2 .* expected finite"),
+        (edit_weights(lambda a: a.pop("31.W2") is None), "31: weight W2 is missing"),
+    ],
+)
+def test_a_damaged_or_foreign_bundle_is_refused_and_told_why(
+    tmp_path: Path, damage: Callable[[Path], object], message: str
+) -> None:
+    directory = tmp_path / "bundle"
+    shutil.copytree(SHIPPED, directory)
+    load_bundle(directory, LAB)
+    damage(directory)
+    with pytest.raises(BundleError) as caught:
+        load_bundle(directory, LAB)
+    assert re.search(message, str(caught.value), re.DOTALL)
+
+
+def test_the_shipped_bundle_is_the_documented_training_and_refuses_another_machine() -> None:
+    bundle = load_bundle("lab", LAB)
+    assert [network.equation.number for network in bundle.networks] == ["28", "29", "30", "31"]
+    assert bundle.manifest.training.seed not in {SEED}
+    with pytest.raises(BundleError, match=r"trained for another machine than demo/heavy: .*rotor\.m1_kg is 5\.0"):
+        load_bundle("lab", load_machine("heavy"))
+
+
+@pytest.mark.slow
+def test_the_tilt_equation_is_evaluated_where_tilt_is_measured() -> None:
+    rig = with_tilt(LAB)
+    bundle = load_bundle("lab", rig)
+    network = next(network for network in bundle.networks if network.equation.number == "30")
+    draw = Draw(rig, SEED, Purpose.EVALUATION, 2, layout=Layout.INDEPENDENT)
+    reading = read_equation(network, simulate_window(draw, 0), rig)
+    assert reading.evaluable
+    assert reading.parameters[0].name == "EI"
+    assert abs(reading.parameters[0].z or 0.0) < 5
