@@ -250,6 +250,9 @@ def load_machine(name_or_path: str | Path) -> Machine:
     path = Path(name_or_path)
     if path.suffix != ".toml" and (_SHIPPED / f"{name_or_path}.toml").is_file():
         path = _SHIPPED / f"{name_or_path}.toml"
+    elif not path.is_file():
+        shipped = ", ".join(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
+        raise MachineFileError(f"{path}: no such machine file; shipped machines: {shipped}")
     try:
         return Machine.model_validate(read_toml(path))
     except ValidationError as error:
@@ -267,8 +270,7 @@ def read_toml(path: Path) -> dict[str, object]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        shipped = ", ".join(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
-        raise MachineFileError(f"{path}: cannot be read ({error.strerror}); shipped machines: {shipped}") from error
+        raise MachineFileError(f"{path}: cannot be read ({error.strerror})") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise MachineFileError(f"{path}: not a TOML file: {error}") from error
 
@@ -279,5 +281,5 @@ def validation_text(path: Path, error: ValidationError) -> str:
     for fault in error.errors():
         field = ".".join(str(part) for part in fault["loc"]) or "file"
         found = "" if fault["type"] == "missing" or isinstance(fault["input"], dict) else f" (found {fault['input']!r})"
-        lines.append(f"{path}: {field}: {fault['msg']}{found}")
+        lines.append(f"{path}: {field}: {fault['msg'].removeprefix('Value error, ')}{found}")
     return "\n".join(lines)

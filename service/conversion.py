@@ -12,6 +12,7 @@ from models.machine import Machine
 from models.physics.parameters import PARAMETER_TEXT
 from service.alarms import Alarm, AlarmEvent, AlarmState
 from service.monitor import DataQuality, HealthState, MachineHealth, WindowReport
+from service.schemas import Alarm as AlarmJson
 from service.schemas import (
     AlarmCloudEvent,
     AlarmEventData,
@@ -22,7 +23,6 @@ from service.schemas import (
     Report,
     StreamStatus,
 )
-from service.schemas import Alarm as AlarmJson
 from service.schemas import Equation as EquationJson
 from service.schemas import Parameter as ParameterJson
 

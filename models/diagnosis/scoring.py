@@ -17,8 +17,9 @@ _WEAK, _COLOUR = 0.05, 1.0
 """Weak pull of levels, noise and its colour towards their usual values: without it the search wanders off where an
 excitation of low rank, or a channel without visible noise, leaves them undetermined."""
 
-_GAIN = 5e-3
-"""Converged when a full step would gain less than this: 0.1 standard errors over all parameters together."""
+_NEAR, _GAIN = 0.05, 1.0
+"""Converged when a full step would move no diagnosed parameter by more than this many standard errors and would gain
+less than this in log-likelihood. Noise levels may swing a little longer; what is diagnosed does not follow them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,7 @@ class FisherScoring:
         gradient, information = self._scores(theta)
         steps = 0
         while True:
-            converged = bool(gradient @ np.linalg.solve(information, gradient) / 2 < _GAIN)
+            converged = self._is_near(gradient, information)
             if converged or steps == most_steps:
                 break
             steps += 1
@@ -109,6 +110,12 @@ class FisherScoring:
             else:
                 damping *= 8
         return Maximum(theta, information, value, steps, converged)
+
+    def _is_near(self, gradient: FloatArray, information: FloatArray) -> bool:
+        step = np.linalg.solve(information, gradient)
+        diagnosed = slice(self._model.cutoff_at)
+        variance = np.diag(np.linalg.inv(information))[diagnosed]
+        return bool(np.all(step[diagnosed] ** 2 < _NEAR**2 * variance) and gradient @ step / 2 < _GAIN)
 
     def _value(self, theta: FloatArray) -> float:
         """Log-likelihood and the weak pulls, up to a constant."""

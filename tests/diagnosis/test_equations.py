@@ -9,6 +9,7 @@ from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response
 from models.physics.matrices import STATES
 from models.physics.parameters import PARAMETERS, changed
+from models.signals.block import FloatArray
 
 LAGS_S = np.arange(60, 126, 3) / 1000  # beyond the memory of a 150 Hz excitation: e^-40
 SOURCES = tuple(
@@ -27,12 +28,12 @@ def theory(machine: Machine, changes: dict[str, float], speed_ratio: float) -> S
     return StatisticsView(STATES, R, q1 - 1j * q2, W)
 
 
-def linear_relation(equation: Equation | SynchronousEquation, machine: Machine) -> np.ndarray:
+def linear_relation(equation: Equation | SynchronousEquation, machine: Machine) -> FloatArray:
     """The fixed combination of the inputs that a perfect network would learn, from healthy theory."""
     rows = [equation.rows(theory(machine, {}, ratio), machine) for ratio in (0.85, 0.95, 1.0, 1.1, 1.2)]
     inputs, target = np.concatenate([row.inputs for row in rows]), np.concatenate([row.target for row in rows])
     scale = np.sqrt(np.mean(inputs**2, axis=0))
-    return np.linalg.lstsq(inputs / scale, target, rcond=1e-14)[0] / scale
+    return np.asarray(np.linalg.lstsq(inputs / scale, target, rcond=1e-14)[0] / scale, dtype=np.float64)
 
 
 @pytest.mark.parametrize("name", ["lab", "heavy"])

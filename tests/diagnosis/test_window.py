@@ -36,7 +36,7 @@ def small_plan(*, angle: bool = True, hops: int = 4) -> Plan:
 def signal(n_samples: int, seed: int, *, offset: float = 0.0, angle: bool = True) -> FloatArray:
     rng = np.random.default_rng(seed)
     noise = rng.standard_normal((n_samples + 5, 2))
-    x = np.stack([noise[5 - lag : n_samples + 5 - lag] for lag in range(5)]).sum(axis=0) + offset
+    x: FloatArray = np.stack([noise[5 - lag : n_samples + 5 - lag] for lag in range(5)]).sum(axis=0) + offset
     if not angle:
         return x
     theta = np.mod(0.4 + 2 * np.pi * 7.3 / RATE * np.arange(n_samples), 2 * np.pi)

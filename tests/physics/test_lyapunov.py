@@ -169,3 +169,15 @@ def test_stochastic_covariance_is_the_rotor_part() -> None:
     np.testing.assert_array_equal(
         stochastic_covariance(machine.rotor, 138.0, SOURCES), stationary_covariance(A, B)[:12, :12]
     )
+
+
+def test_process_noise_of_a_double_integrator_has_its_closed_form() -> None:
+    """White force of intensity S on a barely bound mass: G Gᵀ = S/m² [[T³/3, T²/2], [T²/2, T]], to every digit.
+
+    An unscaled factorisation loses the displacement part, which is 10⁸ times smaller than the velocity part.
+    """
+    S, m, T = 4.0, 2.0, 1e-4
+    A = np.array([[0.0, 1.0], [-1e-6, -1e-3]])
+    system = discretise(A, np.array([[0.0], [np.sqrt(S) / m]]), T)
+    expected = S / m**2 * np.array([[T**3 / 3, T**2 / 2], [T**2 / 2, T]])
+    np.testing.assert_allclose(system.G @ system.G.T, expected, rtol=1e-5)

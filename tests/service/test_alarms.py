@@ -19,7 +19,8 @@ SETTINGS = AlarmSettings(on_delay_s=10, off_delay_s=15)
 def play(
     story: str, settings: AlarmSettings = SETTINGS, error: float = 0.01
 ) -> tuple[str, AlarmBook, list[AlarmEvent]]:
-    book, marks, events = AlarmBook(settings), "", []
+    book, marks = AlarmBook(settings), ""
+    events: list[AlarmEvent] = []
     for number, character in enumerate(story):
         heard: tuple[AlarmEvent, ...] = ()
         if character != "_":
@@ -74,10 +75,11 @@ def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
 
 def test_severity_is_the_highest_of_the_raised_alarms() -> None:
     _, book, _ = play("xxx")
-    assert book.severity is Severity.ALERT
+    severities = [book.severity]
     for number in range(4):
         book.update("e", 0.9, 0.01, number * 5_000_000_000)
-    assert book.severity is Severity.DANGER
+    severities.append(book.severity)
+    assert severities == [Severity.ALERT, Severity.DANGER]
 
 
 def test_own_limits_of_a_parameter() -> None:

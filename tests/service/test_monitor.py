@@ -31,7 +31,8 @@ def monitor() -> MachineMonitor:
 
 
 def feed(target: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[WindowReport], list[AlarmEvent]]:
-    windows, events = [], []
+    windows: list[WindowReport] = []
+    events: list[AlarmEvent] = []
     for block in stream:
         report = target.step(block)
         windows += report.windows

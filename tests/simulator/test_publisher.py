@@ -164,8 +164,7 @@ def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(
 ) -> None:
     """More than cache and sockets hold, to a subscriber slower than the simulation; the session closes at once."""
     scenario, machine = loaded
-    machine = machine.model_copy(update={"dtype": "float64"})
-    long = scenario.overridden(duration_s=100.0)
+    long = scenario.overridden(duration_s=150.0)
     with monitor.declare_queryable(machine.keys.health, lambda query: query.reply(machine.keys.health, b"{}")):
         stream = _Received(monitor, machine.keys.stream, delay_s=0.003)
         with _publishing((long, machine), endpoint, pace=None, wait_for_subscriber_s=30.0, linger_s=0.0) as (
@@ -173,10 +172,10 @@ def test_an_unpaced_stream_waits_for_a_slow_subscriber_and_loses_nothing(
             outcome,
         ):
             _until(lambda: len(outcome) == 1, "end of the stream", 60.0)
-            _until(lambda: len(stream.samples) >= 1000, "last block", 60.0)
+            _until(lambda: len(stream.samples) >= 1500, "last block", 60.0)
     assert isinstance(outcome[0], RunSummary)
-    assert outcome[0].blocks == 1000
-    assert stream.sequences == list(range(1000))
+    assert outcome[0].blocks == 1500
+    assert stream.sequences == list(range(1500))
 
 
 def test_an_arrow_stream_arrives_as_the_same_samples(

@@ -1,0 +1,266 @@
+"""The HTTP API over what the service knows; read only. ``docs/api.md`` lists the routes."""
+
+import html
+from collections.abc import Awaitable, Callable, Sequence
+from http import HTTPStatus
+from typing import Annotated, Any, Protocol
+
+from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import HTMLResponse, JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException as StarletteHTTPException
+
+from service.schemas import (
+    AlarmCloudEvent,
+    AlarmStates,
+    Health,
+    MachineDescription,
+    Problem,
+    Readiness,
+    Report,
+    example,
+)
+
+__all__ = ["AlarmEventList", "Alive", "MachineList", "MachineView", "ReportList", "ServiceView", "create_app"]
+
+_PROBLEM = "application/problem+json"
+_JSON = ConfigDict(extra="forbid", frozen=True)
+_CURSOR = "pass it as until_ns to get what is older; null if nothing older is kept"
+
+
+class MachineView(Protocol):
+    """What the API needs to know about one machine."""
+
+    def description(self) -> MachineDescription:
+        """Identity, stream, keys, and the present state."""
+
+    def health(self) -> Health:
+        """Where the machine stands now."""
+
+    def alarms(self, *, include_normal: bool = False) -> AlarmStates:
+        """Return the alarms as they are now."""
+
+    def reports(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[Report, ...]:
+        """Window reports with since_ns ≤ end_ns < until_ns, newest first."""
+
+    def alarm_events(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[AlarmCloudEvent, ...]:
+        """Alarm events with since_ns ≤ time_ns < until_ns, newest first."""
+
+
+class ServiceView(Protocol):
+    """What the API needs to know about the service."""
+
+    def machines(self) -> Sequence[MachineView]:
+        """Every monitored machine."""
+
+    def machine(self, site: str, name: str) -> MachineView | None:
+        """One machine, or None if it is not monitored."""
+
+    def readiness(self) -> Readiness:
+        """Whether the service can do its work."""
+
+
+class MachineList(BaseModel):
+    """Every monitored machine."""
+
+    model_config = _JSON
+
+    machines: tuple[MachineDescription, ...] = Field(description="in the order of the settings")
+
+
+class ReportList(BaseModel):
+    """Window reports, newest first."""
+
+    model_config = _JSON
+
+    reports: tuple[Report, ...] = Field(description="newest first")
+    next_until_ns: int | None = Field(description=_CURSOR, examples=[1767225805000000000])
+
+
+class AlarmEventList(BaseModel):
+    """Alarm events, newest first."""
+
+    model_config = _JSON
+
+    events: tuple[AlarmCloudEvent, ...] = Field(description="newest first")
+    next_until_ns: int | None = Field(description=_CURSOR, examples=[1767225805000000000])
+
+
+class Alive(BaseModel):
+    """The process answers."""
+
+    model_config = _JSON
+
+    alive: bool = Field(description="always true", examples=[True])
+
+
+_SinceNs = Annotated[int | None, Query(ge=0, description="from this time on, ns since 1970-01-01 UTC")]
+_UntilNs = Annotated[int | None, Query(ge=0, description="before this time, ns since 1970-01-01 UTC")]
+_Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many, the newest")]
+
+
+def create_app(service: ServiceView) -> FastAPI:
+    """Build the application.
+
+    Parameters
+    ----------
+    service : ServiceView
+        Where the answers come from; called from the server's worker threads.
+    """
+    app = FastAPI(
+        title="rotorwatch",
+        description="Health of rotating machines: which parameter changed, by how much, how sure. Read only. "
+        "Errors are problem details (RFC 9457).",
+        docs_url=None,  # the usual pages load their scripts from elsewhere
+        redoc_url=None,
+    )
+    _add_problems(app)
+    _add_machine_routes(app, service)
+    _add_history_routes(app, service)
+    _add_service_routes(app, service)
+    return app
+
+
+def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
+    @app.get("/api/v1/machines", tags=["machines"], responses=_responses(MachineList))
+    def machines() -> MachineList:
+        """Every monitored machine with its state."""
+        return MachineList(machines=tuple(machine.description() for machine in service.machines()))
+
+    @app.get("/api/v1/machines/{site}/{machine}", tags=["machines"], responses=_responses(MachineDescription, 404))
+    def machine(site: str, machine: str) -> MachineDescription:
+        """One machine: stream, channels, keys, state."""
+        return _find(service, site, machine).description()
+
+    @app.get("/api/v1/machines/{site}/{machine}/health", tags=["machines"], responses=_responses(Health, 404))
+    def health(site: str, machine: str) -> Health:
+        """Where a machine stands: state, parameters with intervals, equations, alarms, quality of the data."""
+        return _find(service, site, machine).health()
+
+    @app.get("/api/v1/machines/{site}/{machine}/alarms", tags=["machines"], responses=_responses(AlarmStates, 404, 422))
+    def alarms(
+        site: str,
+        machine: str,
+        all_: Annotated[bool, Query(alias="all", description="normal ones as well")] = False,
+    ) -> AlarmStates:
+        """Alarms that are pending, active or clearing."""
+        return _find(service, site, machine).alarms(include_normal=all_)
+
+
+def _add_history_routes(app: FastAPI, service: ServiceView) -> None:
+    @app.get("/api/v1/machines/{site}/{machine}/reports", tags=["history"], responses=_responses(ReportList, 404, 422))
+    def reports(
+        site: str, machine: str, since_ns: _SinceNs = None, until_ns: _UntilNs = None, limit: _Limit = 100
+    ) -> ReportList:
+        """Window reports by the time of the window's end, newest first: the history of residuals."""
+        found = _find(service, site, machine).reports(since_ns, until_ns, limit)
+        return ReportList(reports=found, next_until_ns=found[-1].end_ns if len(found) == limit else None)
+
+    @app.get(
+        "/api/v1/machines/{site}/{machine}/alarms/events",
+        tags=["history"],
+        responses=_responses(AlarmEventList, 404, 422),
+    )
+    def alarm_events(
+        site: str, machine: str, since_ns: _SinceNs = None, until_ns: _UntilNs = None, limit: _Limit = 100
+    ) -> AlarmEventList:
+        """Raised, escalated and cleared alarms by their time, newest first, as CloudEvents."""
+        found = _find(service, site, machine).alarm_events(since_ns, until_ns, limit)
+        return AlarmEventList(events=found, next_until_ns=found[-1].data.time_ns if len(found) == limit else None)
+
+
+def _add_service_routes(app: FastAPI, service: ServiceView) -> None:
+    @app.get("/healthz", tags=["service"], responses=_responses(Alive))
+    def healthz() -> Alive:
+        """Whether the process answers."""
+        return Alive(alive=True)
+
+    @app.get("/readyz", tags=["service"], responses=_responses(Readiness, 503), response_model=Readiness)
+    def readyz(request: Request) -> Readiness | JSONResponse:
+        """Whether the session is open and every worker runs; a machine without data is listed, not counted."""
+        readiness = service.readiness()
+        if readiness.ready:
+            return readiness
+        return _problem(
+            request, 503, "the session is closed or a worker has stopped", readiness.model_dump(mode="json")
+        )
+
+    @app.get("/", include_in_schema=False, response_class=HTMLResponse)
+    def page() -> str:
+        """Serve a plain page for people."""
+        rows = "".join(_row(machine.description()) for machine in service.machines())
+        return (
+            '<!doctype html><html lang="en"><meta charset="utf-8"><title>rotorwatch</title>'
+            "<h1>rotorwatch</h1><table><thead><tr><th>machine<th>state<th>description<th></thead>"
+            f'<tbody>{rows}</tbody></table><p><a href="/openapi.json">API description (OpenAPI)</a>, '
+            '<a href="/readyz">readiness</a></p></html>'
+        )
+
+
+def _row(machine: MachineDescription) -> str:
+    place = f"/api/v1/machines/{machine.site}/{machine.machine}"
+    links = ", ".join(
+        f'<a href="{place}/{what}">{what}</a>' for what in ("health", "reports", "alarms", "alarms/events")
+    )
+    name = html.escape(f"{machine.site}/{machine.machine}")
+    return (
+        f'<tr><td><a href="{place}">{name}</a><td>{html.escape(machine.state)}'
+        f"<td>{html.escape(machine.description)}<td>{links}</tr>"
+    )
+
+
+def _find(service: ServiceView, site: str, name: str) -> MachineView:
+    machine = service.machine(site, name)
+    if machine is None:
+        known = ", ".join(f"{d.site}/{d.machine}" for d in (view.description() for view in service.machines()))
+        raise HTTPException(404, f"no machine {site}/{name}; there are: {known}")
+    return machine
+
+
+def _responses(model: type[BaseModel], *problems: int) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries: an example of the answer, and the problems a request may meet."""
+    found: dict[int | str, dict[str, Any]] = {200: {"content": {"application/json": {"example": example(model)}}}}
+    for status in (*problems, 500):
+        phrase = HTTPStatus(status).phrase
+        shown = {**example(Problem), "title": phrase, "status": status}
+        found[status] = {
+            "description": phrase,
+            "content": {_PROBLEM: {"schema": Problem.model_json_schema(), "example": shown}},
+        }
+    return found
+
+
+def _problem(request: Request, status: int, detail: str, more: dict[str, Any] | None = None) -> JSONResponse:
+    problem = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, instance=request.url.path)
+    return JSONResponse({**problem.model_dump(), **(more or {})}, status, media_type=_PROBLEM)
+
+
+def _add_problems(app: FastAPI) -> None:
+    """Answer every error with problem details."""
+
+    async def on_http(request: Request, error: Exception) -> JSONResponse:
+        if not isinstance(error, StarletteHTTPException):
+            raise error
+        response = _problem(request, error.status_code, str(error.detail))
+        response.headers.update(error.headers or {})
+        return response
+
+    async def on_invalid(request: Request, error: Exception) -> JSONResponse:
+        if not isinstance(error, RequestValidationError):
+            raise error
+        faults = [{"field": str(fault["loc"][-1]), "message": str(fault["msg"])} for fault in error.errors()]
+        detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
+        return _problem(request, 422, detail, {"errors": faults})
+
+    async def on_error(request: Request, error: Exception) -> JSONResponse:
+        _ = error  # the server logs it; callers learn nothing about the inside
+        return _problem(request, 500, "an error inside the service; its log says more")
+
+    handlers: dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]] = {
+        StarletteHTTPException: on_http,
+        RequestValidationError: on_invalid,
+        Exception: on_error,
+    }
+    for kind, handler in handlers.items():
+        app.add_exception_handler(kind, handler)

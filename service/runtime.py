@@ -1,0 +1,275 @@
+"""The running service: which thread does what, start and stop.
+
+::
+
+    Zenoh threads            one thread per machine              supervisor            HTTP threads
+    -------------            ----------------------              ----------            ------------
+    stream callback --> Inbox --> MachineMonitor.step_payload
+      (bounded, counts)           |        |        |            four times a second:
+                                  |        |        '--> snapshot --> health topic <-- /api/.../health
+                                  |        '--> History <------------------------------ /api/.../reports
+                                  '--> report, alarm topics
+    queries on health, alarm/state <-------------------- snapshot
+
+The main thread waits for a signal. Only a machine's own thread touches its monitor; everybody else reads immutable
+snapshots. Silence is noticed by the supervisor on the monotonic clock: no other time of this computer is used.
+"""
+
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+
+import uvicorn
+
+from models.diagnosis.bundle import load_bundle
+from models.errors import RotorwatchError
+from models.machine import Machine
+from models.signals.keys import MachineKeys
+from service.api import create_app
+from service.config import HttpSettings, ServiceSettings
+from service.logs import logger
+from service.schemas import Health, MachineReadiness, Readiness
+from service.transport import Link, MachineCallbacks, MachineLink
+from service.worker import MachineWorker
+
+__all__ = ["HttpError", "Runtime", "running", "stop_event"]
+
+_TICK_S = 0.25
+_JOIN_S = 10.0
+
+_log = logger(part="runtime")
+
+
+class HttpError(RotorwatchError):
+    """The HTTP API cannot be served; the message names the address."""
+
+
+class Runtime:
+    """Monitors of all machines with their links and the HTTP server.
+
+    Building it reads every file; nothing runs or listens before `start`.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        From `service.config.load_settings`.
+
+    Raises
+    ------
+    MachineFileError, BundleError
+        If a machine file or bundle cannot be used.
+    """
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self.settings = settings
+        self._workers: list[MachineWorker] = []
+        for entry in settings.machines:
+            machine = entry.load()
+            bundle = None if entry.bundle is None else load_bundle(entry.bundle, machine)
+            self._workers.append(MachineWorker(machine, bundle, settings.queue, settings.history))
+        self._link: Link | None = None
+        self._server: _HttpServer | None = None
+        self._undo = ExitStack()
+
+    @property
+    def http_url(self) -> str:
+        """Where the HTTP API is, once started."""
+        if self._server is None:
+            raise HttpError("the HTTP API is not started")
+        return self._server.url
+
+    def machines(self) -> tuple[MachineWorker, ...]:
+        """Every monitored machine."""
+        return tuple(self._workers)
+
+    def machine(self, site: str, name: str) -> MachineWorker | None:
+        """One machine, or None if it is not monitored."""
+        for worker in self._workers:
+            if (worker.machine.site, worker.machine.name) == (site, name):
+                return worker
+        return None
+
+    def readiness(self) -> Readiness:
+        """Whether the session is open and every worker runs."""
+        session_open = self._link is not None and self._link.is_open
+        machines = tuple(
+            MachineReadiness(
+                site=worker.machine.site,
+                machine=worker.machine.name,
+                state=worker.health().state,
+                worker_alive=worker.alive,
+                worker_errors=worker.errors,
+                last_worker_error=worker.last_error,
+            )
+            for worker in self._workers
+        )
+        ready = session_open and all(machine.worker_alive for machine in machines)
+        return Readiness(ready=ready, session_open=session_open, machines=machines)
+
+    def start(self) -> None:
+        """Open the session, start the threads, serve HTTP.
+
+        Raises
+        ------
+        LinkError
+            If the Zenoh endpoints cannot be used.
+        HttpError
+            If the HTTP address cannot be listened on.
+        """
+        with ExitStack() as undo:
+            server = _HttpServer(self.settings.http)  # takes the port first: the commonest mistake, the quickest check
+            undo.callback(server.stop)
+            self._link = Link(self.settings.link)
+            undo.callback(self._link.close)
+            links = []
+            for worker in self._workers:
+                links.append(self._connect(worker, self._link, undo))
+            supervisor = _Supervisor(list(zip(self._workers, links, strict=True)))
+            undo.callback(supervisor.stop)
+            supervisor.start()
+            self._server = server
+            server.start(self)
+            self._undo = undo.pop_all()
+        _log.info("running", http=server.url, machines=len(self._workers))
+
+    def _connect(self, worker: MachineWorker, link: Link, undo: ExitStack) -> MachineLink:
+        machine: Machine = worker.machine
+        keys: MachineKeys = machine.keys
+        callbacks = MachineCallbacks(
+            on_block=worker.inbox.put,
+            on_missed=worker.missed,
+            on_descriptor=worker.descriptor,
+            on_publisher=worker.publisher,
+            health=lambda: worker.health().model_dump_json(),
+            alarm_state=lambda: worker.alarms().model_dump_json(),
+        )
+        machine_link = MachineLink(link, keys, callbacks, wait_when_full=self.settings.queue.when_full == "wait")
+        undo.callback(machine_link.close)
+        # The worker stops first, while its topics are still declared; closing the inbox also frees a waiting callback.
+        undo.callback(worker.stop)
+        worker.start(machine_link)
+        machine_link.publish_alarm_state(worker.alarms().model_dump_json())
+        return machine_link
+
+    def stop(self) -> None:
+        """Stop in the reverse order of starting."""
+        self._undo.close()
+        _log.info("stopped")
+
+
+@contextmanager
+def running(settings: ServiceSettings) -> Iterator[Runtime]:
+    """Run the service inside a ``with`` block.
+
+    Raises
+    ------
+    RotorwatchError
+        As `Runtime` and `Runtime.start`.
+    """
+    runtime = Runtime(settings)
+    runtime.start()
+    try:
+        yield runtime
+    finally:
+        runtime.stop()
+
+
+@contextmanager
+def stop_event() -> Iterator[threading.Event]:
+    """Event that SIGINT and SIGTERM set; the signals' former handlers come back afterwards."""
+    stop = threading.Event()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        _ = number, frame
+        stop.set()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+class _Supervisor:
+    """Publishes health when it has changed, silence included."""
+
+    def __init__(self, watched: list[tuple[MachineWorker, MachineLink]]) -> None:
+        self._watched = watched
+        self._stop = threading.Event()
+        self._published: dict[int, Health] = {}
+        self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop the thread."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            for number, (worker, link) in enumerate(self._watched):
+                try:
+                    self._look(number, worker, link)
+                except Exception:  # the others must still be looked at
+                    _log.exception("health could not be published", machine=worker.machine.name)
+            if self._stop.wait(_TICK_S):
+                return
+
+    def _look(self, number: int, worker: MachineWorker, link: MachineLink) -> None:
+        health = worker.health()
+        before = self._published.get(number)
+        if before is not None and _news(before) == _news(health):
+            return
+        self._published[number] = health
+        link.publish_health(health.model_dump_json())
+        if before is None or before.state != health.state:
+            _log.info("state", machine=f"{health.site}/{health.machine}", state=health.state.value, why=health.reason)
+
+
+def _news(health: Health) -> Health:
+    """Blank what changes with every block: it is no reason to publish."""
+    return health.model_copy(
+        update={
+            "stream": health.stream.model_copy(update={"data_age_s": None}),
+            "quality": health.quality.model_copy(update={"accepted_blocks": 0}),
+        }
+    )
+
+
+class _HttpServer:
+    """The HTTP server in a thread of its own; the address is taken when it is built."""
+
+    def __init__(self, settings: HttpSettings) -> None:
+        family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+        try:
+            self._socket = socket.create_server((settings.host, settings.port), family=family)
+        except OSError as error:
+            raise HttpError(
+                f"HTTP cannot listen on {settings.host} port {settings.port}: {error.strerror or error}"
+            ) from error
+        host = f"[{settings.host}]" if ":" in settings.host else settings.host
+        self.url = f"http://{host}:{self._socket.getsockname()[1]}"
+        self._server: uvicorn.Server | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self, runtime: Runtime) -> None:
+        """Serve the API."""
+        config = uvicorn.Config(create_app(runtime), log_config=None, access_log=False, lifespan="off")
+        server = self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(target=server.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Finish present requests and free the address."""
+        if self._server is not None and self._thread is not None:
+            self._server.should_exit = True
+            self._thread.join(_JOIN_S)
+        self._socket.close()

@@ -1,0 +1,362 @@
+"""The service's side of Zenoh; the only module of the service that imports it.
+
+::
+
+    stream ------------> on_block          descriptor, publisher_alive ---> on_descriptor, on_publisher
+    report <------------ publish_report            (dropped under congestion)
+    alarm/event <------- publish_alarm_event       (waits under congestion, the latest are kept for late joiners)
+    alarm/state, health <- publish_...             (latest kept; also answered by query)
+
+Callbacks run on Zenoh's threads. An exception in one is logged and counted here, because Zenoh would only print it.
+"""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Protocol, TypeVar
+
+import zenoh
+import zenoh.ext
+
+from models.errors import RotorwatchError
+from models.signals.keys import PREFIX, MachineKeys
+from models.signals.link import LinkSettings
+from service.inbox import RawBlock
+from service.logs import logger
+
+__all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "TopicMessage", "follow", "route"]
+
+_JSON = "application/json"
+_CLOUD_EVENT = "application/cloudevents+json"
+_HEARTBEAT_S = 1.0
+_CACHED_BLOCKS = 300
+_CACHED_EVENTS = 200
+_QUERY_TIMEOUT_S = 2.0
+_CONNECT_TIMEOUT_S = 3.0
+
+_T = TypeVar("_T")
+_log = logger(part="transport")
+
+
+class LinkError(RotorwatchError):
+    """No Zenoh session with these endpoints; the message names them."""
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> object: ...
+
+
+@dataclass(frozen=True, slots=True)
+class MachineCallbacks:
+    """What a machine's link calls, each on a thread of Zenoh's: be short.
+
+    Attributes
+    ----------
+    on_block : callable
+        Takes a message of the stream.
+    on_missed : callable
+        Takes the number of messages that were lost on the way and could not be fetched again.
+    on_descriptor : callable
+        Takes a channel descriptor (JSON) that a publisher announced.
+    on_publisher : callable
+        Takes whether a publisher is alive.
+    health, alarm_state : callable
+        Return the present answer (JSON) to a query.
+    """
+
+    on_block: Callable[[RawBlock], None]
+    on_missed: Callable[[int], None]
+    on_descriptor: Callable[[bytes], None]
+    on_publisher: Callable[[bool], None]
+    health: Callable[[], str]
+    alarm_state: Callable[[], str]
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessage:
+    """A message a client received: its key and its JSON text."""
+
+    key: str
+    text: str
+
+
+class Link:
+    """A Zenoh session.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Role and endpoints.
+    fail_fast : bool
+        Give up when no endpoint in `connect` answers within three seconds, instead of trying for ever.
+
+    Raises
+    ------
+    LinkError
+        If an endpoint is malformed, cannot be listened on, or (fail fast) does not answer.
+    """
+
+    def __init__(self, settings: LinkSettings, *, fail_fast: bool = False) -> None:
+        self._errors = 0
+        config = zenoh.Config()
+        items = settings.zenoh_items()
+        if fail_fast:
+            items["connect/timeout_ms"] = json.dumps(round(_CONNECT_TIMEOUT_S * 1000))
+            items["connect/exit_on_failure"] = "true"
+        try:
+            for path, value in items.items():
+                config.insert_json5(path, value)
+            self.session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise LinkError(_explain(settings, str(error))) from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the session is open."""
+        return not self.session.is_closed()
+
+    @property
+    def errors(self) -> int:
+        """Exceptions in callbacks so far."""
+        return self._errors
+
+    def guarded(self, callback: Callable[[_T], None]) -> Callable[[_T], None]:
+        """Wrap a callback so that its exceptions are logged and counted."""
+
+        def call(argument: _T) -> None:
+            try:
+                callback(argument)
+            except Exception:  # whatever it is, it must not vanish on a foreign thread
+                self._errors += 1
+                _log.exception("error in a callback")
+
+        return call
+
+    def close(self) -> None:
+        """Close the session."""
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+class MachineLink:
+    """Everything declared for one machine.
+
+    Parameters
+    ----------
+    link : Link
+        Open session; must outlive this object.
+    keys : MachineKeys
+        The machine's keys.
+    callbacks : MachineCallbacks
+        Where messages go.
+    wait_when_full : bool
+        `on_block` may wait, which slows the publisher down. It then runs on the network's own thread, and lost messages
+        are not fetched again: nothing is lost on a link that waits, and a heartbeat that overtakes waiting blocks would
+        make Zenoh skip them.
+    """
+
+    def __init__(self, link: Link, keys: MachineKeys, callbacks: MachineCallbacks, *, wait_when_full: bool) -> None:
+        self._link = link
+        self._keys = keys
+        self._callbacks = callbacks
+        self._lock = threading.Lock()
+        self._closed = False
+        with ExitStack() as undo:
+            self._declare(link.session, undo, wait_when_full)
+            self._undeclare = undo.pop_all()
+
+    def _declare(self, session: zenoh.Session, undo: ExitStack, wait_when_full: bool) -> None:
+        keys, guarded = self._keys, self._link.guarded
+
+        def keep(declared: _Declared) -> None:
+            undo.callback(declared.undeclare)
+
+        self._report = session.declare_publisher(
+            keys.report, encoding=_JSON, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._event = _advanced_publisher(session, keys.alarm_event, _CLOUD_EVENT, _CACHED_EVENTS)
+        self._state = _advanced_publisher(session, keys.alarm_state, _JSON, 1)
+        self._health = _advanced_publisher(session, keys.health, _JSON, 1)
+        for publisher in (self._report, self._event, self._state, self._health):
+            keep(publisher)
+        for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
+            keep(session.declare_queryable(key, guarded(_answering(key, answer))))
+        # Descriptor and liveliness before the stream: they say what the stream should look like.
+        keep(
+            zenoh.ext.declare_advanced_subscriber(
+                session,
+                keys.descriptor,
+                guarded(self._take_descriptor),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            )
+        )
+        keep(session.liveliness().declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True))
+        stream = zenoh.ext.declare_advanced_subscriber(
+            session,
+            keys.stream,
+            zenoh.handlers.Callback(guarded(self._take_block), indirect=not wait_when_full),
+            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
+            recovery=None if wait_when_full else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            subscriber_detection=True,
+        )
+        keep(stream)
+        keep(stream.sample_miss_listener(guarded(self._take_miss)))
+        keep(session.liveliness().declare_token(keys.monitor_alive))
+
+    def publish_report(self, text: str) -> None:
+        """Publish a window report."""
+        self._put(self._report, text)
+
+    def publish_alarm_event(self, text: str) -> None:
+        """Publish an alarm event; waits if the network is congested."""
+        self._put(self._event, text)
+
+    def publish_alarm_state(self, text: str) -> None:
+        """Publish the alarms as they are now."""
+        self._put(self._state, text)
+
+    def publish_health(self, text: str) -> None:
+        """Publish the health as it is now."""
+        self._put(self._health, text)
+
+    def close(self) -> None:
+        """Undeclare everything; what is published afterwards is ignored."""
+        with self._lock:
+            self._closed = True
+        self._undeclare.close()
+
+    def _put(self, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, text: str) -> None:
+        with self._lock:
+            if not self._closed:
+                publisher.put(text)
+
+    def _take_block(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, str(sample.encoding)))
+
+    def _take_miss(self, miss: zenoh.ext.Miss) -> None:
+        self._callbacks.on_missed(miss.nb)
+
+    def _take_descriptor(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._callbacks.on_descriptor(sample.payload.to_bytes())
+
+    def _take_alive(self, sample: zenoh.Sample) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        self._callbacks.on_publisher(alive)
+        if alive:
+            # Publishers without a cache answer only queries.
+            self._link.session.get(
+                self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S
+            )
+
+    def _take_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._callbacks.on_descriptor(reply.ok.payload.to_bytes())
+
+
+@contextmanager
+def follow(
+    settings: LinkSettings, machines: str, topics: tuple[str, ...], callback: Callable[[TopicMessage], None]
+) -> Iterator[Callable[[], bool]]:
+    """Follow what monitors publish, as a client.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Where to connect; fails fast.
+    machines : str
+        ``<site>/<machine>``, where ``*`` stands for any.
+    topics : tuple of str
+        Fields of `MachineKeys`, such as ``report`` or ``alarm_event``.
+    callback : callable
+        Takes each message on a thread of Zenoh's. Latest health and alarm state come at once; events and reports from
+        now on.
+
+    Yields
+    ------
+    callable
+        Whether the session is still open and connected to anybody.
+
+    Raises
+    ------
+    LinkError
+        If nobody answers at the endpoints.
+    """
+    site, _, machine = machines.partition("/")
+    suffixes = {name: getattr(MachineKeys("s", "m"), name).removeprefix(f"{PREFIX}/s/m/") for name in topics}
+    link = Link(settings, fail_fast=True)
+    try:
+        with ExitStack() as undo:
+            for name, suffix in suffixes.items():
+                current = name in {"health", "alarm_state"}
+
+                def take(sample: zenoh.Sample) -> None:
+                    callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
+
+                subscriber = zenoh.ext.declare_advanced_subscriber(
+                    link.session,
+                    f"{PREFIX}/{site}/{machine}/{suffix}",
+                    link.guarded(take),
+                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1) if current else None,
+                    recovery=None
+                    if name == "report"
+                    else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                )
+                undo.callback(subscriber.undeclare)
+            yield lambda: link.is_open and bool(link.session.info.peers_zid() or link.session.info.routers_zid())
+    finally:
+        link.close()
+
+
+@contextmanager
+def route(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> Iterator[None]:
+    """Run a Zenoh router.
+
+    Raises
+    ------
+    LinkError
+        If it cannot listen.
+    """
+    link = Link(LinkSettings(mode="router", listen=listen, connect=connect))
+    try:
+        yield
+    finally:
+        link.close()
+
+
+def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: int) -> zenoh.ext.AdvancedPublisher:
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        encoding=encoding,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        cache=zenoh.ext.CacheConfig(max_samples=cache),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+        publisher_detection=True,
+    )
+
+
+def _answering(key: str, answer: Callable[[], str]) -> Callable[[zenoh.Query], None]:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, answer(), encoding=_JSON)
+
+    return reply
+
+
+def _explain(settings: LinkSettings, error: str) -> str:
+    """Say which endpoints, and Zenoh's reason without the places in its source code."""
+    cause = error.split(" at /", maxsplit=1)[0]
+    if "Address already in use" in error:
+        cause = "address already in use: does another program listen there?"
+    elif "Timeout" in error:
+        cause = "nobody answers there"
+    ends = [
+        f"{what} {', '.join(where)}"
+        for what, where in (("listen", settings.listen), ("connect", settings.connect))
+        if where
+    ]
+    return f"Zenoh session ({settings.mode}, {'; '.join(ends)}) could not be opened: {cause}"
