@@ -5,12 +5,14 @@ from collections.abc import Awaitable, Callable, Sequence
 from http import HTTPStatus
 from typing import Annotated, Any, Protocol
 
-from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi import FastAPI, HTTPException, Query, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException as StarletteHTTPException
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 
+from service.logs import logger
 from service.schemas import (
     AlarmCloudEvent,
     AlarmStates,
@@ -26,6 +28,7 @@ __all__ = ["AlarmEventList", "Alive", "MachineList", "MachineView", "ReportList"
 
 _PROBLEM = "application/problem+json"
 _JSON = ConfigDict(extra="forbid", frozen=True)
+_log = logger(part="api")
 _CURSOR = "pass it as until_ns to get what is older; null if nothing older is kept"
 
 
@@ -128,12 +131,12 @@ def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
         """Every monitored machine with its state."""
         return MachineList(machines=tuple(machine.description() for machine in service.machines()))
 
-    @app.get("/api/v1/machines/{site}/{machine}", tags=["machines"], responses=_responses(MachineDescription, 404))
+    @app.get("/api/v1/machines/{site}/{machine}", tags=["machines"], responses=_responses(MachineDescription, 404, 422))
     def machine(site: str, machine: str) -> MachineDescription:
         """One machine: stream, channels, keys, state."""
         return _find(service, site, machine).description()
 
-    @app.get("/api/v1/machines/{site}/{machine}/health", tags=["machines"], responses=_responses(Health, 404))
+    @app.get("/api/v1/machines/{site}/{machine}/health", tags=["machines"], responses=_responses(Health, 404, 422))
     def health(site: str, machine: str) -> Health:
         """Where a machine stands: state, parameters with intervals, equations, alarms, quality of the data."""
         return _find(service, site, machine).health()
@@ -253,14 +256,18 @@ def _add_problems(app: FastAPI) -> None:
         detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
         return _problem(request, 422, detail, {"errors": faults})
 
-    async def on_error(request: Request, error: Exception) -> JSONResponse:
-        _ = error  # the server logs it; callers learn nothing about the inside
-        return _problem(request, 500, "an error inside the service; its log says more")
+    async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        # A handler for Exception would let it through to the server after answering, which then drops the connection.
+        try:
+            return await call_next(request)
+        except Exception:  # callers learn nothing about the inside, the log everything
+            _log.exception("request failed", path=request.url.path)
+            return _problem(request, 500, "an error inside the service; its log says more")
 
     handlers: dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]] = {
         StarletteHTTPException: on_http,
         RequestValidationError: on_invalid,
-        Exception: on_error,
     }
     for kind, handler in handlers.items():
         app.add_exception_handler(kind, handler)
+    app.add_middleware(BaseHTTPMiddleware, dispatch=guard)

@@ -24,6 +24,7 @@ __all__ = [
     "MachineEntry",
     "QueueSettings",
     "ServiceSettings",
+    "check_distinct",
     "load_settings",
 ]
 
@@ -168,7 +169,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     folder = Path() if path is None else path.parent
     entries = tuple(_resolved(entry, folder) for entry in settings.machines)
     settings = settings.model_copy(update={"machines": entries})
-    _check_distinct(place, settings)
+    check_distinct(place, settings)
     return settings
 
 
@@ -197,7 +198,14 @@ def _resolved(entry: MachineEntry, folder: Path) -> MachineEntry:
     return MachineEntry(file=file, bundle=None if entry.bundle is None else beside(entry.bundle))
 
 
-def _check_distinct(place: Path, settings: ServiceSettings) -> None:
+def check_distinct(place: Path, settings: ServiceSettings) -> None:
+    """Load every machine file and check that no two describe the same machine.
+
+    Raises
+    ------
+    MachineFileError
+        If one cannot be used, or two have the same site and name.
+    """
     seen: dict[str, str] = {}
     for entry in settings.machines:
         root = entry.load().keys.root

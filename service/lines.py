@@ -48,10 +48,17 @@ def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
 
 
 def health_line(health: Health) -> str:
-    """The state of a machine in a line, with the reason if there is one."""
+    """The state of a machine in a line, with the reason if there is one.
+
+    Examples
+    --------
+    >>> from service.schemas import Health, example
+    >>> health_line(Health.model_validate(example(Health)))
+    '00:03:25  lab  state is alert'
+    """
     at = "--:--:--" if health.window_end_ns is None else _clock(health.window_end_ns)
-    tail = health.reason or (f"window {health.filled:.0%} full" if health.state == "warming" else "")
-    return f"{at}  {health.machine}  {health.state:<13}  {tail}".rstrip()
+    why = f": {health.reason}" if health.reason else ""
+    return f"{at}  {health.machine}  state is {health.state}{why}"
 
 
 def _clock(time_ns: int) -> str:

@@ -105,7 +105,7 @@ def test_start_run_machine_and_arrow_are_options(tmp_path: Path) -> None:
         (["publish", "nothing"], "nothing: no such scenario file; shipped scenarios: c_by, c_bz, e, healthy"),
         (["publish", "--fault", "k_by=0.1"], "fault 'k_by=0.1': expected PARAMETER=CHANGE@SECONDS"),
         (["publish", "--duration", "-1"], "duration_s"),
-        (["publish", "--machine", "none.toml"], "none.toml: cannot be read"),
+        (["publish", "--machine", "none.toml"], "none.toml: no such machine file"),
         (["publish", "--pace", "fast"], "--pace is 'fast', expected a number above 0"),
         (["publish", "--pace", "0"], "--pace is '0', expected a number above 0"),
         (["publish", "--start", "yesterday"], "--start is 'yesterday', expected ISO 8601"),

@@ -99,7 +99,7 @@ def test_a_machine_file_lies_beside_the_scenario(tmp_path: Path) -> None:
         (MINIMAL.replace("seed = 1", "seed = -1"), r"seed: .* \(found -1\)"),
         (MINIMAL.replace("duration_s", "duration"), "duration: Extra inputs are not permitted"),
         (MINIMAL.replace("duration_s = 10.0", "duration_s = inf"), "duration_s: .* finite"),
-        (MINIMAL.replace('"lab"', '"nowhere"'), "nowhere: cannot be read"),
+        (MINIMAL.replace('"lab"', '"nowhere"'), "nowhere: no such machine file"),
         (MINIMAL.replace("cutoff_hz = 90.0", "cutoff_hz = 0.0"), r"sources\.0\.cutoff_hz: .* \(found 0\.0\)"),
         (MINIMAL.replace("[0, 1, 0, 0, 0, 0]", "[0, 1]"), r"sources\.0\.direction"),
         (MINIMAL + MINIMAL[MINIMAL.index("[[") :], "source name occurs twice: disc y"),

@@ -1,0 +1,232 @@
+"""What the tests of the running service share: real sessions on loopback, real processes, waiting for conditions."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+import numpy as np
+import numpy.typing as npt
+import zenoh
+
+from models.machine import Machine, load_machine
+from models.signals.block import SampleBlock
+from models.signals.link import LinkSettings
+from models.signals.wire import encode_block
+from service.config import HttpSettings, MachineEntry, QueueSettings, ServiceSettings
+from service.runtime import Runtime, running
+from service.schemas import Health
+from service.worker import MachineWorker
+from simulator.publisher import PublishSettings, publish
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
+
+__all__ = [
+    "LAB",
+    "ROOT",
+    "START_NS",
+    "Feed",
+    "Program",
+    "endpoint",
+    "machine_file",
+    "open_session",
+    "program",
+    "scenario_blocks",
+    "send",
+    "service",
+    "settings",
+    "until",
+]
+
+ROOT = Path(__file__).parents[2]
+LAB = load_machine("lab")
+START_NS = 1_767_225_600_000_000_000
+
+
+def endpoint() -> str:
+    """A free address on loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> None:
+    """Wait for a condition; a deadline ends a wait that would be in vain."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, f"no {what} within {timeout_s} s"
+        time.sleep(0.01)
+
+
+@contextmanager
+def open_session(connect: str) -> Iterator[zenoh.Session]:
+    """A peer beside a service that subscribes to the lab machine; what it puts is heard from the beginning."""
+    config = zenoh.Config()
+    for path, value in LinkSettings(connect=(connect,)).zenoh_items().items():
+        config.insert_json5(path, value)
+    with zenoh.open(config) as session:
+        probe = session.declare_publisher(LAB.keys.stream)
+        until(lambda: bool(probe.matching_status.matching), "subscriber")  # type: ignore[attr-defined]  # the stub says bool
+        probe.undeclare()  # type: ignore[no-untyped-call]
+        yield session
+
+
+def settings(
+    listen: str, machine: str = "lab", bundle: str | None = None, when_full: str = "drop", bound: int = 600
+) -> ServiceSettings:
+    """Settings of a service on loopback with a free HTTP port."""
+    return ServiceSettings(
+        link=LinkSettings(listen=(listen,)),
+        http=HttpSettings(port=0),
+        machines=(MachineEntry(file=machine, bundle=bundle),),
+        queue=QueueSettings.model_validate({"blocks": bound, "when_full": when_full}),
+    )
+
+
+@contextmanager
+def service(
+    listen: str, machine: str = "lab", bundle: str | None = None, when_full: str = "drop", bound: int = 600
+) -> Iterator[tuple[Runtime, MachineWorker]]:
+    """A running service with one machine."""
+    with running(settings(listen, machine, bundle, when_full, bound)) as runtime:
+        yield runtime, runtime.machines()[0]
+
+
+def machine_file(folder: Path, *replacements: tuple[str, str]) -> str:
+    """The shipped machine file with some lines replaced."""
+    text = (ROOT / "models/machines/lab.toml").read_text(encoding="utf-8")
+    for old, new in replacements:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "machine.toml"
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def scenario_blocks(duration_s: float, *faults: Event, start_ns: int = START_NS, run: int = 1) -> list[SampleBlock]:
+    """Blocks of the shipped healthy scenario, shortened, with faults added."""
+    scenario, machine = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=duration_s, seed=7_700_011, faults=faults)
+    return [block for block, _ in blocks(scenario, machine, start_ns=start_ns, run=run)]
+
+
+def send(connect: str, stream: list[SampleBlock], machine: Machine = LAB) -> None:
+    """Publish blocks as the simulator does, as fast as the service takes them."""
+    plan = PublishSettings(
+        link=LinkSettings(connect=(connect,)), pace=None, wait_for_subscriber_s=20.0, linger_s=0.0, drain_s=20.0
+    )
+    summary = publish(machine, ((block, ()) for block in stream), plan)
+    assert summary.blocks == len(stream)
+
+
+@dataclass(slots=True)
+class Feed:
+    """Good blocks of the shipped machine, one after the other, put on the key without the simulator."""
+
+    session: zenoh.Session
+    machine: Machine = LAB
+    run: int = 1
+    sequence: int = 0
+    start_ns: int = START_NS
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
+
+    def samples(self, n_samples: int = 200) -> npt.NDArray[np.float32]:
+        """Noise in every channel."""
+        return self.rng.standard_normal((n_samples, len(self.machine.sensors))).astype(np.float32)
+
+    def block(self, **changes: object) -> SampleBlock:
+        """The block that comes next, with some fields replaced."""
+        fields: dict[str, object] = {
+            "start_ns": self.start_ns,
+            "sequence": self.sequence,
+            "run": self.run,
+            "rate_hz": self.machine.rate_hz,
+            "samples": self.samples(),
+        }
+        return SampleBlock(**(fields | changes))  # type: ignore[arg-type]  # tests give fields of any kind
+
+    def put(self, block: SampleBlock, schema_hash: str | None = None) -> None:
+        """Publish one block."""
+        self.put_raw(*encode_block(block, self.machine.descriptor.schema_hash if schema_hash is None else schema_hash))
+
+    def put_raw(self, payload: bytes, attachment: bytes, encoding: str) -> None:
+        """Publish bytes."""
+        self.session.put(self.machine.keys.stream, payload, attachment=attachment or None, encoding=encoding)
+
+    def put_good(self) -> None:
+        """Publish the next good block and go on to the one after it."""
+        block = self.block()
+        self.put(block)
+        self.sequence += 1
+        self.start_ns = block.end_ns
+
+
+@dataclass(slots=True)
+class Program:
+    """A started program and the files its output goes to."""
+
+    process: subprocess.Popen[bytes]
+    out: Path
+    err: Path
+
+    def output(self) -> str:
+        """Standard output so far."""
+        return self.out.read_text(encoding="utf-8")
+
+    def errors(self) -> str:
+        """Standard error so far."""
+        return self.err.read_text(encoding="utf-8")
+
+    def wait_for(self, text: str) -> None:
+        """Wait until standard output holds a text."""
+        until(lambda: self.process.poll() is not None or text in self.output(), f"{text!r} in the output")
+        assert text in self.output(), f"ended without {text!r}:\n{self.output()}\n{self.errors()}"
+
+    def url(self) -> str:
+        """Where the HTTP API of a monitor is, from what it printed."""
+        self.wait_for("HTTP API http")
+        return self.output().split("HTTP API ", 1)[1].split()[0]
+
+    def health(self, place: str = "demo/lab") -> Health:
+        """Health of a machine over HTTP."""
+        answer = httpx.get(f"{self.url()}/api/v1/machines/{place}/health", trust_env=False)
+        return Health.model_validate_json(answer.raise_for_status().content)
+
+    def kill(self) -> None:
+        """kill -9."""
+        self.process.kill()
+        self.process.wait()
+
+    def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
+        """Ask the program to stop and return its exit code."""
+        self.process.send_signal(number)
+        return self.process.wait(30)
+
+
+@contextmanager
+def program(folder: Path, *arguments: str, **environment: str) -> Iterator[Program]:
+    """Run ``python -m ARGUMENTS`` from the checkout; it is gone when the block is left."""
+    number = len(list(folder.glob("*.out")))
+    out, err = folder / f"{number}.out", folder / f"{number}.err"
+    with out.open("wb") as out_file, err.open("wb") as err_file:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *arguments],
+            cwd=ROOT,
+            stdin=subprocess.DEVNULL,
+            stdout=out_file,
+            stderr=err_file,
+            env={**os.environ, "COLUMNS": "200", **environment},
+        )
+    try:
+        yield Program(process, out, err)
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()

@@ -1,0 +1,285 @@
+"""Zenoh sessions, real ones on loopback: nothing lost without being counted, late joiners served, errors seen."""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+import zenoh
+
+from models.signals.link import LinkSettings
+from service.inbox import Inbox, RawBlock
+from service.schemas import AlarmStates, Health
+from service.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
+from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, send, service, until
+
+KEYS = LAB.keys
+
+
+def ignore(*_: object) -> None:
+    """Take anything."""
+
+
+@contextmanager
+def machine_link(
+    address: str, on_block: Callable[[RawBlock], None], *, wait: bool = False
+) -> Iterator[tuple[Link, MachineLink]]:
+    callbacks = MachineCallbacks(on_block, ignore, ignore, ignore, lambda: '{"h": 1}', lambda: '{"a": 1}')
+    link = Link(LinkSettings(listen=(address,)))
+    declared = MachineLink(link, KEYS, callbacks, wait_when_full=wait)
+    try:
+        yield link, declared
+    finally:
+        declared.close()
+        link.close()
+
+
+def test_full_inbox_drops_what_waits_and_counts_it() -> None:
+    inbox = Inbox(3, "drop")
+    for number in range(8):
+        inbox.put(RawBlock(bytes([number]), b"", ""))
+    # 0 1 2 | 3 4 5 | 6 7: twice full, twice emptied; what is left continues without a hole.
+    assert inbox.dropped == 6
+    taken = [inbox.get(), inbox.get()]
+    assert [block.payload for block in taken if block is not None] == [bytes([6]), bytes([7])]
+    assert len(inbox) == 0
+
+
+def test_closed_inbox_frees_everybody_who_waits() -> None:
+    inbox = Inbox(1, "wait")
+    inbox.put(RawBlock(b"", b"", ""))
+    threads = [threading.Thread(target=inbox.put, args=(RawBlock(b"", b"", ""),)) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    inbox.close()
+    for thread in threads:
+        thread.join(20.0)
+        assert not thread.is_alive()
+    assert inbox.get() is None
+
+
+def test_a_monitor_that_does_not_keep_up_counts_every_block_it_drops() -> None:
+    inbox, address = Inbox(100, "drop"), endpoint()
+    with machine_link(address, inbox.put), open_session(address) as session:
+        feed = Feed(session)
+        for _ in range(1050):
+            feed.put_good()
+        until(lambda: inbox.dropped + len(inbox) == 1050, "all blocks queued or counted")
+        assert inbox.dropped == 1000
+
+
+def test_waiting_slows_the_publisher_down_and_loses_nothing() -> None:
+    address = endpoint()
+    stream = scenario_blocks(60.0)
+    with service(address, when_full="wait", bound=2) as (_, worker):
+        send(address, stream)
+        until(lambda: worker.health().quality.accepted_blocks == len(stream), "every block")
+        quality = worker.health().quality
+        assert quality.gaps == quality.queue_dropped_blocks == quality.link_missed_blocks == 0
+        assert quality.refused_blocks == {}
+
+
+def test_waiting_survives_a_long_stall() -> None:
+    """A publisher's heartbeat overtakes blocks that wait; with recovery Zenoh would then skip hundreds of them."""
+    address, gate = endpoint(), threading.Event()
+    inbox: Inbox = Inbox(10, "wait")
+    received: list[RawBlock] = []
+
+    def work() -> None:
+        gate.wait()
+        while (block := inbox.get()) is not None:
+            received.append(block)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    stream = scenario_blocks(300.0)
+    with machine_link(address, inbox.put, wait=True):
+        sender = threading.Thread(target=send, args=(address, stream))
+        sender.start()
+        # Longer than several heartbeats; a publisher blocked in a put shows nothing else to wait for.
+        threading.Event().wait(2.0)
+        gate.set()
+        sender.join()
+        until(lambda: len(received) == len(stream), "every block")
+        inbox.close()
+        worker.join()
+
+
+def test_exception_in_a_callback_is_counted_and_the_next_block_arrives() -> None:
+    address = endpoint()
+    received: list[RawBlock] = []
+
+    def take(block: RawBlock) -> None:
+        received.append(block)
+        if len(received) == 2:
+            raise RuntimeError("on a foreign thread")
+
+    with machine_link(address, take) as (link, _), open_session(address) as session:
+        feed = Feed(session)
+        for _ in range(3):
+            feed.put_good()
+        until(lambda: len(received) == 3, "third block")
+        assert link.errors == 1
+
+
+def test_nothing_is_delivered_or_published_after_close() -> None:
+    address = endpoint()
+    first: list[RawBlock] = []
+    second: list[RawBlock] = []
+    healths: list[str] = []
+    callbacks = MachineCallbacks(second.append, ignore, ignore, ignore, lambda: "{}", lambda: "{}")
+    with machine_link(address, first.append) as (link, declared), open_session(address) as session:
+        listening = session.declare_subscriber(KEYS.health, lambda sample: healths.append(sample.payload.to_string()))
+        feed = Feed(session)
+        feed.put_good()
+        until(lambda: len(first) == 1, "first block")
+        # Published again until the subscription has arrived, of which there is no other sign.
+        until(repeating(lambda: declared.publish_health('"open"'), lambda: bool(healths)), "health")
+        declared.close()
+        declared.publish_health('"closed"')
+        successor = MachineLink(link, KEYS, callbacks, wait_when_full=False)
+        until(
+            repeating(lambda: successor.publish_health('"successor"'), lambda: '"successor"' in healths), "later health"
+        )
+        until(repeating(feed.put_good, lambda: bool(second)), "later block")
+        successor.close()
+        listening.undeclare()  # type: ignore[no-untyped-call]
+    assert len(first) == 1
+    assert set(healths) == {'"open"', '"successor"'}
+    assert not link.is_open
+
+
+def repeating(action: Callable[[], None], condition: Callable[[], bool]) -> Callable[[], bool]:
+    """The condition, with the action before every look at it."""
+
+    def act_and_look() -> bool:
+        action()
+        return condition()
+
+    return act_and_look
+
+
+def test_late_joiner_asks_for_health_and_alarm_state() -> None:
+    address = endpoint()
+    with service(address) as (_, worker):
+        with open_session(address) as session:
+            feed = Feed(session)
+            for _ in range(5):
+                feed.put_good()
+            until(lambda: worker.health().quality.accepted_blocks == 5, "blocks")
+        with open_session(address) as session:
+            health = Health.model_validate_json(query(session, KEYS.health))
+            assert health.quality.accepted_blocks == 5
+            assert health.machine_hash == worker.identity.machine_hash
+            states = AlarmStates.model_validate_json(query(session, KEYS.alarm_state))
+            assert (states.site, states.machine, states.alarms) == ("demo", "lab", ())
+            alive = [reply.ok.key_expr for reply in session.liveliness().get("rotorwatch/**") if reply.ok is not None]
+            assert [str(key) for key in alive] == [KEYS.monitor_alive]
+
+
+def query(session: zenoh.Session, key: str) -> str:
+    """The answer to a query, asked again until the declaration of the queryable has arrived."""
+    found: list[str] = []
+
+    def ask() -> bool:
+        replies = session.get(key, timeout=5.0)
+        found.extend(reply.ok.payload.to_string() for reply in replies if reply.ok is not None)
+        return bool(found)
+
+    until(ask, f"answer on {key}")
+    return found[0]
+
+
+def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
+    address = endpoint()
+    messages: list[TopicMessage] = []
+    with machine_link(address, ignore) as (_, declared):
+        declared.publish_health('{"number": 1}')
+        declared.publish_health('{"number": 2}')
+        declared.publish_alarm_state('{"number": 3}')
+        declared.publish_alarm_event('{"number": 0}')
+        link = LinkSettings(mode="client", connect=(address,))
+        topics = ("health", "alarm_state", "alarm_event", "report")
+        with follow(link, "*/lab", topics, messages.append) as connected:
+            until(lambda: len(messages) >= 2, "cached messages")
+            assert {(m.key, m.text) for m in messages} == {
+                (KEYS.health, '{"number": 2}'),
+                (KEYS.alarm_state, '{"number": 3}'),
+            }
+            declared.publish_alarm_event('{"number": 4}')
+            declared.publish_report('{"number": 5}')
+            until(lambda: len(messages) == 4, "live messages")
+            assert {(m.key, m.text) for m in messages[2:]} == {
+                (KEYS.alarm_event, '{"number": 4}'),
+                (KEYS.report, '{"number": 5}'),
+            }
+            assert connected()
+
+
+def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> None:
+    address = endpoint()
+    wrong = LAB.descriptor.model_copy(update={"rate_hz": 1000.0}).model_dump_json()
+    with service(address) as (_, worker), open_session(address) as session:
+        answer = session.declare_queryable(KEYS.descriptor, lambda q: q.reply(KEYS.descriptor, wrong))
+        token = session.liveliness().declare_token(KEYS.publisher_alive)
+        until(lambda: worker.health().stream.publisher_alive, "publisher")
+        until(lambda: bool(worker.health().stream.descriptor_mismatch), "descriptor by query")
+        assert worker.health().stream.descriptor_mismatch == ("rate_hz is 1000.0, expected 2000.0",)
+        token.undeclare()  # type: ignore[no-untyped-call]
+        until(lambda: not worker.health().stream.publisher_alive, "publisher gone")
+        assert worker.health().stream.descriptor_mismatch == ()
+        answer.undeclare()  # type: ignore[no-untyped-call]
+
+
+def test_router_joins_what_cannot_reach_each_other() -> None:
+    address = endpoint()
+    messages: list[TopicMessage] = []
+    with (
+        route((address,)),
+        Linked(address) as declared,
+        follow(LinkSettings(mode="client", connect=(address,)), "demo/*", ("health",), messages.append),
+    ):
+        declared.publish_health(json.dumps({"number": 1}))
+        until(lambda: bool(messages), "message through the router")
+        assert messages[0] == TopicMessage(KEYS.health, '{"number": 1}')
+
+
+class Linked:
+    """A machine's link that connects instead of listening."""
+
+    def __init__(self, address: str) -> None:
+        self._link = Link(LinkSettings(connect=(address,)))
+        callbacks = MachineCallbacks(ignore, ignore, ignore, ignore, lambda: "{}", lambda: "{}")
+        self._declared = MachineLink(self._link, KEYS, callbacks, wait_when_full=False)
+
+    def __enter__(self) -> MachineLink:
+        return self._declared
+
+    def __exit__(self, *_: object) -> None:
+        self._declared.close()
+        self._link.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        (LinkSettings(listen=("tcp/nowhere",)), "listen tcp/nowhere"),
+        (LinkSettings(listen=("pigeon/127.0.0.1:1",)), "listen pigeon/127.0.0.1:1"),
+    ],
+)
+def test_unusable_endpoint_is_named(settings: LinkSettings, named: str) -> None:
+    with pytest.raises(LinkError) as caught:
+        Link(settings)
+    assert named in str(caught.value)
+    assert ".rs" not in str(caught.value)
+
+
+def test_used_and_silent_addresses_are_named() -> None:
+    address = endpoint()
+    with machine_link(address, ignore), pytest.raises(LinkError) as caught:
+        Link(LinkSettings(listen=(address,)))
+    assert f"listen {address}) could not be opened: address already in use" in str(caught.value)
+    with pytest.raises(LinkError) as caught:
+        Link(LinkSettings(mode="client", connect=(address,)), fail_fast=True)
+    assert f"connect {address}) could not be opened: nobody answers there" in str(caught.value)
