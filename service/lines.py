@@ -73,4 +73,4 @@ def _change(name: str, change: float | None, standard_error: float | None) -> st
     if change is None or standard_error is None:
         return f"{name} n/a"
     # A true minus sign is as wide as the plus sign, so that columns stay put.
-    return f"{name} {100 * change:+.1f}±{100 * _Z95 * standard_error:.1f} %".replace("-", "−")
+    return f"{name} {100 * change:+5.1f}±{100 * _Z95 * standard_error:.1f} %".replace("-", "−")

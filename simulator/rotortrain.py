@@ -67,7 +67,7 @@ def train(
 
 def _train(name: str, out: Path, n_windows: int, seed: int, processes: int) -> None:
     from models.diagnosis.bundle import Training, save_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
-    from models.diagnosis.equations import EQUATIONS  # noqa: PLC0415
+    from models.diagnosis.equations import EQUATIONS, missing  # noqa: PLC0415
     from models.diagnosis.training import calibrate, train_network  # noqa: PLC0415
     from models.machine import load_machine  # noqa: PLC0415
     from simulator.campaign import Draw, Purpose, windows, with_tilt  # noqa: PLC0415
@@ -76,9 +76,8 @@ def _train(name: str, out: Path, n_windows: int, seed: int, processes: int) -> N
     networks = []
     with _progress() as bar:
         for stream, equation in enumerate(EQUATIONS):
-            missing = equation.missing(machine.descriptor.states, phase_reference="theta" in machine.descriptor.states)
             # Trained in any case: the same bundle serves the machine with tilt probes.
-            rig = with_tilt(machine) if missing else machine
+            rig = with_tilt(machine) if missing(equation, machine.descriptor.states) else machine
             label = f"({equation.number}) {equation.title}"
             simulating = bar.add_task(f"{label}: simulating", total=n_windows + n_windows // 2)
             simulated = partial(bar.advance, simulating)

@@ -13,7 +13,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -50,7 +50,9 @@ class EquationEntry(BaseModel):
     model_config = _STRICT
 
     number: str
-    inputs: tuple[str, ...] = Field(description="inputs in order, SI units, divided by the rms of the target")
+    channels: tuple[str, ...] = Field(description="measured states in order, references first")
+    units: Literal["SI"] = Field(default="SI", description="units of the channels")
+    inputs: tuple[str, ...] = Field(description="inputs in order, divided by the rms of the target")
     parameters: tuple[str, ...]
     hidden: int
     healthy: HealthyEntry
@@ -127,6 +129,7 @@ def save_bundle(directory: Path, machine: Machine, networks: tuple[EquationNetwo
         entries.append(
             EquationEntry(
                 number=number,
+                channels=trained.equation.channels,
                 inputs=trained.equation.input_names,
                 parameters=trained.equation.parameters,
                 hidden=HIDDEN,
@@ -208,6 +211,7 @@ def _network(
     except KeyError:
         raise BundleError(f"{where} is not in this program's table") from None
     checks: tuple[tuple[str, object, object], ...] = (
+        ("channels", entry.channels, equation.channels),
         ("inputs", entry.inputs, equation.input_names),
         ("parameters", entry.parameters, equation.parameters),
         ("hidden", entry.hidden, HIDDEN),

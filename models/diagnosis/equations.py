@@ -20,7 +20,7 @@ from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.physics.parameters import RotorParameters
 from models.signals.block import FloatArray
 
-__all__ = ["EQUATIONS", "Equation", "EquationRows", "StatisticsView", "SynchronousEquation", "Term"]
+__all__ = ["EQUATIONS", "Equation", "EquationRows", "StatisticsView", "SynchronousEquation", "Term", "missing"]
 
 _REFERENCES = ("y1", "y2", "z1", "z2")
 _ANGLES = np.arange(16) * (2 * np.pi / 16)
@@ -131,12 +131,12 @@ class Equation:
         """Names of the inputs in order."""
         return tuple(term.name for term in self.inputs)
 
-    def missing(self, states: tuple[str, ...], *, phase_reference: bool) -> tuple[str, ...]:
-        """What would have to be measured besides."""
-        del phase_reference  # needed by the synchronous equation only
-        needed = [term.response for term in (self.target, *self.inputs)]
-        needed += [name for reference in _REFERENCES for name in (reference, f"{reference}_dot")]
-        return tuple(dict.fromkeys(name for name in needed if name not in states))
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Measured states it needs: references and their rates first, then what its terms need besides."""
+        needed = [name for reference in _REFERENCES for name in (reference, f"{reference}_dot")]
+        needed += [term.response for term in (self.target, *self.inputs)]
+        return tuple(dict.fromkeys(needed))
 
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
         """Rows of one view, SI units."""
@@ -185,10 +185,10 @@ class SynchronousEquation:
         """Names of the inputs in order."""
         return ("R[n,y1]", "Ω²R[n,y1]", "Ω⁴R[n,y1]", "Ω²R[n,z1]", "Ω²R[n,n]", "Ω⁴R[n,n]", "Ω⁶R[n,n]")
 
-    def missing(self, states: tuple[str, ...], *, phase_reference: bool) -> tuple[str, ...]:
-        """What would have to be measured besides."""
-        absent = [name for name in _REFERENCES if name not in states]
-        return tuple(absent if phase_reference else [*absent, "theta"])
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Measured states it needs, and the phase reference."""
+        return (*_REFERENCES, "theta")
 
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
         """Rows of one view, SI units.
@@ -283,3 +283,15 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
     ),
 )
 """The equations in the paper's order; adding a row here is all it takes."""
+
+
+def missing(equation: Equation | SynchronousEquation, measured: tuple[str, ...]) -> tuple[str, ...]:
+    """What would have to be measured besides, to evaluate an equation.
+
+    Parameters
+    ----------
+    equation : Equation or SynchronousEquation
+    measured : tuple of str
+        Measured states, with ``theta`` for the phase reference.
+    """
+    return tuple(name for name in equation.channels if name not in measured)

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.equations import EQUATIONS, Equation, EquationRows, StatisticsView, SynchronousEquation
+from models.diagnosis.equations import (
+    EQUATIONS,
+    Equation,
+    EquationRows,
+    StatisticsView,
+    SynchronousEquation,
+    missing,
+)
 from models.diagnosis.readings import EquationReading, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
@@ -119,9 +126,9 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     equation, and size in one step. The scatter over the window's hops gives the standard error.
     """
     equation = trained.equation
-    missing = equation.missing(window.states, phase_reference=window.synchronous is not None)
-    if missing:
-        return EquationReading(equation.number, equation.title, reason=f"not measured: {', '.join(missing)}")
+    absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
+    if absent:
+        return EquationReading(equation.number, equation.title, reason=f"not measured: {', '.join(absent)}")
     rows = equation.rows(window_view(window, machine), machine)
     norm = rows.norm
     if not norm > 0:

@@ -112,6 +112,8 @@ def flip_a_byte(directory: Path) -> None:
         (edit_manifest(lambda m: m["physics"].update(rate_hz=4000.0)), "rate_hz is 2000.0, trained for 4000.0"),
         (edit_manifest(lambda m: m["physics"]["window"].update(lag_to_s=0.2)), "window.lag_to_s is 0.125, trained"),
         (edit_manifest(lambda m: m["equations"][0].update(number="99")), "equation 99 is not in this program's table"),
+        (edit_manifest(lambda m: m["equations"][0]["channels"].reverse()), "equation 28: channels are"),
+        (edit_manifest(lambda m: m["equations"][0].update(units="um")), "units.*'SI'"),
         (edit_manifest(lambda m: m["equations"][0].update(inputs=["R[i,y1]"])), "equation 28: inputs are"),
         (edit_weights(lambda a: a.update({"28.W1": np.zeros((3, 15))})), r"28: weight W1 is float64\(3, 15\)"),
         (edit_weights(lambda a: a.update({"28.b2": np.array([np.nan])})), "28: weight b2 .* expected finite"),

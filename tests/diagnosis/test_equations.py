@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation
+from models.diagnosis.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation, missing
 from models.machine import Machine, load_machine
 from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response
@@ -56,9 +56,9 @@ def test_an_equation_reads_its_own_parameters_and_is_blind_to_the_rest(
 
 def test_equations_do_not_depend_on_unmeasured_states() -> None:
     lab = load_machine("lab").descriptor.states
-    missing = {equation.number: equation.missing(lab, phase_reference=True) for equation in EQUATIONS}
-    assert missing == {"28": (), "29": (), "30": ("psi_dot", "psi", "phi_dot"), "31": ()}
-    assert EQUATIONS[1].missing(lab, phase_reference=False) == ("theta",)
+    absent = {equation.number: missing(equation, lab) for equation in EQUATIONS}
+    assert absent == {"28": (), "29": (), "30": ("psi_dot", "psi", "phi_dot"), "31": ()}
+    assert missing(EQUATIONS[1], tuple(name for name in lab if name != "theta")) == ("theta",)
 
 
 def test_targets_and_inputs_are_taken_at_the_same_lag() -> None:

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 import zenoh
+import zenoh.ext
 
 from models.signals.link import LinkSettings
 from service.inbox import Inbox, RawBlock
@@ -93,17 +94,24 @@ def test_waiting_survives_a_long_stall() -> None:
 
     worker = threading.Thread(target=work)
     worker.start()
-    stream = scenario_blocks(300.0)
-    with machine_link(address, inbox.put, wait=True):
-        sender = threading.Thread(target=send, args=(address, stream))
+    with machine_link(address, inbox.put, wait=True), open_session(address) as session:
+        publisher = zenoh.ext.declare_advanced_publisher(
+            session,
+            KEYS.stream,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            cache=zenoh.ext.CacheConfig(max_samples=300),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
+        )
+        sender = threading.Thread(target=lambda: [publisher.put(bytes(7200)) for _ in range(10_000)])
         sender.start()
         # Longer than several heartbeats; a publisher blocked in a put shows nothing else to wait for.
-        threading.Event().wait(2.0)
+        threading.Event().wait(1.5)
         gate.set()
         sender.join()
-        until(lambda: len(received) == len(stream), "every block")
+        until(lambda: len(received) == 10_000, "every block")
         inbox.close()
         worker.join()
+        publisher.undeclare()  # type: ignore[no-untyped-call]
 
 
 def test_exception_in_a_callback_is_counted_and_the_next_block_arrives() -> None:
