@@ -16,6 +16,9 @@ from models.physics.parameters import PARAMETERS
 
 __all__ = ["Evaluation", "WindowEvaluator"]
 
+_STEADY = 0.05
+"""Range of speed within a window, relative: what the changing 1x leaves behind then stays next to the excluded line."""
+
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
@@ -60,7 +63,7 @@ class WindowEvaluator:
         Raises
         ------
         EstimationError
-            If the window cannot be evaluated: outside the speed range, or no fluctuation in a channel.
+            If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
         operation = self._machine.operation
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
@@ -68,6 +71,12 @@ class WindowEvaluator:
             raise EstimationError(
                 f"{self._machine.site}/{self._machine.name}: speed is {speed * 30 / np.pi:.0f} rpm, evaluated are "
                 f"{operation.speed_rpm:.0f} rpm ± {operation.speed_tolerance:.0%}"
+            )
+        slowest, fastest = window.speed_range
+        if speed is not None and fastest - slowest > _STEADY * operation.speed_rad_s:
+            raise EstimationError(
+                f"{self._machine.site}/{self._machine.name}: speed went from {slowest * 30 / np.pi:.0f} to "
+                f"{fastest * 30 / np.pi:.0f} rpm within the window, evaluated is a steady speed (± {_STEADY / 2:.1%})"
             )
         estimate = self._likelihood.fit(window)
         values = {

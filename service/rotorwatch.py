@@ -34,7 +34,8 @@ app = typer.Typer(
 )
 
 _ConnectOption = Annotated[
-    list[str] | None, typer.Option("--connect", metavar="ENDPOINT", help="Zenoh endpoint to connect to. Repeatable.")
+    list[str] | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="Zenoh endpoint to connect to, as a client. Repeatable."),
 ]
 _ListenOption = Annotated[
     list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Zenoh endpoint to listen on. Repeatable.")
@@ -206,6 +207,8 @@ def status(
 def router(listen: _ListenOption = None, connect: _ConnectOption = None) -> None:
     """Run a Zenoh router until Ctrl-C, for networks in which monitors and sensors cannot reach each other directly.
 
+    Everybody who connects to it must do so as a client: rotorwatch run --connect, rotorsim publish --mode client.
+
     [bold]Example[/bold]
 
     [cyan]rotorwatch router --listen tcp/0.0.0.0:7447[/cyan]
@@ -301,7 +304,7 @@ def _overridden(
     http_port: int | None,
     when_full: Literal["drop", "wait"] | None,
 ) -> "ServiceSettings":
-    """Put the command line over the settings; endpoints replace those of the settings altogether."""
+    """Put the command line over the settings; endpoints and role replace those of the settings altogether."""
     from service.config import MachineEntry, check_distinct  # noqa: PLC0415  # keeps --help quick
 
     update: dict[str, object] = {}
@@ -309,7 +312,9 @@ def _overridden(
         pairs = [text.partition("@") for text in machines]
         update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
     if listen or connect:
-        ends = {"listen": tuple(listen or ()), "connect": tuple(connect or ())}
+        # A router joins clients; between peers, which it takes to know each other, it passes nothing on.
+        mode = "peer" if listen else "client"
+        ends = {"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())}
         update["link"] = settings.link.model_copy(update=ends)
     if http_port is not None:
         update["http"] = settings.http.model_copy(update={"port": http_port})

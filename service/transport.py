@@ -34,7 +34,8 @@ _HEARTBEAT_S = 1.0
 _CACHED_BLOCKS = 300
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 2.0
-_CONNECT_TIMEOUT_S = 3.0
+_QUICK_CONNECT_S = 3.0
+_CONNECT_S = 10.0
 
 _T = TypeVar("_T")
 _log = logger(part="transport")
@@ -90,20 +91,22 @@ class Link:
     settings : LinkSettings
         Role and endpoints.
     fail_fast : bool
-        Give up when no endpoint in `connect` answers within three seconds, instead of trying for ever.
+        Give up when no endpoint in `connect` answers within three seconds. Otherwise a client tries for ten, and a
+        peer for ever, in the background.
 
     Raises
     ------
     LinkError
-        If an endpoint is malformed, cannot be listened on, or (fail fast) does not answer.
+        If an endpoint is malformed, cannot be listened on, or does not answer in time.
     """
 
     def __init__(self, settings: LinkSettings, *, fail_fast: bool = False) -> None:
         self._errors = 0
         config = zenoh.Config()
         items = settings.zenoh_items()
-        if fail_fast:
-            items["connect/timeout_ms"] = json.dumps(round(_CONNECT_TIMEOUT_S * 1000))
+        if fail_fast or settings.mode == "client":
+            timeout_s = _QUICK_CONNECT_S if fail_fast else _CONNECT_S
+            items["connect/timeout_ms"] = json.dumps(round(timeout_s * 1000))
             items["connect/exit_on_failure"] = "true"
         try:
             for path, value in items.items():

@@ -93,8 +93,8 @@ class LikelihoodFit:
         keep = self._usable_bins(window)
         observed = window.spectrum[keep]
         power = np.einsum("fii->i", observed).real / observed.shape[0]
-        if not np.all(power > 0):
-            dead = [name for name, value in zip(window.states, power, strict=True) if not value > 0]
+        dead = _dead(window.states, power)
+        if dead:
             raise EstimationError(
                 f"{self._machine.name}: no fluctuation in {', '.join(dead)}: nothing to compare with theory"
             )
@@ -103,13 +103,19 @@ class LikelihoodFit:
         observed = observed / np.outer(model.scale, model.scale)
         averages = _AVERAGES_PER_SEGMENT * window.n_segments
         search = FisherScoring(model, observed, averages, speed, self._usual_cutoff_hz)
+        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window"
         try:
-            found = self._maximise(model, search)
+            # Trial points may lie far out; what comes of them is checked, not warned of.
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                found = self._maximise(model, search)
             covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
-            raise EstimationError(f"{self._machine.name}: the likelihood has no maximum for this window") from error
+            raise EstimationError(nowhere) from error
         theta, steps = found.theta, found.steps
+        if not (np.all(np.isfinite(theta)) and np.all(np.diag(covariance) > 0)):
+            self.reset()
+            raise EstimationError(nowhere)
         self._last = theta
         n = len(STRUCTURAL)
         ratio = np.exp(theta[:n])
@@ -156,7 +162,10 @@ class LikelihoodFit:
         next window carries on from there.
         """
         if self._last is not None:
-            return search.maximise(self._last, _WARM_STEPS)
+            try:
+                return search.maximise(self._last, _WARM_STEPS)
+            except np.linalg.LinAlgError:  # the old point makes no valid spectrum for this window
+                self.reset()
         return search.maximise(self._usual(model), _COLD_STEPS)
 
     def _eccentricity(
@@ -201,6 +210,13 @@ class LikelihoodFit:
         weight = np.linalg.solve(total, g2)
         precision = float(weight @ g2)
         return float(weight @ q2) / precision - 1, precision**-0.5
+
+
+def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
+    """States without fluctuation: a million times less than another one of their kind, which is rounding."""
+    rates = np.array([name.endswith("_dot") for name in states])
+    largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
+    return [name for name, dead in zip(states, ~(power > 1e-12 * largest), strict=True) if dead]
 
 
 def _misfit(S: ComplexArray, observed: ComplexArray, window: WindowStatistics) -> float:

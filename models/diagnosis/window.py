@@ -42,6 +42,8 @@ class WindowStatistics:
         The same of every hop alone.
     speed_rad_s : float
         Mean speed (nan without a phase reference).
+    speed_range : tuple of float
+        Slowest and fastest hop, rad/s (nan without a phase reference).
     duration_s : float
         Length of the data in the window.
     """
@@ -59,6 +61,7 @@ class WindowStatistics:
     synchronous: ComplexArray | None
     hop_synchronous: ComplexArray | None
     speed_rad_s: float
+    speed_range: tuple[float, float]
     duration_s: float
 
 
@@ -80,6 +83,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowStatist
     rest = np.ascontiguousarray((segments @ remove.T).transpose(1, 2, 0))
     spectrum = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
     duration_s = len(hops) * plan.hop / plan.rate_hz
+    turned = [hop.turned_rad for hop in hops]
     synchronous = hop_synchronous = None
     if plan.angle_column is not None:
         synchronous = _synchronous(beta)
@@ -97,14 +101,15 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowStatist
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,
-        speed_rad_s=sum(hop.turned_rad for hop in hops) / duration_s,
+        speed_rad_s=sum(turned) / duration_s,
+        speed_range=(min(turned) / duration_s * len(hops), max(turned) / duration_s * len(hops)),
         duration_s=duration_s,
     )
 
 
 def _regression(zero_lag: FloatArray, n: int) -> FloatArray:
-    """β of x on the regressors, shape (n, n_regressors)."""
-    return np.asarray(np.linalg.solve(zero_lag[n:, n:], zero_lag[n:, :n]).T, dtype=np.float64)
+    """β of x on the regressors, shape (n, n_regressors); of least norm where a stuck angle makes them dependent."""
+    return np.asarray(np.linalg.lstsq(zero_lag[n:, n:], zero_lag[n:, :n], rcond=None)[0].T, dtype=np.float64)
 
 
 def _synchronous(beta: FloatArray) -> ComplexArray:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import httpx
 import numpy as np
@@ -66,10 +67,10 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> 
 
 
 @contextmanager
-def open_session(connect: str) -> Iterator[zenoh.Session]:
-    """A peer beside a service that subscribes to the lab machine; what it puts is heard from the beginning."""
+def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iterator[zenoh.Session]:
+    """A session beside a service that subscribes to the lab machine; what it puts is heard from the beginning."""
     config = zenoh.Config()
-    for path, value in LinkSettings(connect=(connect,)).zenoh_items().items():
+    for path, value in LinkSettings(mode=mode, connect=(connect,)).zenoh_items().items():
         config.insert_json5(path, value)
     with zenoh.open(config) as session:
         probe = session.declare_publisher(LAB.keys.stream)

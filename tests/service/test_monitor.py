@@ -1,5 +1,6 @@
 """The data path of one machine, fed by the simulator's blocks without any transport."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -118,6 +119,47 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     assert "speed is 2000 rpm, evaluated are 1320 rpm ± 25%" in windows[-1].reason
     assert windows[-1].parameters == ()
     assert not events
+
+
+def test_an_unsteady_speed_is_not_evaluable() -> None:
+    loaded, machine = load_scenario("healthy")
+    ramp = {"at_s": 20, "ramp_s": 30, "speed_rpm": 1452}
+    fields = loaded.model_dump() | {"duration_s": 140.0, "seed": SEED, "events": [ramp]}
+    stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
+    windows, events = feed(MachineMonitor(machine, None), stream_)
+    states = [window.state for window in windows]
+    assert states[11] is HealthState.NOT_EVALUABLE
+    assert "speed went from 1320 to 1452 rpm within the window" in windows[11].reason
+    assert states[-1] is HealthState.HEALTHY  # at the new speed
+    assert not events
+
+
+@pytest.mark.parametrize("kind", ["stuck angle", "backwards", "constant channel", "twins", "huge", "clipped"])
+def test_sick_channels_never_stop_the_monitor_and_never_raise_an_alarm_by_crashing(kind: str) -> None:
+    target = monitor()
+    seen: list[WindowReport] = []
+    for block in stream("healthy", 71.0):
+        samples = block.samples.copy()
+        match kind:
+            case "stuck angle":
+                samples[:, 8] = 1.0
+            case "backwards":
+                samples[:, 8] = 2 * np.pi - samples[:, 8]
+            case "constant channel":
+                samples[:, 3] = 0.5
+            case "twins":
+                samples[:, 4] = samples[:, 5]
+            case "huge":
+                samples[:, :8] *= 1e12
+            case "clipped":
+                samples[:, 4] = np.clip(samples[:, 4], -1e-3, 1e-3)
+        report = target.step(replace(block, samples=samples))
+        assert report.verdict.accepted
+        seen += report.windows
+    assert len(seen) == 14
+    if kind in {"stuck angle", "backwards", "constant channel"}:
+        assert {window.state for window in seen[11:]} == {HealthState.NOT_EVALUABLE}
+        assert all(window.reason for window in seen[11:])
 
 
 def test_without_a_bundle_the_equations_say_so() -> None:

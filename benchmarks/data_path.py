@@ -1,0 +1,87 @@
+"""What one machine costs: the data path's stages over the same samples, as ratios measured side by side in one run.
+
+Run: ``python benchmarks/data_path.py``. The yardstick is the Fourier transform that the cross-spectra need at the very
+least (one real FFT per segment and channel); absolute times depend on the computer, ratios much less.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from models.diagnosis.bundle import load_bundle
+from models.diagnosis.likelihood import LikelihoodFit
+from models.diagnosis.moments import hop_moments, plan_for
+from models.diagnosis.networks import read_equation
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from service.monitor import MachineMonitor
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+
+REPETITIONS = 5
+DATA_S = 180.0
+
+
+def median_s(work: Callable[[], object], count: int) -> float:
+    """Median time of one of `count` items of work, over the repetitions."""
+    times = []
+    for _ in range(REPETITIONS):
+        begin = time.perf_counter()
+        work()
+        times.append((time.perf_counter() - begin) / count)
+    return statistics.median(times)
+
+
+def main() -> None:
+    """Measure and print."""
+    scenario, machine = load_scenario("healthy")
+    scenario = scenario.overridden(seed=1, duration_s=DATA_S)
+    stream = [block for block, _ in blocks(scenario, machine)]
+    bundle, plan = load_bundle("lab", machine), plan_for(machine)
+    window = SlidingWindow(plan)
+    windows: list[WindowStatistics] = []
+    samples = np.concatenate([plan.to_si(block.samples) for block in stream])
+    for _ in window.feed(samples, 0):
+        full = window.statistics()
+        if full is not None:
+            windows.append(full)
+    piece = samples[: plan.preamble + plan.hop]
+    level = piece[:, : len(plan.states)].mean(axis=0)
+    fit = LikelihoodFit(machine)
+    fit.fit(windows[0])
+
+    def yardstick() -> None:
+        half = plan.segment // 2
+        for number in range(plan.hop // half):
+            np.fft.rfft(piece[number * half : number * half + plan.segment], axis=0)
+
+    def whole() -> None:
+        monitor = MachineMonitor(machine, bundle)
+        for block in stream:
+            monitor.step(block)
+
+    hops = round(DATA_S / machine.window.hop_s)
+    costs = {
+        "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
+        "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
+        "statistics of a window": median_s(window.statistics, 1),
+        "likelihood, warm": median_s(lambda: [fit.fit(one) for one in windows], len(windows)),
+        "networks 28, 29, 31": median_s(
+            lambda: [read_equation(network, windows[0], machine) for network in bundle.networks], 1
+        ),
+        "whole data path, per hop": median_s(whole, hops),
+    }
+    base = costs["Fourier transforms alone (yardstick)"]
+    print(f"{machine.name}: {machine.rate_hz:g} Hz, {len(machine.sensors)} channels, hop {machine.window.hop_s:g} s")
+    for name, seconds in costs.items():
+        print(f"  {name:<40} {1e3 * seconds:8.2f} ms   {seconds / base:8.1f} x")
+    print(f"  real time / whole data path: {machine.window.hop_s / costs['whole data path, per hop']:.0f}")
+
+
+if __name__ == "__main__":
+    main()

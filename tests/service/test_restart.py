@@ -1,0 +1,90 @@
+"""Programs that are killed and come back: real processes, kill -9, one side at a time."""
+
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.api import ReportList
+from service.schemas import Health
+from tests.service.live import Program, endpoint, program, until
+
+PACE = "20"
+
+
+def monitor(address: str, http_port: str = "0") -> tuple[str, ...]:
+    return ("service.rotorwatch", "run", "--machine", "lab", "--listen", address, "--http-port", http_port)
+
+
+def simulator(address: str, start: str, *more: str) -> tuple[str, ...]:
+    return (
+        "simulator.rotorsim", "publish", "healthy", "--connect", address, "--pace", PACE, "--start", start,
+        "--wait-for-subscriber", "30", *more,
+    )  # fmt: skip
+
+
+def reaches(watched: Program, condition: Callable[[Health], bool], what: str) -> Health:
+    """Health as soon as a condition holds."""
+    found: list[Health] = []
+
+    def look() -> bool:
+        found[:] = [watched.health()]
+        return condition(found[0])
+
+    until(look, what, timeout_s=60.0)
+    return found[0]
+
+
+@pytest.mark.parametrize("start", ["2026-01-01T00:02:30Z", "2025-06-01T00:00:00Z"], ids=["later", "clock set back"])
+def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, start: str) -> None:
+    """Healthy before, healthy after, a gap between: reported as a gap, no alarm, windows full again."""
+    address = endpoint()
+    with program(tmp_path, *monitor(address)) as watched:
+        watched.wait_for("HTTP API")
+        with program(tmp_path, *simulator(address, "2026-01-01T00:00:00Z", "--run", "1")) as publisher:
+            reaches(watched, lambda health: health.state == "healthy" and health.filled == 1.0, "full window")
+            publisher.kill()
+        before = reaches(watched, lambda health: not health.stream.publisher_alive, "death of the publisher noticed")
+        assert before.quality.gaps == 0
+        with program(tmp_path, *simulator(address, start, "--run", "2", "--seed", "7700021")):
+            gap = reaches(watched, lambda health: health.quality.gaps == 1, "gap")
+            assert "publisher restarted" in gap.quality.last_gap or "clock stepped" in gap.quality.last_gap
+            assert gap.stream.publisher_alive
+            until(lambda: newest_full_window(watched) > start_ns(start) + 130e9, "a minute of full windows", 60.0)
+        after = watched.health()
+        assert after.quality.gaps == 1
+        assert after.alarms == ()
+        events = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/alarms/events", trust_env=False).json()["events"]
+        assert events == []
+        assert watched.process.poll() is None
+
+
+def newest_full_window(watched: Program) -> int:
+    """End of the newest window that was evaluated."""
+    answer = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/reports?limit=1", trust_env=False)
+    (report,) = ReportList.model_validate_json(answer.content).reports
+    return report.end_ns if report.parameters and report.state == "healthy" else 0
+
+
+def start_ns(text: str) -> float:
+    return datetime.fromisoformat(text).timestamp() * 1e9
+
+
+def test_killed_monitor_comes_back_and_the_publisher_carries_on(tmp_path: Path) -> None:
+    address = endpoint()
+    with program(tmp_path, *monitor(address)) as first:
+        first.wait_for("HTTP API")
+        with program(tmp_path, *simulator(address, "2026-01-01T00:00:00Z")) as publisher:
+            reaches(first, lambda health: health.quality.accepted_blocks > 100, "blocks at the first monitor")
+            first.kill()
+            with program(tmp_path, *monitor(address)) as second:
+                full = reaches(second, lambda health: health.state == "healthy", "full window at the second monitor")
+                assert full.stream.publisher_alive
+                assert full.stream.descriptor_mismatch == ()
+                assert full.quality.accepted_blocks >= 600
+                assert full.quality.refused_blocks == {}
+                assert full.alarms == ()
+                assert publisher.process.poll() is None
+                assert second.stop() == 0

@@ -1,0 +1,238 @@
+"""The command `rotorwatch` as a process: what it prints, where, and its exit codes."""
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.lines import alarm_event_line, alarm_state_lines, health_line, report_line
+from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report, example
+from simulator.scenario import parse_fault
+from tests.service.live import (
+    ROOT,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    program,
+    scenario_blocks,
+    send,
+    service,
+    until,
+)
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    command = [sys.executable, "-m", "service.rotorwatch", *arguments]
+    clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, env=clean, check=False)
+
+
+def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
+    code = (
+        "import sys\nfrom service.rotorwatch import app\n"
+        "try:\n    app(['--help'])\nexcept SystemExit:\n    pass\n"
+        "print('loaded', sorted({name.split('.')[0] for name in sys.modules}))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60, check=True
+    )
+    loaded = found.stdout.splitlines()[-1]
+    assert loaded.startswith("loaded")
+    for name in ("numpy", "scipy", "torch", "zenoh", "fastapi", "pyarrow"):
+        assert f"'{name}'" not in loaded
+    for command in ("run", "check-config", "watch", "status", "router"):
+        assert command in found.stdout
+
+
+def test_the_service_never_imports_torch() -> None:
+    code = (
+        "import sys, service.runtime, service.transport, service.api\n"
+        "from service.config import MachineEntry, ServiceSettings\n"
+        "service.runtime.Runtime(ServiceSettings(machines=(MachineEntry(file='lab', bundle='lab'),)))\n"
+        "assert 'numpy' in sys.modules\nassert 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60, check=True)
+
+
+def test_numpy_computes_in_one_thread() -> None:
+    code = (
+        "import os, sys\nfrom service import rotorwatch\nassert 'numpy' not in sys.modules\n"
+        "rotorwatch._one_blas_thread()\nimport numpy as np\n"
+        "a = np.ones((800, 800))\na @ a\nprint(len(os.listdir('/proc/self/task')))"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, env={"PATH": "/usr/bin"}, check=True
+    )
+    assert found.stdout.strip() == "1"
+
+
+@pytest.mark.parametrize("command", ["run", "check-config", "watch", "status", "router"])
+def test_every_command_has_an_example(command: str) -> None:
+    found = run(command, "--help")
+    assert found.returncode == 0
+    assert "Example" in found.stdout
+    assert f"rotorwatch {command}" in found.stdout
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_run_says_where_it_is_and_stops_cleanly(tmp_path: Path, number: signal.Signals) -> None:
+    address = endpoint()
+    with program(
+        tmp_path, "service.rotorwatch", "run", "--listen", address, "--http-port", "0", ROTORWATCH_LOG__FORMAT="json"
+    ) as started:
+        url = started.url()
+        assert f"Zenoh listening on {address}" in started.output()
+        assert "machine demo/lab, trained networks " in started.output()
+        assert httpx.get(f"{url}/readyz", trust_env=False).json()["ready"]
+        assert started.stop(number) == 0
+        lines = [json.loads(line) for line in started.errors().splitlines()]
+        assert lines[-1]["event"] == "stopped"
+        assert {line["level"] for line in lines} == {"info"}
+
+
+def test_used_addresses_are_run_time_errors_that_name_them() -> None:
+    address = endpoint()
+    with service(address) as (runtime, _):
+        zenoh = run("run", "--machine", "lab", "--listen", address, "--http-port", "0")
+        port = runtime.http_url.rsplit(":", 1)[1]
+        http = run("run", "--machine", "lab", "--listen", endpoint(), "--http-port", port)
+    for found, named in ((zenoh, address), (http, f"127.0.0.1 port {port}: Address already in use")):
+        assert found.returncode == 1
+        assert named in found.stderr
+        assert found.stdout == ""
+        assert "Traceback" not in found.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (("run", "--config", "missing.toml"), "missing.toml"),
+        (("run", "--machine", "pump"), "pump"),
+        (("run", "--machine", "lab@nowhere"), "nowhere"),
+        (("run", "--machine", "heavy@lab"), "lab"),
+        (("run", "--machine", "lab", "--machine", "lab"), "command line: machines: lab and lab both describe"),
+        (("watch", "--machine", "lab"), "--machine is 'lab', expected SITE/MACHINE"),
+        (("check-config", "missing.toml"), "missing.toml"),
+    ],
+)
+def test_unusable_files_and_arguments_exit_with_2(arguments: tuple[str, ...], named: str) -> None:
+    found = run(*arguments)
+    assert found.returncode == 2
+    assert named in found.stderr
+    assert "Traceback" not in found.stderr
+
+
+def test_watch_and_status_without_a_monitor_say_so() -> None:
+    address = endpoint()
+    found = run("watch", "--connect", address)
+    assert found.returncode == 1
+    assert f"connect {address}" in found.stderr
+    assert "nobody answers" in found.stderr
+    url = f"http://{address.removeprefix('tcp/')}"
+    found = run("status", "--url", url)
+    assert found.returncode == 1
+    assert f"{url}: the monitor's HTTP API does not answer" in found.stderr
+
+
+def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
+    address = endpoint()
+    file = machine_file(
+        tmp_path,
+        ("on_delay_s = 60.0", "on_delay_s = 5.0"),
+        ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
+    )
+    watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")
+    with (
+        service(address, file, when_full="wait") as (runtime, worker),
+        program(tmp_path, *watching, "--machine", "demo/*") as text,
+        program(tmp_path, *watching, "--json") as lines,
+    ):
+        calm = run("status", "--url", runtime.http_url)
+        assert calm.returncode == 0
+        assert "warming" in calm.stdout
+        until(lambda: "state is warming" in text.output() and "/health" in lines.output(), "watchers at work")
+        send(address, scenario_blocks(77.0, parse_fault("k_bz=-0.3@0")), worker.machine)
+        text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by -")
+        until(lambda: "org.rotorwatch.alarm.raised" in lines.output(), "alarm event as JSON")
+        until(lambda: "00:01:16  lab  alert" in text.output(), "line of the last window")
+        assert "00:01:01  lab  healthy        k_by " in text.output()
+
+        late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
+        with late as joined:
+            joined.wait_for("ALERT (active): bearing stiffness, vertical")
+            assert joined.stop() == 0
+        found = run("status", "--url", runtime.http_url)
+        assert found.returncode == 1
+        assert "k_bz alert" in found.stdout
+        assert text.stop(signal.SIGINT) == 0
+        assert lines.stop() == 0
+        records = [json.loads(line) for line in lines.output().splitlines()]
+    topics = {record["topic"].removeprefix("rotorwatch/demo/lab/") for record in records}
+    assert topics == {"report", "health", "alarm/state", "alarm/event"}
+    for record in records:
+        if record["topic"].endswith("/report"):
+            Report.model_validate(record["message"])
+
+
+def test_watch_notices_a_monitor_that_goes_and_comes_back(tmp_path: Path) -> None:
+    address = endpoint()
+    with service(address):
+        started = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
+        watcher = started.__enter__()
+        try:
+            watcher.wait_for("state is warming")
+        except BaseException:
+            started.__exit__(None, None, None)
+            raise
+    try:
+        until(lambda: "connection lost, trying again" in watcher.errors(), "loss noticed")
+        with service(address):
+            until(lambda: "connected again" in watcher.errors(), "return noticed")
+        assert watcher.stop() == 0
+    finally:
+        started.__exit__(None, None, None)
+
+
+def test_router_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
+    address = endpoint()
+    with program(tmp_path, "service.rotorwatch", "router", "--listen", address) as router:
+        router.wait_for(f"router listening on {address}")
+        second = run("router", "--listen", address)
+        assert second.returncode == 1
+        assert address in second.stderr
+        monitor = ("service.rotorwatch", "run", "--machine", "lab", "--connect", address, "--http-port", "0")
+        with program(tmp_path, *monitor) as watched:
+            watched.wait_for(f"Zenoh connecting to {address}")
+            watched.url()
+            with open_session(address, "client") as session:
+                Feed(session).put_good()
+                until(lambda: watched.health().quality.accepted_blocks == 1, "block through the router")
+        assert router.stop() == 0
+
+
+def test_lines_for_terminals() -> None:
+    report = Report.model_validate(example(Report))
+    assert report_line(report) == "00:03:25  lab  alert          k_by −24.7±1.4 %"
+    small = report.parameters[0].model_copy(update={"relative_change": 0.005})
+    assert report_line(report.model_copy(update={"parameters": (small,)})).endswith("k_by  +0.5±1.4 %")
+    blind = report.parameters[0].model_copy(update={"relative_change": None})
+    assert report_line(report.model_copy(update={"parameters": (blind,)})).endswith("k_by n/a")
+    early = report.model_copy(update={"parameters": (), "filled": 0.25, "state": "warming"})
+    assert report_line(early) == "00:03:25  lab  warming        window 25% full"
+    assert report_line(early.model_copy(update={"reason": "too fast"})).endswith("too fast")
+    event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
+    assert alarm_event_line(event).startswith("00:03:25  lab  ALERT: bearing stiffness, horizontal (k_by)")
+    states = AlarmStates.model_validate(example(AlarmStates))
+    assert alarm_state_lines(states) == (
+        "00:03:25  lab  ALERT (active): bearing stiffness, horizontal  k_by −24.7±1.4 %",
+    )
+    health = Health.model_validate(example(Health))
+    assert health_line(health) == "00:03:25  lab  state is alert"
+    unseen = health.model_copy(update={"window_end_ns": None, "state": "no-data", "reason": "silence"})
+    assert health_line(unseen) == "--:--:--  lab  state is no-data: silence"

@@ -1,0 +1,142 @@
+"""Settings: file, environment over it, and what is said about mistakes."""
+
+import re
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from models.errors import MachineFileError
+from service.config import DEFAULT_LISTEN, ServiceSettings, load_settings
+from tests.service.live import ROOT, machine_file
+from tests.service.test_rotorwatch_cli import run
+
+GOOD = """
+[link]
+listen = ["tcp/127.0.0.1:7001"]
+
+[http]
+port = 9000
+
+[[machines]]
+file = "machine.toml"
+bundle = "lab"
+
+[queue]
+blocks = 10
+when_full = "wait"
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    machine_file(folder)
+    path = folder / "service.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_defaults_watch_the_shipped_machine_on_loopback() -> None:
+    settings = load_settings()
+    assert [(entry.file, entry.bundle) for entry in settings.machines] == [("lab", "lab")]
+    assert settings.link.listen == (DEFAULT_LISTEN,)
+    assert settings.http.host == "127.0.0.1"
+    assert settings.queue.when_full == "drop"
+
+
+def test_file_is_read_and_paths_are_relative_to_it(tmp_path: Path) -> None:
+    settings = load_settings(written(tmp_path, GOOD))
+    assert settings.http.port == 9000
+    assert settings.queue.blocks == 10
+    assert settings.machines[0].file == str(tmp_path / "machine.toml")
+    assert settings.machines[0].bundle == "lab"
+    assert settings.machines[0].load().name == "lab"
+    (tmp_path / "lab").mkdir()
+    assert load_settings(tmp_path / "service.toml").machines[0].bundle == str(tmp_path / "lab")
+
+
+def test_environment_goes_over_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROTORWATCH_HTTP__PORT", "9001")
+    monkeypatch.setenv("ROTORWATCH_MACHINES", '[{"file": "heavy"}]')
+    settings = load_settings(written(tmp_path, GOOD))
+    assert settings.http.port == 9001
+    assert settings.queue.blocks == 10
+    assert [(entry.file, entry.bundle) for entry in settings.machines] == [("heavy", None)]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (("port = 9000", "port = 99000"), r"service.toml: http.port: .*less than or equal to 65535 \(found 99000\)"),
+        (("port = 9000", "prot = 9000"), r"service.toml: http.prot: Extra inputs are not permitted \(found 9000\)"),
+        (("[queue]", "[cue]"), r"service.toml: cue: Extra inputs"),
+        (('"wait"', '"hope"'), r"service.toml: queue.when_full: .*'drop' or 'wait' \(found 'hope'\)"),
+        (("blocks = 10", "blocks = 0"), r"service.toml: queue.blocks: .*\(found 0\)"),
+        (('file = "machine.toml"', ""), r"service.toml: machines.0.file: Field required"),
+        (('"machine.toml"', '"other.toml"'), r"other.toml: "),
+        (('listen = ["tcp/127.0.0.1:7001"]', ""), r"service.toml: .*neither listen nor connect"),
+        (("[http]", "[http"), r"service.toml: not a TOML file: .*line 5"),
+    ],
+)
+def test_mistake_is_named_with_file_field_and_value(tmp_path: Path, change: tuple[str, str], named: str) -> None:
+    assert change[0] in GOOD
+    path = written(tmp_path, GOOD.replace(*change))
+    with pytest.raises(MachineFileError) as caught:
+        load_settings(path)
+    assert re.search(named, str(caught.value)), str(caught.value)
+
+
+def test_mistake_in_the_environment_names_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROTORWATCH_HTTP__PORT", "many")
+    with pytest.raises(MachineFileError) as caught:
+        load_settings()
+    assert "environment variable ROTORWATCH_HTTP__PORT: http.port" in str(caught.value)
+    monkeypatch.setenv("ROTORWATCH_HTTP__PORT", "1")
+    monkeypatch.setenv("ROTORWATCH_MACHINES", "lab")
+    with pytest.raises(MachineFileError) as broken:
+        load_settings()
+    assert "machines" in str(broken.value)
+
+
+def test_two_entries_for_one_machine_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, GOOD + '\n[[machines]]\nfile = "lab"\n')
+    with pytest.raises(MachineFileError) as caught:
+        load_settings(path)
+    assert "machine.toml and lab both describe rotorwatch/demo/lab" in str(caught.value)
+
+
+def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
+    good = written(tmp_path, GOOD)
+    wrong_machine = tmp_path / "wrong.toml"
+    wrong_machine.write_text(
+        (tmp_path / "machine.toml").read_text(encoding="utf-8").replace("rate_hz = 2000.0", "rate_hz = -1.0"),
+        encoding="utf-8",
+    )
+    wrong_bundle = tmp_path / "bundle.toml"
+    wrong_bundle.write_text('[[machines]]\nfile = "heavy"\nbundle = "lab"\n', encoding="utf-8")
+    fine = run("check-config", str(good), str(tmp_path / "machine.toml"))
+    assert (fine.returncode, fine.stderr) == (0, "")
+    assert f"{good}: ok, settings for demo/lab" in fine.stdout
+    assert f"{tmp_path / 'machine.toml'}: ok, machine demo/lab, 9 channels at 2000 Hz" in fine.stdout
+    mixed = run("check-config", str(good), str(wrong_machine), str(wrong_bundle))
+    assert mixed.returncode == 2
+    assert f"{good}: ok" in mixed.stdout
+    assert f"{wrong_machine}: rate_hz: Input should be greater than 0 (found -1.0)" in mixed.stderr
+    assert str(wrong_bundle) in mixed.stderr
+
+
+def fields_of(model: type[BaseModel], table: str = "") -> list[tuple[str, str, str | None]]:
+    found: list[tuple[str, str, str | None]] = []
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            found += fields_of(inner, name)
+        else:
+            found.append((table, name, field.description))
+    return found
+
+
+def test_every_setting_is_described_and_documented() -> None:
+    page = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
+    for table, name, description in fields_of(ServiceSettings):
+        assert description, f"{table}.{name} has no description"
+        assert f"`{name}`" in page or f"[[{name}]]" in page, f"docs/service.md does not mention {table}.{name}"

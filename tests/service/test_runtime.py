@@ -1,0 +1,230 @@
+"""The running service: what it says equals what the monitor says offline, silence, errors, start and stop."""
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from models.diagnosis.bundle import load_bundle
+from models.errors import BundleError, MachineFileError
+from models.machine import load_machine
+from models.signals.link import LinkSettings
+from service import conversion
+from service.config import HttpSettings, MachineEntry, ServiceSettings
+from service.logs import Limiter
+from service.monitor import MachineMonitor, MonitorReport
+from service.runtime import HttpError, Runtime, running
+from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report
+from service.transport import LinkError, TopicMessage, follow
+from simulator.scenario import parse_fault
+from tests.service.live import Feed, endpoint, machine_file, open_session, scenario_blocks, send, service, until
+
+QUICK_ALARM = ("on_delay_s = 60.0", "on_delay_s = 5.0")
+SHORT_SILENCE = ("[operation]", "[ingest]\nno_data_after_s = 0.5\n\n[operation]")
+
+
+class Topics:
+    """What a client collected, by the last part of the key."""
+
+    def __init__(self) -> None:
+        self.messages: list[TopicMessage] = []
+
+    def texts(self, suffix: str) -> list[str]:
+        return [message.text for message in list(self.messages) if message.key.endswith(suffix)]
+
+
+def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_nothing(tmp_path: Path) -> None:
+    file = machine_file(tmp_path, QUICK_ALARM, SHORT_SILENCE)
+    machine = load_machine(file)
+    stream = scenario_blocks(85.0, parse_fault("c_bz=0.5@0"))
+    offline = MachineMonitor(machine, load_bundle("lab", machine))
+    reports = [offline.step(block) for block in stream]
+    windows = tuple(window for report in reports for window in report.windows)
+    events = tuple(event for report in reports for event in report.events)
+    assert [event.alarm.parameter for event in events] == ["c_bz"]
+
+    address, topics = endpoint(), Topics()
+    with service(address, file, bundle="lab", when_full="wait") as (_, worker):
+        client = LinkSettings(mode="client", connect=(address,))
+        names = ("report", "alarm_event", "alarm_state", "health")
+        with follow(client, "demo/lab", names, topics.messages.append):
+            until(lambda: bool(topics.texts("/health")), "first health")
+            send(address, stream, machine)
+            until(lambda: worker.health().quality.accepted_blocks == len(stream), "all blocks")
+            assert tuple(reversed(worker.history.reports())) == windows
+            assert tuple(reversed(worker.history.alarm_events())) == events
+
+            until(lambda: len(topics.texts("/report")) == len(windows), "reports on the topic")
+            published = [Report.model_validate_json(text) for text in topics.texts("/report")]
+            assert published == [conversion.report(worker.identity, window) for window in windows]
+            (event,) = [AlarmCloudEvent.model_validate_json(text) for text in topics.texts("/alarm/event")]
+            assert event == conversion.alarm_cloud_event(worker.identity, events[0])
+            states = AlarmStates.model_validate_json(topics.texts("/alarm/state")[-1])
+            assert [(alarm.parameter, alarm.state) for alarm in states.alarms] == [("c_bz", "active")]
+
+            def latest() -> Health:
+                return Health.model_validate_json(topics.texts("/health")[-1])
+
+            until(lambda: latest().state == "no-data", "silence on the topic")
+            silent = latest()
+            assert silent.reason == "no usable block for more than 0.5 s"
+            assert [alarm.parameter for alarm in silent.alarms if alarm.raised] == ["c_bz"]
+            assert silent.parameters == published[-1].parameters
+            said = [Health.model_validate_json(text).state.value for text in topics.texts("/health")]
+            assert "danger" in said
+            # News only: a service does not repeat itself because a block came in or a second went by.
+            news = [silence_aside(json.loads(text)) for text in topics.texts("/health")]
+            assert all(before != after for before, after in pairwise(news))
+
+
+def silence_aside(health: dict[str, Any]) -> dict[str, Any]:
+    """The message without what changes with every block."""
+    health["stream"]["data_age_s"] = None
+    health["quality"]["accepted_blocks"] = None
+    return health
+
+
+def test_data_after_silence_end_it(tmp_path: Path) -> None:
+    file = machine_file(tmp_path, SHORT_SILENCE)
+    address = endpoint()
+    with service(address, file) as (_, worker), open_session(address) as session:
+        until(lambda: worker.health().state == "no-data", "silence from the start")
+        assert worker.health().reason == "no usable block since the monitor started"
+        assert worker.health().stream.data_age_s is None
+        feed = Feed(session, load_machine(file))
+        feed.put_good()
+        until(lambda: worker.health().state == "warming", "end of the silence")
+        until(lambda: worker.health().state == "no-data", "silence")
+        # Blocks that are refused are no data either.
+        accepted = worker.health().quality.accepted_blocks
+        for _ in range(3):
+            feed.put(feed.block(samples=np.full((200, 9), np.nan, dtype=np.float32)))
+        until(lambda: sum(worker.health().quality.refused_blocks.values()) == 3, "refusals")
+        assert worker.health().state == "no-data"
+        assert worker.health().quality.accepted_blocks == accepted
+
+
+class _Poisoned(MachineMonitor):
+    """A monitor with a defect that one payload brings to light."""
+
+    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> MonitorReport:
+        if encoding == "poison":
+            raise ZeroDivisionError("defect in the monitor")
+        return super().step_payload(payload, attachment, encoding)
+
+
+def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.worker.MachineMonitor", _Poisoned)
+    address = endpoint()
+    with service(address) as (runtime, worker), open_session(address) as session:
+        feed = Feed(session)
+        feed.put_good()
+        feed.put_raw(b"", b"", "poison")
+        feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 2, "block after the defect")
+        health = worker.health()
+        assert health.worker_errors == 1
+        assert health.last_worker_error == "ZeroDivisionError: defect in the monitor"
+        answer = httpx.get(f"{runtime.http_url}/readyz", trust_env=False)
+        assert answer.status_code == 200
+        assert answer.json()["machines"][0]["worker_errors"] == 1
+
+
+def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> None:
+    other = machine_file(tmp_path, ('name = "lab"', 'name = "rig-2"'))
+    address = endpoint()
+    two = ServiceSettings(
+        link=LinkSettings(listen=(address,)),
+        http=HttpSettings(port=0),
+        machines=(MachineEntry(file="lab"), MachineEntry(file=other)),
+    )
+    with running(two) as runtime, open_session(address) as session:
+        first, second = runtime.machines()
+        feed = Feed(session, second.machine)
+        feed.put_raw(b"", b"", "rubbish")
+        feed.put_good()
+        Feed(session).put_good()
+        until(lambda: first.health().quality.accepted_blocks == 1, "block of the first")
+        until(lambda: second.health().quality.accepted_blocks == 1, "block of the second")
+        assert first.health().quality.refused_blocks == {}
+        assert second.health().quality.refused_blocks == {"malformed": 1}
+        assert runtime.machine("demo", "rig-2") is second
+        assert runtime.machine("demo", "rig-3") is None
+        listed = httpx.get(f"{runtime.http_url}/api/v1/machines", trust_env=False).json()["machines"]
+        assert [entry["machine"] for entry in listed] == ["lab", "rig-2"]
+
+
+def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
+    address = endpoint()
+    with service(address) as (runtime, _):
+        port = int(runtime.http_url.rsplit(":", 1)[1])
+        clash = ServiceSettings(
+            link=LinkSettings(listen=(endpoint(),)), http=HttpSettings(port=port), machines=(MachineEntry(file="lab"),)
+        )
+        with pytest.raises(HttpError) as http:
+            Runtime(clash).start()
+        assert f"HTTP cannot listen on 127.0.0.1 port {port}: Address already in use" in str(http.value)
+        second = ServiceSettings(
+            link=LinkSettings(listen=(address,)), http=HttpSettings(port=0), machines=(MachineEntry(file="lab"),)
+        )
+        failed = Runtime(second)
+        with pytest.raises(LinkError) as link:
+            failed.start()
+        assert address in str(link.value)
+        assert not failed.readiness().ready
+        assert not any(worker.alive for worker in failed.machines())
+    # Both addresses are free again.
+    with running(second.model_copy(update={"http": HttpSettings(port=port)})) as runtime:
+        assert runtime.readiness().ready
+
+
+def test_stopped_service_has_no_thread_left() -> None:
+    address = endpoint()
+    with service(address, when_full="wait", bound=1) as (_, worker), open_session(address) as session:
+        feed = Feed(session)
+        for _ in range(50):
+            feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks > 0, "blocks")
+    assert not worker.alive
+
+
+@pytest.mark.parametrize(
+    ("entry", "error", "named"),
+    [
+        (MachineEntry(file="missing.toml"), MachineFileError, "missing.toml: no such machine file"),
+        (MachineEntry(file="lab", bundle="missing"), BundleError, "missing"),
+        (MachineEntry(file="heavy", bundle="lab"), BundleError, "lab"),
+    ],
+)
+def test_files_are_checked_before_anything_runs(
+    entry: MachineEntry, error: type[MachineFileError] | type[BundleError], named: str
+) -> None:
+    with pytest.raises(error, match=named):
+        Runtime(ServiceSettings(machines=(entry,)))
+
+
+def test_log_lines_of_one_kind_are_limited() -> None:
+    now = [0.0]
+    limiter = Limiter(lambda: now[0])
+    assert [limiter.admit("gap") for _ in range(4)] == [0, None, None, None]
+    assert limiter.admit("refused") == 0
+    now[0] = 10.0
+    assert limiter.admit("gap") == 3
+    assert limiter.admit("gap") is None
+
+
+def test_health_over_http_is_the_health_on_the_topic() -> None:
+    address, topics = endpoint(), Topics()
+    with service(address) as (runtime, worker), open_session(address) as session:
+        with follow(LinkSettings(mode="client", connect=(address,)), "*/*", ("health",), topics.messages.append):
+            feed = Feed(session)
+            feed.put_raw(b"", b"", "rubbish")
+            until(lambda: bool(worker.health().quality.refused_blocks), "refusal")
+            until(lambda: any("rubbish" in text for text in topics.texts("/health")), "refusal on the topic")
+        over_http = httpx.get(f"{runtime.http_url}/api/v1/machines/demo/lab/health", trust_env=False).json()
+        on_topic = json.loads(topics.texts("/health")[-1])
+        assert over_http == on_topic
