@@ -87,11 +87,11 @@ def run(
         _one_blas_thread()
         from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
         from service.logs import configure_logging  # noqa: PLC0415
-        from service.runtime import running, stop_event  # noqa: PLC0415  # must see the variables set above
+        from service.runtime import running, stop_request  # noqa: PLC0415  # must see the variables set above
 
         settings = _overridden(load_settings(config), machine, listen, connect, http_port, when_full)
         configure_logging(settings.log)
-        with stop_event() as stop, running(settings) as service:
+        with stop_request() as stop, running(settings) as service:
             for worker in service.machines():
                 networks = worker.identity.bundle or "none: the equations are not evaluated"
                 typer.echo(f"machine {worker.identity.site}/{worker.identity.machine}, trained networks {networks}")
@@ -155,13 +155,13 @@ def watch(
         if machine.count("/") != 1:
             raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
         from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
-        from service.runtime import stop_event  # noqa: PLC0415
+        from service.runtime import stop_request  # noqa: PLC0415
         from service.transport import follow  # noqa: PLC0415
 
         topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
         link = LinkSettings(mode="client", connect=tuple(connect) if connect else (_ENDPOINT,))
         show = _JsonLines() if as_json else _Lines()
-        with stop_event() as stop, follow(link, machine, topics, show) as connected:
+        with stop_request() as stop, follow(link, machine, topics, show) as connected:
             there = True
             while not stop.wait(0.5):
                 if connected() != there:
@@ -214,11 +214,11 @@ def router(listen: _ListenOption = None, connect: _ConnectOption = None) -> None
     [cyan]rotorwatch router --listen tcp/0.0.0.0:7447[/cyan]
     """
     with _exit_codes():
-        from service.runtime import stop_event  # noqa: PLC0415  # keeps --help quick
+        from service.runtime import stop_request  # noqa: PLC0415  # keeps --help quick
         from service.transport import route  # noqa: PLC0415
 
         endpoints = tuple(listen) if listen else (_ENDPOINT,)
-        with stop_event() as stop, route(endpoints, tuple(connect or ())):
+        with stop_request() as stop, route(endpoints, tuple(connect or ())):
             typer.echo(f"router listening on {', '.join(endpoints)}")
             sys.stdout.flush()
             stop.wait()

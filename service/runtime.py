@@ -18,6 +18,7 @@ snapshots. Silence is noticed by the supervisor on the monotonic clock: no other
 import signal
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType
@@ -35,7 +36,7 @@ from service.schemas import Health, MachineReadiness, Readiness
 from service.transport import Link, MachineCallbacks, MachineLink
 from service.worker import MachineWorker
 
-__all__ = ["HttpError", "Runtime", "running", "stop_event"]
+__all__ = ["HttpError", "Runtime", "StopRequest", "running", "stop_request"]
 
 _TICK_S = 0.25
 _JOIN_S = 10.0
@@ -177,14 +178,37 @@ def running(settings: ServiceSettings) -> Iterator[Runtime]:
         runtime.stop()
 
 
+class StopRequest:
+    """Whether SIGINT or SIGTERM has come."""
+
+    def __init__(self) -> None:
+        self._asked = threading.Event()
+
+    def ask(self) -> None:
+        """Ask for the stop."""
+        self._asked.set()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait for the stop, at most so long, and say whether it was asked for.
+
+        Looks up again and again: the system may hand the signal to one of Zenoh's threads, and Python runs the handler
+        only when the main thread next does something.
+        """
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._asked.wait(_TICK_S):
+            if deadline_s is not None and time.monotonic() >= deadline_s:
+                return False
+        return True
+
+
 @contextmanager
-def stop_event() -> Iterator[threading.Event]:
-    """Event that SIGINT and SIGTERM set; the signals' former handlers come back afterwards."""
-    stop = threading.Event()
+def stop_request() -> Iterator[StopRequest]:
+    """Turn SIGINT and SIGTERM into a request to stop; the signals' former handlers come back afterwards."""
+    stop = StopRequest()
 
     def handle(number: int, frame: FrameType | None) -> None:
         _ = number, frame
-        stop.set()
+        stop.ask()
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -1,5 +1,6 @@
 """The command `rotorwatch` as a process: what it prints, where, and its exit codes."""
 
+import ctypes
 import json
 import signal
 import subprocess
@@ -94,6 +95,17 @@ def test_run_says_where_it_is_and_stops_cleanly(tmp_path: Path, number: signal.S
         lines = [json.loads(line) for line in started.errors().splitlines()]
         assert lines[-1]["event"] == "stopped"
         assert {line["level"] for line in lines} == {"info"}
+
+
+@pytest.mark.parametrize("command", ["run", "router"])
+def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Path, command: str) -> None:
+    more = ("--machine", "lab", "--http-port", "0") if command == "run" else ()
+    with program(tmp_path, "service.rotorwatch", command, "--listen", endpoint(), *more) as started:
+        started.wait_for("HTTP API" if command == "run" else "router listening")
+        number = started.process.pid
+        other = next(int(task.name) for task in Path(f"/proc/{number}/task").iterdir() if int(task.name) != number)
+        assert ctypes.CDLL(None).tgkill(number, other, signal.SIGTERM) == 0
+        assert started.process.wait(20) == 0
 
 
 def test_used_addresses_are_run_time_errors_that_name_them() -> None:

@@ -1,0 +1,24 @@
+# One image for all programs. Training needs torch, which is not in it.
+FROM python:3.11.13-slim-bookworm AS build
+ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+WORKDIR /src
+# Dependencies first, so that a change of the source does not fetch them again.
+COPY constraints.txt pyproject.toml README.md ./
+RUN python -m venv /opt/venv \
+    && mkdir models service simulator \
+    && touch models/__init__.py service/__init__.py simulator/__init__.py \
+    && /opt/venv/bin/pip install --constraint constraints.txt . \
+    && /opt/venv/bin/pip uninstall --yes rotorwatch
+COPY models models
+COPY service service
+COPY simulator simulator
+RUN /opt/venv/bin/pip install --constraint constraints.txt --no-deps .
+
+FROM python:3.11.13-slim-bookworm
+ENV PATH=/opt/venv/bin:$PATH PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
+RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin rotorwatch
+COPY --from=build /opt/venv /opt/venv
+COPY deploy/healthcheck.py /opt/healthcheck.py
+USER 10001:10001
+WORKDIR /
+CMD ["rotorwatch", "--help"]
