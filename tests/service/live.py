@@ -49,13 +49,23 @@ __all__ = [
 ROOT = Path(__file__).parents[2]
 LAB = load_machine("lab")
 START_NS = 1_767_225_600_000_000_000
+_USED_PORTS: set[int] = set()
 
 
 def endpoint() -> str:
-    """A free address on loopback."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """A free address on loopback, below the range from which the system takes ports for outgoing connections."""
+    while True:
+        # Not from the seeded generators: two test runs beside each other must not try the same ports.
+        port = 10_000 + int.from_bytes(os.urandom(2), "little") % 20_000
+        if port in _USED_PORTS:
+            continue
+        _USED_PORTS.add(port)
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        return f"tcp/127.0.0.1:{port}"
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> None:

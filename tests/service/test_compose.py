@@ -104,7 +104,7 @@ def test_the_commands_work_together(tmp_path: Path) -> None:
     router_port, api_port = address.rsplit(":", 1)[1], endpoint().rsplit(":", 1)[1]
     settings = tmp_path / "monitor.toml"
     text = (ROOT / "deploy/monitor.toml").read_text(encoding="utf-8")
-    for old, new in (("tcp/router:7447", address), ("0.0.0.0", "127.0.0.1"), ("8080", api_port)):
+    for old, new in (("tcp/router:7447", address), ('host = "0.0.0.0"', 'host = "127.0.0.1"'), ("8080", api_port)):
         assert old in text
         text = text.replace(old, new)
     settings.write_text(text, encoding="utf-8")
