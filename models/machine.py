@@ -42,7 +42,7 @@ class Operation(BaseModel):
     model_config = _STRICT
 
     speed_rpm: float = Field(gt=0, le=1e6, description="nominal speed")
-    speed_tolerance: float = Field(default=0.25, ge=0, lt=1, description="relative speed range that is evaluated")
+    speed_tolerance: float = Field(default=0.2, ge=0, lt=1, description="relative speed range, trained and evaluated")
     unbalance_phase_rad: float = Field(
         default=0.0, ge=-math.pi, le=math.pi, description="angle of the heavy spot from the phase reference"
     )
@@ -54,7 +54,7 @@ class Operation(BaseModel):
 
 
 class ConditionRange(BaseModel):
-    """Operating conditions the networks are trained for and the monitor vouches for."""
+    """Operating conditions the networks are trained for."""
 
     model_config = _STRICT
 
@@ -119,7 +119,7 @@ class IngestSettings(BaseModel):
 
     block_from_s: float = Field(default=0.001, gt=0, le=1, description="shortest accepted block")
     block_to_s: float = Field(default=2.0, gt=0, le=60, description="longest accepted block")
-    time_tolerance_s: float = Field(default=0.0005, gt=0, le=1, description="jitter of block times that is no gap")
+    time_tolerance_s: float = Field(default=0.0002, gt=0, le=1, description="jitter of block times that is no gap")
     rate_tolerance: float = Field(default=1e-4, ge=0, lt=0.1, description="relative deviation of the sampling rate")
     max_jump_s: float = Field(default=3600.0, gt=0, description="a block further ahead than this is refused as future")
     resync_blocks: int = Field(default=10, ge=2, le=1000, description="blocks in a row that establish a stepped clock")
@@ -153,7 +153,6 @@ class AlarmSettings(BaseModel):
     limits: AlarmLimits = AlarmLimits()
     parameters: dict[str, AlarmLimits] = Field(default={}, description="limits of single parameters instead")
     raise_z: float = Field(default=5.0, ge=2, le=20, description="the change must exceed this many standard errors")
-    clear_z: float = Field(default=3.0, ge=1, le=20, description="and counts as gone below this many")
     on_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must last before the alarm")
     off_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must be gone before it clears")
 
@@ -162,8 +161,6 @@ class AlarmSettings(BaseModel):
         unknown = sorted(set(self.parameters) - set(PARAMETERS))
         if unknown:
             raise ValueError(f"parameters {unknown} are not among {', '.join(PARAMETERS)}")
-        if self.clear_z > self.raise_z:
-            raise ValueError(f"clear_z {self.clear_z} must not be above raise_z {self.raise_z}")
         return self
 
     def for_parameter(self, name: str) -> AlarmLimits:
@@ -201,6 +198,15 @@ class Machine(BaseModel):
                 raise ValueError(
                     f"window.{field} is {samples:.6g} samples at {self.rate_hz} Hz, expected a whole number"
                 )
+        if round(self.window.segment_s * self.rate_hz) % 2:
+            raise ValueError(
+                f"window.segment_s {self.window.segment_s} is an odd number of samples, expected an even one"
+            )
+        bins = (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s
+        if bins < 20:
+            raise ValueError(f"window.band_hz holds {bins:.0f} frequencies of segment_s, expected at least 20")
+        if all(channel.quantity == "shaft_angle" for channel in self.sensors):
+            raise ValueError("sensors: a shaft angle alone shows no vibration, expected a displacement or velocity too")
         if self.window.band_hz[1] >= self.rate_hz / 2:
             raise ValueError(
                 f"window.band_hz ends at {self.window.band_hz[1]} Hz, above half of rate_hz {self.rate_hz}"

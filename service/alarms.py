@@ -9,9 +9,11 @@
       '--------------------------'          for off_delay  CLEARING ----------'
       '------------------------------------------------------'
 
-A window that could not be evaluated changes nothing: missing data neither raises nor clears.
+A window that could not be evaluated changes nothing: missing data neither raises nor clears, and an uncertain reading
+that is still large clears nothing either.
 """
 
+import math
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -128,7 +130,8 @@ class AlarmBook:
     def clock_stepped(self, time_ns: int) -> None:
         """Restart all running delays: the data's clock was set, so they cannot be measured across it."""
         for name, alarm in self._alarms.items():
-            self._alarms[name] = replace(alarm, since_ns=time_ns)
+            if alarm.state in {AlarmState.PENDING, AlarmState.CLEARING}:
+                self._alarms[name] = replace(alarm, since_ns=time_ns)
 
     def update(self, parameter: str, change: float, standard_error: float, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Judge one evaluated parameter of one window.
@@ -147,6 +150,8 @@ class AlarmBook:
         tuple of AlarmEvent
             None, or what operators should hear.
         """
+        if not (math.isfinite(change) and 0 < standard_error < math.inf):
+            return ()
         settings, limits = self._settings, self._settings.for_parameter(parameter)
         alarm = replace(
             self._alarms.get(parameter, Alarm(parameter, since_ns=time_ns)),
@@ -155,7 +160,7 @@ class AlarmBook:
         )
         size, z = abs(change), abs(change) / standard_error
         beyond = size > limits.raise_above and z > settings.raise_z
-        small = size < limits.clear_below or z < settings.clear_z
+        small = size < limits.clear_below
         lasted_s = (time_ns - alarm.since_ns) / 1e9
         kind = None
         match alarm.state:

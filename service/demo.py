@@ -293,7 +293,12 @@ def _interruptible() -> Iterator[None]:
 
 
 def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
+    """A free TCP port below the range from which the system takes ports for outgoing connections."""
+    while True:
+        port = 10_000 + int.from_bytes(os.urandom(2), "little") % 20_000
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", port))
+            except OSError:
+                continue
         return port

@@ -21,6 +21,10 @@ from models.signals.block import SampleBlock
 __all__ = ["Gate", "Reason", "Verdict"]
 
 
+_SURELY_S = 1.0
+"""A block that is next in sequence but later than this has a wrong time rather than a gap before it."""
+
+
 class Reason(StrEnum):
     """Why a block was refused."""
 
@@ -46,12 +50,15 @@ class Verdict:
     text : str
         A sentence naming machine, field, value and expectation; empty if there is nothing to say.
     gap_s : float
-        Seconds of data missing before an accepted block (0 = contiguous; negative after a clock set back).
+        Seconds of data missing before an accepted block (0 = contiguous).
+    clock_step_s : float
+        Seconds by which the data's clock was set before this block, either way.
     """
 
     reason: Reason | None = None
     text: str = ""
     gap_s: float = 0.0
+    clock_step_s: float = 0.0
 
     @property
     def accepted(self) -> bool:
@@ -185,6 +192,13 @@ class Gate:
                 f"start_ns {block.start_ns} of block {block.sequence} lies {late_s:.6g} s ahead, expected at most "
                 f"{self._settings.max_jump_s:g} s; believed if the clock stays there",
             )
+        if block.run == expected.run and block.sequence == expected.sequence and late_s > _SURELY_S:
+            return self._resynchronise(
+                block,
+                Reason.FUTURE,
+                f"start_ns {block.start_ns} lies {late_s:.6g} s ahead although block {block.sequence} is the next one; "
+                "believed if the clock stays there",
+            )
         what = "the publisher restarted and " if block.run != expected.run else ""
         missed = block.sequence - expected.sequence if block.run == expected.run else 0
         blocks = f" ({missed} blocks)" if missed > 0 else ""
@@ -208,7 +222,9 @@ class Gate:
         previous = self._expected
         step_s = 0.0 if previous is None else (block.start_ns - previous.start_ns) / 1e9
         self._follow(block)
-        return Verdict(text=f"{self._name}: the stream's clock stepped by {step_s:.6g} s; following it", gap_s=step_s)
+        return Verdict(
+            text=f"{self._name}: the stream's clock stepped by {step_s:.6g} s; following it", clock_step_s=step_s
+        )
 
     def _follow(self, block: SampleBlock) -> None:
         self._expected = _Expected(block.run, block.sequence + 1, block.end_ns)

@@ -184,7 +184,7 @@ class MachineMonitor:
             return MonitorReport(verdict)
         if not verdict.continuous:
             self._window.gap()
-        if verdict.gap_s < 0:
+        if verdict.clock_step_s:
             self._window.clear()
             self._alarms.clock_stepped(block.start_ns)
         windows: list[WindowReport] = []
@@ -208,7 +208,7 @@ class MachineMonitor:
         elif verdict.continuous:
             self._quality = replace(quality, accepted=quality.accepted + 1)
         else:
-            missing_s = quality.missing_s + max(0.0, verdict.gap_s)
+            missing_s = quality.missing_s + verdict.gap_s
             self._quality = replace(
                 quality,
                 accepted=quality.accepted + 1,

@@ -16,6 +16,12 @@ from models.physics.parameters import PARAMETERS
 
 __all__ = ["Evaluation", "WindowEvaluator"]
 
+_VAGUE = 0.2
+"""A larger standard error is no longer one: the reading says nothing."""
+
+_PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}
+"""Plane in which a bearing parameter acts."""
+
 _STEADY = 0.05
 """Range of speed within a window, relative: what the changing 1x leaves behind then stays next to the excluded line."""
 
@@ -78,18 +84,16 @@ class WindowEvaluator:
                 f"{self._machine.site}/{self._machine.name}: speed went from {slowest * 30 / np.pi:.0f} to "
                 f"{fastest * 30 / np.pi:.0f} rpm within the window, evaluated is a steady speed (± {_STEADY / 2:.1%})"
             )
-        estimate = self._likelihood.fit(window)
+        try:
+            estimate, equations = self._likelihood.fit(window), self._equations(window)
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(f"{self._machine.site}/{self._machine.name}: {error} in this window") from error
         values = {
             name: (float(change), float(error))
             for name, change, error in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
         }
-        parameters = tuple(
-            ParameterReading(name, "likelihood", *values[name])
-            if name in values
-            else ParameterReading(name, "likelihood", reason="no phase reference")
-            for name in PARAMETERS
-        )
-        return Evaluation(parameters, self._equations(window), speed, estimate.misfit)
+        parameters = tuple(_reading(name, values.get(name), window.states) for name in PARAMETERS)
+        return Evaluation(parameters, equations, speed, estimate.misfit)
 
     def _equations(self, window: WindowStatistics) -> tuple[EquationReading, ...]:
         readings = []
@@ -100,3 +104,18 @@ class WindowEvaluator:
             else:
                 readings.append(read_equation(trained, window, self._machine))
         return tuple(readings)
+
+
+def _reading(name: str, value: tuple[float, float] | None, states: tuple[str, ...]) -> ParameterReading:
+    """The likelihood's reading of one parameter, or why these sensors do not determine it."""
+    plane = _PLANES.get(name)
+    if value is None:
+        return ParameterReading(name, "likelihood", reason="no phase reference")
+    if plane is not None and not any(state.startswith(plane) for state in states):
+        return ParameterReading(name, "likelihood", reason=f"no displacement or velocity measured in {plane}")
+    change, error = value
+    if not error < _VAGUE:
+        return ParameterReading(
+            name, "likelihood", reason=f"not determined in this window (standard error {error:.0%})"
+        )
+    return ParameterReading(name, "likelihood", change, error)

@@ -98,7 +98,7 @@ class Report(BaseModel):
     filled: float = Field(description="fraction of a full window", examples=[1.0])
     speed_rad_s: float | None = Field(description="mean speed in the window", examples=[138.23])
     misfit: float | None = Field(
-        description="power beyond what the fitted theory says, relative; 0 is none", examples=[0.004]
+        description="power beyond what the fitted theory says, relative; not calibrated yet", examples=[0.64]
     )
     parameters: tuple[Parameter, ...] = Field(description="what the alarms are decided on")
     equations: tuple[Equation, ...] = Field(description="the networks' opinion, equation by equation")
@@ -192,7 +192,9 @@ class Health(BaseModel):
     window_start_ns: int | None = Field(description="oldest data of the latest window", examples=[_NS - 60_000_000_000])
     window_end_ns: int | None = Field(description="end of the latest window", examples=[_NS])
     speed_rad_s: float | None = Field(description="mean speed in the latest window", examples=[138.23])
-    misfit: float | None = Field(description="power beyond what the fitted theory says, relative", examples=[0.004])
+    misfit: float | None = Field(
+        description="power beyond what the fitted theory says, relative; not calibrated yet", examples=[0.64]
+    )
     parameters: tuple[Parameter, ...] = Field(description="parameters in the latest window")
     equations: tuple[Equation, ...] = Field(description="equations in the latest window")
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")

@@ -102,7 +102,7 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     changes = {
         name: float(rng.uniform(-draw.spread, draw.spread)) for name in PARAMETERS if name not in draw.kept_nominal
     } | draw.faults
-    tolerance = min(0.2, machine.operation.speed_tolerance)
+    tolerance = machine.operation.speed_tolerance
     speed_rpm = machine.operation.speed_rpm * float(rng.uniform(1 - tolerance, 1 + tolerance))
     cutoff_hz = float(rng.uniform(*condition.cutoff_hz))
     layout = Layout(int(rng.integers(2))) if draw.layout is None else draw.layout

@@ -13,7 +13,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -40,8 +40,8 @@ class HealthyEntry(BaseModel):
 
     windows: int = Field(ge=1)
     msd: float = Field(ge=0)
-    z_scale: tuple[float, ...]
-    spread: tuple[float, ...]
+    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...]
+    spread: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
 
 
 class EquationEntry(BaseModel):
@@ -189,6 +189,9 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
             f"{directory}/weights.safetensors: sha256 is {digest[:12]}…, "
             f"the manifest says {manifest.weights_sha256[:12]}…"
         )
+    numbers = [entry.number for entry in manifest.equations]
+    if len(set(numbers)) < len(numbers):
+        raise BundleError(f"{directory}: an equation occurs twice: {', '.join(numbers)}")
     differences = list(_differences(manifest.physics, _physics(machine)))
     if differences:
         raise BundleError(
@@ -215,6 +218,7 @@ def _network(
         ("inputs", entry.inputs, equation.input_names),
         ("parameters", entry.parameters, equation.parameters),
         ("hidden", entry.hidden, HIDDEN),
+        ("lengths of z_scale and spread", _lengths(entry.healthy), (len(entry.parameters),) * 2),
     )
     for field, found, expected in checks:
         if found != expected:
@@ -227,9 +231,15 @@ def _network(
         if array is None or array.shape != shapes[name] or array.dtype != np.float64 or not np.isfinite(array).all():
             state = "missing" if array is None else f"{array.dtype}{array.shape}"
             raise BundleError(f"{where}: weight {name} is {state}, expected finite float64{shapes[name]}")
+        if name == "input_scale" and not np.all(array > 0):
+            raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
         parts.append(array)
     healthy = Healthy(entry.healthy.windows, entry.healthy.msd, entry.healthy.z_scale, entry.healthy.spread)
     return EquationNetwork(equation, Network(*parts), healthy)
+
+
+def _lengths(healthy: HealthyEntry) -> tuple[int, int]:
+    return len(healthy.z_scale), len(healthy.spread)
 
 
 def _differences(trained: Any, present: Any, path: str = "") -> list[str]:

@@ -27,6 +27,10 @@ _AVERAGES_PER_SEGMENT = 0.53
 segments (|ρ|² = 1/36) and bins (|ρ|² = 4/9, 1/36)."""
 
 _COLD_STEPS, _WARM_STEPS = 200, 20
+_MOST_MISFIT = 10.0
+"""Healthy and changed machines read 0.2 to 5; dead, clipped or doubled channels above 40."""
+_MOST_LOG_RATIO = float(np.log(5))
+"""No stiffness or damping is believed to have changed by more than a factor of five within the model."""
 _SYNCHRONOUS_BINS = 3
 
 _TIME_OVERLAP = 0.947
@@ -64,8 +68,7 @@ class LikelihoodEstimate:
 class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
-    The state kept between windows is only the starting point; the result does not depend on it beyond the convergence
-    tolerance.
+    The state kept between windows is only the starting point.
 
     Parameters
     ----------
@@ -93,6 +96,9 @@ class LikelihoodFit:
         keep = self._usable_bins(window)
         observed = window.spectrum[keep]
         power = np.einsum("fii->i", observed).real / observed.shape[0]
+        twins = _twins(window.states, observed)
+        if twins:
+            raise EstimationError(f"{self._machine.name}: channels {' and '.join(twins)} carry the same signal")
         dead = _dead(window.states, power)
         if dead:
             raise EstimationError(
@@ -120,12 +126,20 @@ class LikelihoodFit:
         n = len(STRUCTURAL)
         ratio = np.exp(theta[:n])
         change = np.asarray(ratio - 1, dtype=np.float64)
-        deviation = np.asarray(ratio * np.sqrt(np.diag(covariance)[:n]), dtype=np.float64)
+        # A search that has not converged adds the step it would still take to the uncertainty.
+        deviation = np.asarray(ratio * np.sqrt(np.diag(covariance)[:n] + found.remaining**2), dtype=np.float64)
         names: tuple[str, ...] = STRUCTURAL
         if window.synchronous is not None:
             e, e_error = self._eccentricity(model, theta, covariance[:n, :n], window, speed)
             names, change, deviation = (*names, "e"), np.append(change, e), np.append(deviation, e_error)
-        return LikelihoodEstimate(names, change, deviation, steps, _misfit(model.at(theta, speed).S, observed, window))
+        misfit = _misfit(model.at(theta, speed).S, observed, window)
+        if misfit > _MOST_MISFIT or np.any(np.abs(theta[:n]) > _MOST_LOG_RATIO):
+            self.reset()
+            raise EstimationError(
+                f"{self._machine.name}: the theory does not explain this window (misfit {misfit:.3g}, at most "
+                f"{_MOST_MISFIT:g} is evaluated): a sensor is at fault, or something outside the model has changed"
+            )
+        return LikelihoodEstimate(names, change, deviation, steps, misfit)
 
     def _usable_bins(self, window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
         """All bins but the neighbourhood of the rotation: what is left of its line there is not stochastic."""
@@ -209,14 +223,27 @@ class LikelihoodFit:
         g2, q2 = np.concatenate([g.real, g.imag]), np.concatenate([q.real, q.imag])
         weight = np.linalg.solve(total, g2)
         precision = float(weight @ g2)
+        if not precision > 0:
+            raise EstimationError(f"{self._machine.name}: the spectrum at the speed of rotation is not determined")
         return float(weight @ q2) / precision - 1, precision**-0.5
 
 
+def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:
+    """Two states whose difference is nothing but rounding; empty if there are none."""
+    cross = observed.real.mean(axis=0)
+    power = np.diag(cross)
+    for i, first in enumerate(states):
+        for j in range(i):
+            if power[i] + power[j] - 2 * cross[i, j] < 1e-9 * power[i]:
+                return states[j], first
+    return ()
+
+
 def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
-    """States without fluctuation: a million times less than another one of their kind, which is rounding."""
+    """States without fluctuation: a thousand times less than another one of their kind."""
     rates = np.array([name.endswith("_dot") for name in states])
     largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
-    return [name for name, dead in zip(states, ~(power > 1e-12 * largest), strict=True) if dead]
+    return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]
 
 
 def _misfit(S: ComplexArray, observed: ComplexArray, window: WindowStatistics) -> float:

@@ -36,15 +36,16 @@ class Maximum:
         Log-likelihood there, up to a constant.
     steps : int
         Steps tried.
-    converged : bool
-        Whether it is the maximum.
+    remaining : ndarray, shape (n_diagnosed,)
+        Step of the diagnosed parameters that the search would still take; a small part of a standard error if it has
+        converged.
     """
 
     theta: FloatArray
     information: FloatArray
     value: float
     steps: int
-    converged: bool
+    remaining: FloatArray
 
 
 class FisherScoring:
@@ -92,8 +93,8 @@ class FisherScoring:
         gradient, information = self._scores(theta)
         steps = 0
         while True:
-            converged = self._is_near(gradient, information)
-            if converged or steps == most_steps:
+            full_step: FloatArray = np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
+            if steps == most_steps or self._is_near(full_step, gradient, information):
                 break
             steps += 1
             damped = information + damping * np.diag(np.diag(information))
@@ -109,10 +110,9 @@ class FisherScoring:
                 break
             else:
                 damping *= 8
-        return Maximum(theta, information, value, steps, converged)
+        return Maximum(theta, information, value, steps, full_step[: self._model.cutoff_at])
 
-    def _is_near(self, gradient: FloatArray, information: FloatArray) -> bool:
-        step = np.linalg.solve(information, gradient)
+    def _is_near(self, step: FloatArray, gradient: FloatArray, information: FloatArray) -> bool:
         diagnosed = slice(self._model.cutoff_at)
         variance = np.diag(np.linalg.inv(information))[diagnosed]
         return bool(np.all(step[diagnosed] ** 2 < _NEAR**2 * variance) and gradient @ step / 2 < _GAIN)

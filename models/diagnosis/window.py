@@ -157,24 +157,24 @@ class SlidingWindow:
             End time of a hop that became complete and is in the window now. A long block may complete several: ask for
             the statistics between them, and take all, or the rest of the block is lost.
         """
-        if not self._pending:
-            self._pending_start_ns = start_ns
+        # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
+        self._pending_start_ns = start_ns - round(self._pending_samples * 1e9 / self.plan.rate_hz)
         self._pending.append(samples)
         self._pending_samples += samples.shape[0]
         need = self.plan.preamble + self.plan.hop
         while self._pending_samples >= need:
             buffer = np.concatenate(self._pending)
-            end_ns = self._complete(buffer[:need])
-            rest = buffer[self.plan.hop :]
+            first_ns, rest = self._pending_start_ns, buffer[self.plan.hop :]
             self._pending = [rest]
             self._pending_samples = rest.shape[0]
             self._pending_start_ns += round(self.plan.hop * 1e9 / self.plan.rate_hz)
-            yield end_ns
+            yield self._complete(buffer[:need], first_ns)
 
-    def _complete(self, samples: FloatArray) -> int:
-        if self._level is None:
-            self._level = samples[:, : len(self.plan.states)].mean(axis=0)
-        start_ns = self._pending_start_ns + round(self.plan.preamble * 1e9 / self.plan.rate_hz)
+    def _complete(self, samples: FloatArray, first_ns: int) -> int:
+        if self._level is None or not self._hops:
+            # The median: one wild sample must not become the level of everything that follows.
+            self._level = np.median(samples[:, : len(self.plan.states)], axis=0)
+        start_ns = first_ns + round(self.plan.preamble * 1e9 / self.plan.rate_hz)
         hop = hop_moments(self.plan, samples, self._level, start_ns)
         while self._hops and hop.end_ns - self._hops[0].start_ns > self.plan.max_span_ns:
             self._hops.popleft()
@@ -187,7 +187,7 @@ class SlidingWindow:
         self._pending_samples = 0
 
     def clear(self) -> None:
-        """Forget everything but the reference level."""
+        """Forget everything."""
         self.gap()
         self._hops.clear()
 

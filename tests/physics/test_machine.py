@@ -41,6 +41,7 @@ def test_shipped_machines_have_the_documented_modes() -> None:
         ('unit = "um"', 'unit = "furlong"', "furlong"),
         ('name = "lab"', 'name = "la/b"', "'la/b' cannot be part of a key"),
         ("hop_s = 5.0", "hop_s = 7.0", "multiple of hop_s"),
+        ("band_hz = [3.0, 150.0]", "band_hz = [3.0, 3.1]", "expected at least 20"),
         ("on_delay_s = 60.0", "on_delay_s = -1.0", "alarms.on_delay_s"),
         ('name = "z1"', 'name = "y1"', "channel name occurs twice: y1"),
         ("[rotor]", "[rotor", "not a TOML file"),

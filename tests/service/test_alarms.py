@@ -56,10 +56,11 @@ def test_a_change_must_exceed_its_own_uncertainty() -> None:
     assert "^" in play("xxxxxxxx", error=0.039)[0]
 
 
-def test_a_large_uncertain_change_clears_an_alarm_only_when_it_is_insignificant() -> None:
+@pytest.mark.parametrize("error", [0.05, 0.15, 0.0, float("inf"), float("nan")])
+def test_a_large_change_clears_no_alarm_however_uncertain_it_is(error: float) -> None:
     _, book, _ = play("xxx")
     for number in range(3, 10):
-        book.update("k_by", -0.2, 0.05, number * 5_000_000_000)  # 4 standard errors: above clear_z
+        assert not book.update("k_by", -0.2, error, number * 5_000_000_000)
     assert book.alarms[0].state is AlarmState.ACTIVE
 
 

@@ -34,7 +34,7 @@ def test_contiguous_blocks_are_accepted_silently() -> None:
 
 
 def test_jitter_within_the_tolerance_is_no_gap() -> None:
-    assert judge(block(0), block(1, shift_ns=400_000), block(2))[1:] == [Verdict(), Verdict()]
+    assert judge(block(0), block(1, shift_ns=150_000), block(2))[1:] == [Verdict(), Verdict()]
 
 
 def not_finite(value: float) -> SampleBlock:
@@ -101,8 +101,24 @@ def test_a_stepped_clock_is_believed_after_ten_blocks_that_agree(shift_s: int, r
     verdicts = judge(block(0), *stepped)[1:]
     assert [verdict.reason for verdict in verdicts] == [reason] * 9 + [None] * 3
     assert "clock stepped" in verdicts[9].text
-    assert verdicts[9].gap_s == pytest.approx(shift_s + 0.9)
+    assert verdicts[9].clock_step_s == pytest.approx(shift_s + 0.9)
+    assert verdicts[9].gap_s == 0.0  # nothing is missing: the clock was set
     assert verdicts[10].continuous
+
+
+def test_one_wild_time_among_good_blocks_costs_one_block() -> None:
+    wild = block(1, shift_ns=1000 * 10**9)
+    verdicts = judge(block(0), wild, block(2), block(3))
+    assert verdicts[1].reason is Reason.FUTURE
+    assert "is the next one" in verdicts[1].text
+    assert verdicts[2].gap_s == pytest.approx(0.1)
+    assert verdicts[3].continuous
+
+
+def test_a_lost_sample_is_a_gap() -> None:
+    verdict = judge(block(0), block(1, shift_ns=500_000))[1]
+    assert verdict.accepted
+    assert verdict.gap_s == pytest.approx(0.0005)
 
 
 def test_scattered_wild_times_never_move_the_clock() -> None:

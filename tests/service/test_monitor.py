@@ -116,7 +116,7 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
     windows, events = feed(MachineMonitor(machine, None), stream_)
     assert windows[-1].state is HealthState.NOT_EVALUABLE
-    assert "speed is 2000 rpm, evaluated are 1320 rpm ± 25%" in windows[-1].reason
+    assert "speed is 2000 rpm, evaluated are 1320 rpm ± 20%" in windows[-1].reason
     assert windows[-1].parameters == ()
     assert not events
 
@@ -134,11 +134,13 @@ def test_an_unsteady_speed_is_not_evaluable() -> None:
     assert not events
 
 
-@pytest.mark.parametrize("kind", ["stuck angle", "backwards", "constant channel", "twins", "huge", "clipped"])
-def test_sick_channels_never_stop_the_monitor_and_never_raise_an_alarm_by_crashing(kind: str) -> None:
+@pytest.mark.parametrize("kind", ["stuck angle", "backwards", "constant channel", "dead probe", "twins", "clipped"])
+def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
     target = monitor()
     seen: list[WindowReport] = []
-    for block in stream("healthy", 71.0):
+    events: list[AlarmEvent] = []
+    rng = np.random.default_rng(1)
+    for block in stream("healthy", 131.0):  # two windows: long enough for an alarm
         samples = block.samples.copy()
         match kind:
             case "stuck angle":
@@ -149,17 +151,38 @@ def test_sick_channels_never_stop_the_monitor_and_never_raise_an_alarm_by_crashi
                 samples[:, 3] = 0.5
             case "twins":
                 samples[:, 4] = samples[:, 5]
-            case "huge":
-                samples[:, :8] *= 1e12
+            case "dead probe":
+                samples[:, 5] = 0.01 * rng.standard_normal(samples.shape[0])
             case "clipped":
                 samples[:, 4] = np.clip(samples[:, 4], -1e-3, 1e-3)
         report = target.step(replace(block, samples=samples))
         assert report.verdict.accepted
         seen += report.windows
-    assert len(seen) == 14
-    if kind in {"stuck angle", "backwards", "constant channel"}:
-        assert {window.state for window in seen[11:]} == {HealthState.NOT_EVALUABLE}
-        assert all(window.reason for window in seen[11:])
+        events += report.events
+    assert len(seen) == 26
+    assert not events
+    assert {window.state for window in seen[11:]} == {HealthState.NOT_EVALUABLE}
+    assert all(window.reason for window in seen[11:])
+
+
+def test_parameters_that_the_sensors_cannot_see_are_not_read() -> None:
+    _, machine = load_scenario("healthy")
+    horizontal = [column for column, sensor in enumerate(machine.sensors) if sensor.direction != "z"]
+    part = machine.model_copy(update={"sensors": tuple(machine.sensors[column] for column in horizontal)})
+    blocks_ = [replace(block, samples=block.samples[:, horizontal]) for block in stream("healthy", 62.0)]
+    window = feed(MachineMonitor(part, None), blocks_)[0][-1]
+    readings = {reading.name: reading for reading in window.parameters}
+    assert readings["k_bz"].change is None
+    assert readings["k_bz"].reason == "no displacement or velocity measured in z"
+    assert abs(readings["k_by"].change or 1.0) < 0.1
+
+
+def test_one_wild_sample_does_not_blind_the_monitor() -> None:
+    everything = stream("healthy", 131.0)
+    everything[0].samples[50, 0] = 1e30
+    windows, events = feed(monitor(), everything)
+    assert windows[-1].state is HealthState.HEALTHY
+    assert not events
 
 
 def test_without_a_bundle_the_equations_say_so() -> None:
