@@ -1,6 +1,5 @@
 """The HTTP API over what the service knows; read only. ``docs/api.md`` lists the routes."""
 
-import html
 from collections.abc import Awaitable, Callable, Sequence
 from http import HTTPStatus
 from typing import Annotated, Any, Protocol
@@ -13,6 +12,7 @@ from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 
 from service.logs import logger
+from service.page import front_page
 from service.schemas import (
     AlarmCloudEvent,
     AlarmStates,
@@ -192,25 +192,7 @@ def _add_service_routes(app: FastAPI, service: ServiceView) -> None:
     @app.get("/", include_in_schema=False, response_class=HTMLResponse)
     def page() -> str:
         """Serve a plain page for people."""
-        rows = "".join(_row(machine.description()) for machine in service.machines())
-        return (
-            '<!doctype html><html lang="en"><meta charset="utf-8"><title>rotorwatch</title>'
-            "<h1>rotorwatch</h1><table><thead><tr><th>machine<th>state<th>description<th></thead>"
-            f'<tbody>{rows}</tbody></table><p><a href="/openapi.json">API description (OpenAPI)</a>, '
-            '<a href="/readyz">readiness</a></p></html>'
-        )
-
-
-def _row(machine: MachineDescription) -> str:
-    place = f"/api/v1/machines/{machine.site}/{machine.machine}"
-    links = ", ".join(
-        f'<a href="{place}/{what}">{what}</a>' for what in ("health", "reports", "alarms", "alarms/events")
-    )
-    name = html.escape(f"{machine.site}/{machine.machine}")
-    return (
-        f'<tr><td><a href="{place}">{name}</a><td>{html.escape(machine.state)}'
-        f"<td>{html.escape(machine.description)}<td>{links}</tr>"
-    )
+        return front_page(tuple(machine.health() for machine in service.machines()))
 
 
 def _find(service: ServiceView, site: str, name: str) -> MachineView:

@@ -1,5 +1,6 @@
 """The HTTP API of a running service that has seen a fault: real server, real session, real evaluation."""
 
+import re
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
@@ -149,7 +150,11 @@ def test_page_for_people_needs_nothing_from_elsewhere(client: httpx.Client) -> N
     answer = client.get("/")
     assert answer.headers["content-type"] == "text/html; charset=utf-8"
     assert "demo/lab" in answer.text
-    assert "alert" in answer.text
+    assert 'class="alert">alert</span>' in answer.text
+    assert re.search(
+        r'class="raised"><td>bearing stiffness, horizontal \(k_by\)<td class="number">-3\d\.\d%', answer.text
+    )
+    assert "bearing damping, vertical (c_bz)" in answer.text
     assert 'href="/openapi.json"' in answer.text
     assert "//" not in answer.text
     for path in ("/docs", "/redoc"):
