@@ -169,7 +169,14 @@ class Feed:
 
     def put_raw(self, payload: bytes, attachment: bytes, encoding: str) -> None:
         """Publish bytes."""
-        self.session.put(self.machine.keys.stream, payload, attachment=attachment or None, encoding=encoding)
+        self.session.put(
+            self.machine.keys.stream,
+            payload,
+            attachment=attachment or None,
+            encoding=encoding,
+            # The sender must not drop on a busy computer: what is lost shall be lost where the test looks.
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
 
     def put_good(self) -> None:
         """Publish the next good block and go on to the one after it."""
