@@ -44,6 +44,7 @@ __all__ = [
     "service",
     "settings",
     "until",
+    "until_subscribed",
 ]
 
 ROOT = Path(__file__).parents[2]
@@ -76,6 +77,13 @@ def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> 
         time.sleep(0.01)
 
 
+def until_subscribed(session: zenoh.Session, key: str) -> None:
+    """Wait until what is put on a key is heard: a subscriber's declaration takes its time to arrive."""
+    probe = session.declare_publisher(key)
+    until(lambda: bool(probe.matching_status.matching), f"subscriber of {key}")  # type: ignore[attr-defined]  # the stub says bool
+    probe.undeclare()  # type: ignore[no-untyped-call]
+
+
 @contextmanager
 def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iterator[zenoh.Session]:
     """A session beside a service that subscribes to the lab machine; what it puts is heard from the beginning."""
@@ -83,9 +91,7 @@ def open_session(connect: str, mode: Literal["peer", "client"] = "peer") -> Iter
     for path, value in LinkSettings(mode=mode, connect=(connect,)).zenoh_items().items():
         config.insert_json5(path, value)
     with zenoh.open(config) as session:
-        probe = session.declare_publisher(LAB.keys.stream)
-        until(lambda: bool(probe.matching_status.matching), "subscriber")  # type: ignore[attr-defined]  # the stub says bool
-        probe.undeclare()  # type: ignore[no-untyped-call]
+        until_subscribed(session, LAB.keys.stream)
         yield session
 
 

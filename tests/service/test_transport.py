@@ -13,7 +13,17 @@ from models.signals.link import LinkSettings
 from service.inbox import Inbox, RawBlock
 from service.schemas import AlarmStates, Health
 from service.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
-from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, send, service, until
+from tests.service.live import (
+    LAB,
+    Feed,
+    endpoint,
+    open_session,
+    scenario_blocks,
+    send,
+    service,
+    until,
+    until_subscribed,
+)
 
 KEYS = LAB.keys
 
@@ -202,7 +212,7 @@ def query(session: zenoh.Session, key: str) -> str:
 def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
     address = endpoint()
     messages: list[TopicMessage] = []
-    with machine_link(address, ignore) as (_, declared):
+    with machine_link(address, ignore) as (opened, declared):
         declared.publish_health('{"number": 1}')
         declared.publish_health('{"number": 2}')
         declared.publish_alarm_state('{"number": 3}')
@@ -215,6 +225,8 @@ def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
                 (KEYS.health, '{"number": 2}'),
                 (KEYS.alarm_state, '{"number": 3}'),
             }
+            for key in (KEYS.alarm_event, KEYS.report):
+                until_subscribed(opened.session, key)
             declared.publish_alarm_event('{"number": 4}')
             declared.publish_report('{"number": 5}')
             until(lambda: len(messages) == 4, "live messages")
