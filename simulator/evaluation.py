@@ -17,6 +17,8 @@ from models.diagnosis.bundle import Bundle
 from models.diagnosis.likelihood import LikelihoodFit
 from models.diagnosis.networks import read_equation
 from models.diagnosis.readings import ParameterReading
+from models.diagnosis.spectral_model import STRUCTURAL
+from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.parameters import PARAMETERS
 from simulator.campaign import Draw, Layout, Purpose, simulate_window
@@ -52,6 +54,7 @@ class Reading(BaseModel):
 
     by: str
     parameter: str
+    not_evaluable: int
     truth: float
     median: float
     spread: float
@@ -131,18 +134,27 @@ def evaluate_cell(
 
 def _read_window(draw: Draw, bundle: Bundle, number: int) -> tuple[ParameterReading, ...]:
     window = simulate_window(draw, number)
-    estimate = LikelihoodFit(draw.machine).fit(window)
-    readings = [
-        ParameterReading(name, "likelihood", float(change), float(error))
-        for name, change, error in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
-    ]
+    try:
+        estimate = LikelihoodFit(draw.machine).fit(window)
+    except EstimationError as error:  # a refused window is a result: it is counted
+        readings = [ParameterReading(name, "likelihood", reason=str(error)) for name in (*STRUCTURAL, "e")]
+    else:
+        readings = [
+            ParameterReading(name, "likelihood", float(change), float(deviation))
+            for name, change, deviation in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
+        ]
     for network in bundle.networks:
         readings += read_equation(network, window, draw.machine).parameters
     return tuple(readings)
 
 
 def _summary(readings: list[ParameterReading], faults: dict[str, float], threshold: float) -> Reading:
+    """Summarise one parameter over the evaluated windows; rates are of those."""
     truth = faults.get(readings[0].name, 0.0)
+    refused = sum(reading.change is None for reading in readings)
+    if refused == len(readings):
+        raise EstimationError(f"no window of a cell could be evaluated: {readings[0].reason}")
+    readings = [reading for reading in readings if reading.change is not None]
     change = np.array([reading.change for reading in readings], dtype=np.float64)
     error = np.array([reading.standard_error for reading in readings], dtype=np.float64)
     median = float(np.median(change))
@@ -150,6 +162,7 @@ def _summary(readings: list[ParameterReading], faults: dict[str, float], thresho
     return Reading(
         by=readings[0].by,
         parameter=readings[0].name,
+        not_evaluable=refused,
         truth=truth,
         median=median,
         spread=float(1.4826 * np.median(np.abs(change - median))),
