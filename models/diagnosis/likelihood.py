@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import digamma
 
 from models.diagnosis.moments import ComplexArray
+from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.scoring import FisherScoring, Maximum
 from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel
 from models.diagnosis.window import WindowStatistics
@@ -80,6 +81,22 @@ class LikelihoodFit:
         self._machine = machine
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
         self._last: FloatArray | None = None
+
+    @property
+    def by(self) -> str:
+        """Name under which it is reported."""
+        return "likelihood"
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        """Judge one window; raises EstimationError if nothing can be said."""
+        estimate = self.fit(window)
+        readings = tuple(
+            ParameterReading(name, self.by, float(change), float(error))
+            for name, change, error in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
+        )
+        return Diagnosis(
+            self.by, readings, covariance=np.diag(estimate.standard_error**2), misfit_z=0.0, steps=estimate.steps
+        )
 
     def reset(self) -> None:
         """Start the next window cold."""

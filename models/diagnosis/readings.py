@@ -1,8 +1,14 @@
 """What a diagnostician says about a window: readings of parameters and of equations, or why there are none."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
-__all__ = ["EquationReading", "ParameterReading"]
+import numpy as np
+
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+__all__ = ["Diagnosis", "Diagnostician", "EquationReading", "ParameterReading"]
 
 _Z95 = 1.959964
 
@@ -16,7 +22,7 @@ class ParameterReading:
     name : str
         One of ``models.physics.parameters.PARAMETERS``.
     by : str
-        Who says so: ``likelihood`` or ``network``.
+        Who says so: ``likelihood``, ``network`` (amortised) or ``relation``.
     change, standard_error : float or None
         Relative change from nominal and its standard error; None if not evaluable.
     reason : str
@@ -76,3 +82,63 @@ class EquationReading:
     def evaluable(self) -> bool:
         """Whether the equation was evaluated."""
         return not self.reason
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """One diagnostician's opinion of one window.
+
+    Attributes
+    ----------
+    by : str
+        Who: ``likelihood``, ``network``, ``relation`` or ``paper``.
+    parameters : tuple of ParameterReading
+        The parameters it speaks of, evaluable or with the reason why not.
+    equations : tuple of EquationReading
+        The equations it evaluated; empty for the likelihood.
+    covariance : ndarray, shape (m, m), or None
+        Covariance of the m evaluable `parameters`' changes, in their order; None where a diagnostician knows only
+        single standard errors.
+    misfit_z : float or None
+        Over-identification: how far the window is from anything the model can explain, standard normal where the model
+        holds; None where the diagnostician has no such test.
+    steps : int
+        Search steps it took (0 where there is no search).
+    """
+
+    by: str
+    parameters: tuple[ParameterReading, ...] = ()
+    equations: tuple[EquationReading, ...] = ()
+    covariance: FloatArray | None = None
+    misfit_z: float | None = None
+    steps: int = 0
+
+    @property
+    def evaluable(self) -> tuple[ParameterReading, ...]:
+        """The parameters with a reading, in the order of `covariance`."""
+        return tuple(reading for reading in self.parameters if reading.change is not None)
+
+    @property
+    def full_covariance(self) -> FloatArray:
+        """`covariance`, or the diagonal of the squared standard errors where there is none."""
+        if self.covariance is not None:
+            return self.covariance
+        errors = [reading.standard_error for reading in self.evaluable]
+        return np.diag(np.square(np.array(errors, dtype=np.float64)))
+
+
+class Diagnostician(Protocol):
+    """Looks at one window after the other and says which parameter changed, by how much, and how sure."""
+
+    @property
+    def by(self) -> str:
+        """Name under which it is reported."""
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        """Judge one window.
+
+        Raises
+        ------
+        models.errors.EstimationError
+            If the window as a whole cannot be judged.
+        """
