@@ -2,9 +2,6 @@
 
 import json
 import os
-import platform
-from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +11,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -59,56 +55,12 @@ def train(
     Example: rotortrain train --machine lab --out lab-bundle
     """
     _one_thread_per_process()
+    from simulator.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
+
     try:
-        _train(machine, out, windows, seed, processes)
+        train_bundle(machine, out, windows, seed, processes)
     except RotorwatchError as error:
         _fail(error)
-
-
-def _train(name: str, out: Path, n_windows: int, seed: int, processes: int) -> None:
-    from models.diagnosis.bundle import Training, save_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
-    from models.diagnosis.equations import EQUATIONS, missing  # noqa: PLC0415
-    from models.diagnosis.training import calibrate, train_network  # noqa: PLC0415
-    from models.machine import load_machine  # noqa: PLC0415
-    from simulator.campaign import Draw, Purpose, windows, with_tilt  # noqa: PLC0415
-
-    machine = load_machine(name)
-    networks = []
-    with _progress() as bar:
-        for stream, equation in enumerate(EQUATIONS):
-            # Tilt is simulated where it is not measured: the same bundle serves the machine once it has tilt probes.
-            rig = with_tilt(machine) if missing(equation, machine.descriptor.states) else machine
-            absent = missing(equation, rig.descriptor.states)
-            if absent:
-                bar.console.print(f"({equation.number}) {equation.title}: left out, not measured: {', '.join(absent)}")
-                continue
-            label = f"({equation.number}) {equation.title}"
-            simulating = bar.add_task(f"{label}: simulating", total=n_windows + n_windows // 2)
-            simulated = partial(bar.advance, simulating)
-            training, calibration = (
-                list(
-                    windows(Draw(rig, seed, purpose, stream, equation.kept_nominal), range(count), processes, simulated)
-                )
-                for purpose, count in ((Purpose.TRAINING, n_windows), (Purpose.CALIBRATION, n_windows // 2))
-            )
-            fitting = bar.add_task(f"{label}: training", total=1.0)
-            trained = train_network(equation, training, rig, seed, partial(_complete, bar, fitting))
-            networks.append(calibrate(trained, calibration, rig))
-    versions = {name: version(name) for name in ("rotorwatch", "numpy", "torch")} | {
-        "python": platform.python_version()
-    }
-    made = Training(seed=seed, training_windows=n_windows, calibration_windows=n_windows // 2, versions=versions)
-    bundle = save_bundle(out, machine, tuple(networks), made)
-    table = Table(
-        "equation", "parameter", "healthy spread per window", "residual (MSD)", title=f"bundle {bundle.identity}"
-    )
-    for trained in networks:
-        if trained.healthy is not None:
-            for parameter, spread in zip(trained.equation.parameters, trained.healthy.spread, strict=True):
-                number = f"({trained.equation.number}) {trained.equation.title}"
-                table.add_row(number, parameter, f"{spread:.2%}", f"{trained.healthy.msd:.2g}")
-    Console().print(table)
-    typer.echo(f"written to {out}")
 
 
 @app.command()
@@ -224,10 +176,6 @@ def _one_thread_per_process() -> None:
     """Keep the linear algebra to one thread: the workers are processes. Takes effect before numpy is first imported."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-
-
-def _complete(bar: Progress, task: TaskID, done: float) -> None:
-    bar.update(task, completed=done)
 
 
 def _progress() -> Progress:
