@@ -246,7 +246,7 @@ def load_machine(name_or_path: str | Path) -> Machine:
     Parameters
     ----------
     name_or_path : str or Path
-        "lab" or "heavy" (shipped), or the path of a TOML file.
+        Name of a shipped machine ("lab", "heavy", "light"), or the path of a TOML file.
 
     Raises
     ------

@@ -8,6 +8,7 @@ import pytest
 
 from models.errors import MachineFileError
 from models.machine import Machine, load_machine
+from models.physics.lyapunov import synchronous_response
 from models.physics.matrices import system_A
 from models.physics.parameters import PARAMETERS, changed
 
@@ -24,11 +25,25 @@ def test_shipped_machines_have_the_documented_modes() -> None:
     for name, expected_hz in (
         ("lab", (28.2, 30.3, 90.1, 94.3, 472, 507)),
         ("heavy", (17.1, 18.4, 75.6, 92.6, 242, 254)),
+        ("light", (23.4, 27.4, 74.3, 97.5, 182.7, 227.8)),
     ):
         machine = load_machine(name)
         values = np.linalg.eigvals(system_A(machine.rotor, machine.operation.speed_rad_s))
         modes_hz = np.sort(np.abs(values[values.imag > 0])) / (2 * np.pi)
         np.testing.assert_allclose(modes_hz, expected_hz, rtol=0.005)
+
+
+def test_the_light_machine_is_damped_as_its_file_says() -> None:
+    machine = load_machine("light")
+    assert machine.rotor.EI_N_m2 == pytest.approx(1649, rel=1e-3)
+    values = np.linalg.eigvals(system_A(machine.rotor, machine.operation.speed_rad_s))
+    values = values[values.imag > 0]
+    values = values[np.argsort(np.abs(values))]
+    np.testing.assert_allclose(
+        -values.real / np.abs(values), np.array([0.67, 1.2, 8.1, 9.2, 2.5, 0.84]) / 100, rtol=0.03
+    )
+    q1, q2 = synchronous_response(machine.rotor, machine.operation.speed_rad_s)
+    np.testing.assert_allclose(np.hypot(q1, q2)[[0, 1]], [2.04e-6, 12.4e-6], rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +71,7 @@ def test_a_wrong_machine_file_is_refused_by_name(tmp_path: Path, old: str, new: 
 
 
 def test_a_missing_machine_file_names_the_shipped_ones(tmp_path: Path) -> None:
-    with pytest.raises(MachineFileError, match="shipped machines: heavy, lab"):
+    with pytest.raises(MachineFileError, match="shipped machines: heavy, lab, light"):
         load_machine(tmp_path / "none.toml")
 
 
