@@ -27,6 +27,8 @@ __all__ = ["Draw", "Layout", "Purpose", "draw_condition", "simulate_window", "wi
 
 _BLOCK_S = 5.0
 
+_REALISATION = 1
+
 
 class Purpose(IntEnum):
     """What a window is for; part of its seed."""
@@ -65,6 +67,9 @@ class Draw:
         Fixed relative changes on top.
     layout : Layout or None
         None draws one of them at random for each window.
+    fixed_condition : bool
+        All windows share the condition drawn for number 0; only the realisation of force and noise differs. The number
+        0 itself has another realisation than without.
     """
 
     machine: Machine
@@ -75,6 +80,7 @@ class Draw:
     spread: float = 0.3
     faults: dict[str, float] = field(default_factory=dict)
     layout: Layout | None = None
+    fixed_condition: bool = False
 
 
 def with_tilt(machine: Machine) -> Machine:
@@ -98,7 +104,7 @@ def with_tilt(machine: Machine) -> Machine:
 def draw_condition(draw: Draw, number: int) -> Scenario:
     """Draw the operating condition of one window: cutoff, layout, levels, speed, noise, and varying parameters."""
     machine, condition = draw.machine, draw.machine.condition
-    rng = np.random.default_rng([draw.seed, draw.purpose, draw.stream, number])
+    rng = _generator(draw, 0 if draw.fixed_condition else number)
     changes = {
         name: float(rng.uniform(-draw.spread, draw.spread)) for name in PARAMETERS if name not in draw.kept_nominal
     } | draw.faults
@@ -112,15 +118,21 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     sensors = Sensors(noise_relative=float(rng.uniform(*condition.noise_relative)), noise_corner_hz=corner_hz)
     events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in changes.items()]
     plan = plan_for(machine)
+    realisation = _generator(draw, number, _REALISATION) if draw.fixed_condition else rng
     return Scenario(
         name=f"draw {draw.purpose.name.lower()} {draw.stream}.{number}",
         machine=machine.name,
-        seed=int(rng.integers(2**62)),
+        seed=int(realisation.integers(2**62)),
         duration_s=(plan.preamble + plan.hops * plan.hop) / machine.rate_hz,
         sources=sources,
         sensors=sensors,
         events=(*events, Event(at_s=0, speed_rpm=speed_rpm)),
     )
+
+
+def _generator(draw: Draw, number: int, *topic: int) -> np.random.Generator:
+    """Random numbers of one window; a topic has numbers of its own, so that a new one leaves the others alone."""
+    return np.random.default_rng([draw.seed, draw.purpose, draw.stream, number, *topic])
 
 
 def _sources(layout: Layout, cutoff_hz: float, machine: Machine, rng: np.random.Generator) -> tuple[NamedSource, ...]:
