@@ -1,0 +1,164 @@
+"""Declared false-alarm rates, and the thresholds on standard normal test values that keep them.
+
+Per window, several parameters are tested at once. Per month, the same test is repeated at every hop on windows that
+overlap, so that neighbouring test values hang together: only a new crossing of the threshold is a new alarm.
+
+References
+----------
+D. Siegmund, Sequential Analysis (Springer, 1985), chapters IV and X; D. Siegmund and E. S. Venkatraman, "Using the
+generalized likelihood ratio statistic for sequential detection of a change-point", Annals of Statistics 23 (1995).
+"""
+
+import math
+from dataclasses import dataclass
+
+from scipy.optimize import brentq
+from scipy.special import ndtr, ndtri
+
+__all__ = ["MONTH_S", "Thresholds", "crossing_rate", "month_thresholds", "overshoot_correction", "window_thresholds"]
+
+MONTH_S = 30 * 86400.0
+"""The month of "false alarms per month", s."""
+
+_FURTHER = 0.25
+"""Share of the rate at which a parameter is wrongly added to one that is known to have changed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """What a test value must exceed, in standard errors.
+
+    Attributes
+    ----------
+    first : float
+        For the first changed parameter: this one carries the declared rate.
+    further : float
+        For every one more; larger, because a wrong name beside a right one misleads.
+    outside : float
+        For the over-identification test (one-sided), which has the declared rate to itself.
+    """
+
+    first: float
+    further: float
+    outside: float
+
+
+def _upper(probability: float) -> float:
+    """Point that a standard normal exceeds with this probability."""
+    return -float(ndtri(probability))
+
+
+def _shared(probability: float, tests: int) -> float:
+    """Probability for each of several tests that keeps `probability` for all of them (Šidák)."""
+    return -math.expm1(math.log1p(-probability) / tests)
+
+
+def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
+    """Thresholds of one window by itself.
+
+    Parameters
+    ----------
+    rate : float
+        Probability that a healthy window is called changed, over all parameters together, for example 0.01.
+    n_parameters : int
+        Parameters evaluated in it.
+
+    Raises
+    ------
+    ValueError
+        If the rate is not between 0 and 1, or there is no parameter.
+    """
+    if not 0 < rate < 1 or n_parameters < 1:
+        raise ValueError(f"rate is {rate} for {n_parameters} parameters, expected 0 < rate < 1 and at least one")
+    others = max(1, n_parameters - 1)
+    return Thresholds(
+        first=_upper(_shared(rate, n_parameters) / 2),
+        further=_upper(_shared(_FURTHER * rate, others) / 2),
+        outside=_upper(rate),
+    )
+
+
+def overshoot_correction(x: float) -> float:
+    """Siegmund's ν(x): how much rarer a crossing is when time goes in steps.
+
+    Parameters
+    ----------
+    x : float
+        Threshold times the standard deviation of one step; 0 is continuous time, where ν = 1.
+    """
+    if x < 1e-6:
+        return 1.0
+    density = math.exp(-(x**2) / 8) / math.sqrt(2 * math.pi)
+    distribution = float(ndtr(x / 2))
+    return (2 / x) * (distribution - 0.5) / (x / 2 * distribution + density)
+
+
+def crossing_rate(threshold: float, overlap: int) -> float:
+    """How often per hop a sliding window's test value newly exceeds a threshold, upwards only.
+
+    The test value of a window of `overlap` hops is a moving average of independent hops: its autocorrelation falls
+    linearly to zero over the window. For such a process the rate is b φ(b) μ ν(b √(2μ)) with μ = 1/overlap.
+
+    Parameters
+    ----------
+    threshold : float
+        b, in standard errors.
+    overlap : int
+        Hops in a window; 1 for windows that do not overlap.
+
+    Returns
+    -------
+    float
+        Crossings per hop; of -b the same number again.
+    """
+    tail = float(ndtr(-threshold))
+    if overlap <= 1:
+        return tail
+    density = math.exp(-(threshold**2) / 2) / math.sqrt(2 * math.pi)
+    rate = threshold * density / overlap * overshoot_correction(threshold * math.sqrt(2 / overlap))
+    return min(rate, tail)
+
+
+def month_thresholds(
+    per_month: float, hop_s: float, overlap: int, n_parameters: int, n_stretches: int = 1
+) -> Thresholds:
+    """Thresholds of a sliding window that is tested at every hop.
+
+    Parameters
+    ----------
+    per_month : float
+        Expected number of false alarms of the machine in 30 days of data.
+    hop_s : float
+        Data time between tests, s.
+    overlap : int
+        Hops in the window.
+    n_parameters : int
+        Parameters evaluated.
+    n_stretches : int
+        Windows of different lengths tested side by side; each gets an equal share of the rate.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive, or the rate is so large that no threshold would be needed.
+    """
+    if min(per_month, hop_s) <= 0 or min(overlap, n_parameters, n_stretches) < 1:
+        raise ValueError(
+            f"{per_month} per month, hop {hop_s} s, {overlap} hops, {n_parameters} parameters, {n_stretches} stretches:"
+            " expected positive numbers"
+        )
+    per_hop = per_month * hop_s / MONTH_S / n_stretches
+    others = max(1, n_parameters - 1)
+    return Thresholds(
+        first=_crossed(per_hop / (2 * n_parameters), overlap),
+        further=_crossed(_FURTHER * per_hop / (2 * others), overlap),
+        outside=_crossed(per_hop * n_stretches, overlap),
+    )
+
+
+def _crossed(per_hop: float, overlap: int) -> float:
+    """Threshold with this crossing rate."""
+    low, high = 1.0, 37.0  # the rate falls from 1 on
+    if not crossing_rate(low, overlap) > per_hop > crossing_rate(high, overlap):
+        raise ValueError(f"{per_hop:.3g} crossings per hop of windows of {overlap} hops: expected less than about 0.1")
+    return float(brentq(lambda b: math.log(crossing_rate(b, overlap) / per_hop), low, high, xtol=1e-10))

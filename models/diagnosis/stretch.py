@@ -1,0 +1,149 @@
+"""A stretch of data and what it says about the parameters, in the form in which stretches add up.
+
+Changes are held in the scale in which their errors are normal and do not depend on the change: the logarithm of the
+ratio to nominal for stiffness and damping, the relative change itself for the eccentricity, which enters linearly. They
+are held as information: matrix J (the inverse covariance) and vector J x. Independent stretches add both.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.readings import Diagnosis
+from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
+
+__all__ = ["Stretch", "added", "from_scale", "slope", "stretch_of", "to_scale"]
+
+_LINEAR = frozenset({"e"})
+_MOST_LOSS = -0.95
+"""A parameter that reads as lost altogether has no logarithm."""
+
+
+def to_scale(name: str, change: float) -> float:
+    """Relative change in the scale of its errors: ln(1 + change), or the change itself for e."""
+    return change if name in _LINEAR else math.log1p(max(change, _MOST_LOSS))
+
+
+def from_scale(name: str, value: float) -> float:
+    """Relative change from a value in the scale of its errors."""
+    return value if name in _LINEAR else math.expm1(value)
+
+
+def slope(name: str, value: float) -> float:
+    """Standard error of the relative change over that in the scale of the errors."""
+    return 1.0 if name in _LINEAR else math.exp(value)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """What a stretch of data says.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Oldest and newest data.
+    vector : ndarray, shape (6,)
+        J x, in the order of `PARAMETERS`; 0 for a parameter that was not evaluable.
+    information : ndarray, shape (6, 6)
+        J; zero row and column for a parameter that was not evaluable.
+    misfit_z : float or None
+        Over-identification, standard normal where the model holds.
+    """
+
+    start_ns: int
+    end_ns: int
+    vector: FloatArray
+    information: FloatArray
+    misfit_z: float | None = None
+
+    @property
+    def known(self) -> tuple[int, ...]:
+        """Indices into `PARAMETERS` of what was evaluable."""
+        return tuple(int(i) for i in np.flatnonzero(np.diag(self.information) > 0))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What was evaluable."""
+        return tuple(PARAMETERS[i] for i in self.known)
+
+    @property
+    def duration_s(self) -> float:
+        """From the oldest to the newest data, s."""
+        return (self.end_ns - self.start_ns) / 1e9
+
+    def estimate(self) -> tuple[FloatArray, FloatArray]:
+        """Values of `names` in the scale of their errors, shape (m,), and their covariance, shape (m, m)."""
+        known = list(self.known)
+        covariance = np.linalg.inv(self.information[np.ix_(known, known)])
+        covariance = (covariance + covariance.T) / 2
+        return np.asarray(covariance @ self.vector[known], dtype=np.float64), covariance
+
+    def blurred(self, standard_error: float) -> "Stretch":
+        """Return the same with an error added that further data does not remove.
+
+        Parameters
+        ----------
+        standard_error : float
+            Of every parameter, in the scale of the errors.
+        """
+        known = list(self.known)
+        values, covariance = self.estimate()
+        return _stretch(
+            self.start_ns,
+            self.end_ns,
+            known,
+            values,
+            covariance + standard_error**2 * np.eye(len(known)),
+            self.misfit_z,
+        )
+
+
+def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
+    """Put a diagnosis into the form in which stretches add up.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        Of the stretch.
+    start_ns, end_ns : int
+        Its oldest and newest data.
+    """
+    readings = diagnosis.evaluable
+    known = [PARAMETERS.index(reading.name) for reading in readings]
+    values = np.array([to_scale(reading.name, reading.change or 0.0) for reading in readings], dtype=np.float64)
+    slopes = np.array([slope(reading.name, value) for reading, value in zip(readings, values, strict=True)])
+    covariance = diagnosis.full_covariance / np.outer(slopes, slopes)
+    return _stretch(start_ns, end_ns, known, values, covariance, diagnosis.misfit_z)
+
+
+def _stretch(
+    start_ns: int,
+    end_ns: int,
+    known: list[int],
+    values: FloatArray,
+    covariance: FloatArray,
+    misfit_z: float | None,
+) -> Stretch:
+    n = len(PARAMETERS)
+    information, vector = np.zeros((n, n)), np.zeros(n)
+    if known:
+        own = np.linalg.inv(covariance)
+        own = (own + own.T) / 2
+        information[np.ix_(known, known)] = own
+        vector[known] = own @ values
+    return Stretch(start_ns, end_ns, vector, information, misfit_z)
+
+
+def added(stretches: Sequence[Stretch]) -> Stretch:
+    """Sum of stretches that do not overlap: inverse-variance mean; misfits add as independent normal values."""
+    misfits = [one.misfit_z for one in stretches if one.misfit_z is not None]
+    return Stretch(
+        min(one.start_ns for one in stretches),
+        max(one.end_ns for one in stretches),
+        np.sum([one.vector for one in stretches], axis=0),
+        np.sum([one.information for one in stretches], axis=0),
+        sum(misfits) / math.sqrt(len(misfits)) if misfits else None,
+    )

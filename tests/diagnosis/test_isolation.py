@@ -1,0 +1,151 @@
+"""The choice among sets of parameters, on Gaussian windows with random covariances."""
+
+import numpy as np
+import pytest
+
+from models.diagnosis.isolation import Isolation, isolate_window, outside_confidence
+from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.stretch import added, from_scale, slope, stretch_of, to_scale
+from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
+
+SEED = 88_100
+
+
+def covariance(rng: np.random.Generator, n: int = 6) -> FloatArray:
+    """Standard errors from 0.1 % to 5 %, correlations from weak to strong."""
+    factor = rng.standard_normal((n, n)) * 0.5 + np.eye(n) * rng.uniform(1, 2)
+    raw = factor @ factor.T
+    unit = raw / np.sqrt(np.outer(np.diag(raw), np.diag(raw)))
+    errors = np.exp(rng.uniform(np.log(0.001), np.log(0.05), n))
+    return np.asarray(unit * np.outer(errors, errors))
+
+
+def window(values: FloatArray, cov: FloatArray, misfit_z: float | None = None) -> Diagnosis:
+    """A diagnosis whose estimates are `values` in the scale of the errors."""
+    slopes = np.array([slope(name, value) for name, value in zip(PARAMETERS, values, strict=True)])
+    errors = np.sqrt(np.diag(cov)) * slopes
+    readings = tuple(
+        ParameterReading(name, "likelihood", from_scale(name, float(value)), float(error))
+        for name, value, error in zip(PARAMETERS, values, errors, strict=True)
+    )
+    return Diagnosis("likelihood", readings, covariance=cov * np.outer(slopes, slopes), misfit_z=misfit_z)
+
+
+def draw(rng: np.random.Generator, changed: int, rate: float, smallest: float) -> tuple[set[str], Isolation]:
+    cov = covariance(rng)
+    errors = np.sqrt(np.diag(cov))
+    true = np.zeros(6)
+    at = rng.choice(6, changed, replace=False)
+    true[at] = rng.choice([-1, 1], changed) * rng.uniform(smallest, 2 * smallest, changed) * errors[at]
+    values = rng.multivariate_normal(true, cov)
+    return {PARAMETERS[i] for i in at}, isolate_window(window(values, cov), rate)
+
+
+@pytest.mark.parametrize(("rate", "windows"), [(0.05, 6_000), (0.01, 20_000)])
+def test_a_healthy_window_is_called_changed_at_the_declared_rate(rate: float, windows: int) -> None:
+    rng = np.random.default_rng(SEED)
+    called = sum(bool(draw(rng, 0, rate, 0.0)[1].changed) for _ in range(windows))
+    expected = rate * windows
+    # The bound of independent tests: with strongly correlated parameters the true rate is a little lower.
+    assert 0.75 * expected - 3 * expected**0.5 < called < expected + 3 * expected**0.5
+
+
+@pytest.mark.parametrize("changed", [1, 2])
+def test_one_or_two_faults_are_named_exactly(changed: int) -> None:
+    """Faults of 6 to 12 of their free standard errors, at 1 % false alarms per window."""
+    rng = np.random.default_rng(SEED + changed)
+    windows, exact, wrong = 4000, 0, 0
+    sure: list[float] = []
+    for _ in range(windows):
+        true, verdict = draw(rng, changed, 0.01, 6.0)
+        exact += set(verdict.changed) == true
+        wrong += bool(set(verdict.changed) - true)
+        sure.append(verdict.confidence)
+    assert exact / windows >= 0.995
+    assert wrong / windows <= 0.005
+    assert float(np.mean(sure)) < exact / windows + 0.002  # the confidence is not overstated
+
+
+@pytest.mark.parametrize("changed", [3, 4, 6])
+def test_more_than_two_are_nameable(changed: int) -> None:
+    rng = np.random.default_rng(SEED + changed)
+    hits = [true == set(found.changed) for true, found in (draw(rng, changed, 0.01, 9.0) for _ in range(400))]
+    assert np.mean(hits) > 0.98
+
+
+def test_the_confidence_is_calibrated_near_the_limit() -> None:
+    """Single faults of 2 to 4 standard errors: verdicts given with 60 to 90 % are right about as often or more."""
+    rng = np.random.default_rng(SEED + 50)
+    drawn = [draw(rng, 1, 0.01, 2.5) for _ in range(4000)]
+    named = [(true == set(found.changed), found.confidence) for true, found in drawn if found.changed]
+    middle = [(right, sure) for right, sure in named if 0.6 < sure < 0.9]
+    assert len(middle) > 200
+    assert np.mean([right for right, _ in middle]) > np.mean([sure for _, sure in middle]) - 0.05
+
+
+def test_changes_that_hide_each_other_in_single_tests_are_found_together() -> None:
+    """Two changes along the ridge of a strong correlation: neither alone explains anything, both together do."""
+    cov = np.diag(np.full(6, 1e-4))
+    cov[0, 1] = cov[1, 0] = 0.9e-4
+    J = np.linalg.inv(cov)
+    true = np.zeros(6)
+    true[0] = 0.1
+    true[1] = -J[0, 0] / J[0, 1] * 0.1  # the restricted estimate of k_by is zero
+    found = isolate_window(window(true, cov), 0.01)
+    assert found.changed == ("k_by", "c_by")
+
+
+def test_the_restricted_estimate_is_sharper_and_right() -> None:
+    rng = np.random.default_rng(SEED + 60)
+    cov = np.diag(np.full(6, 1e-4))
+    cov[0, 1] = cov[1, 0] = 0.8e-4
+    z = []
+    for _ in range(500):
+        found = isolate_window(window(rng.multivariate_normal([-0.3, 0, 0, 0, 0, 0], cov), cov), 0.01)
+        (reading,) = (one for one in found.readings if one.name == "k_by")
+        assert reading.change is not None
+        assert reading.standard_error is not None
+        z.append((to_scale("k_by", reading.change) + 0.3) / (reading.standard_error / (1 + reading.change)))
+        if len(found.changed) == 1:
+            assert reading.standard_error < 0.65 * 0.01 * (1 + reading.change)
+    assert float(np.std(z)) == pytest.approx(1.0, abs=0.1)
+    assert abs(float(np.mean(z))) < 0.2
+
+
+def test_outside_the_model_is_a_verdict_of_its_own() -> None:
+    cov = np.diag(np.full(6, 1e-4))
+    quiet, loud = (isolate_window(window(np.zeros(6), cov, misfit_z=z), 0.01) for z in (1.0, 5.0))
+    assert (quiet.outside, quiet.low_confidence) == (False, False)
+    assert (loud.outside, loud.low_confidence, loud.changed) == (True, True, ())
+    assert loud.outside_confidence is not None
+    assert loud.outside_confidence > 0.9999
+    assert outside_confidence(-3.0) == 0.5
+    assert outside_confidence(2.326) == pytest.approx(1 / (1 + np.e * 0.01 * np.log(100)), rel=1e-3)
+
+
+def test_parameters_without_a_reading_take_no_part() -> None:
+    cov = np.diag(np.full(6, 1e-4))
+    full = window(np.array([0.2, 0, 0, 0, 0, 0]), cov)
+    missing = tuple(
+        ParameterReading(one.name, one.by, reason="not measured") if one.name == "c_bz" else one
+        for one in full.parameters
+    )
+    found = isolate_window(Diagnosis("network", missing, covariance=np.delete(np.delete(cov, 3, 0), 3, 1)), 0.01)
+    assert found.changed == ("k_by",)
+    assert found.readings[0].by == "network"
+    assert found.probability[3] == 0.0
+    assert isolate_window(Diagnosis("network"), 0.01).changed == ()
+
+
+def test_stretches_add_by_inverse_variance() -> None:
+    rng = np.random.default_rng(SEED + 70)
+    cov = covariance(rng)
+    parts = [stretch_of(window(rng.multivariate_normal(np.zeros(6), cov), cov, 1.5), n, n + 1) for n in range(4)]
+    together = added(parts)
+    mean, spread = together.estimate()
+    np.testing.assert_allclose(spread, cov / 4, rtol=1e-6)
+    np.testing.assert_allclose(mean, np.mean([part.estimate()[0] for part in parts], axis=0), atol=1e-9)
+    assert together.misfit_z == pytest.approx(3.0)
+    assert (together.start_ns, together.end_ns) == (0, 4)
+    np.testing.assert_allclose(together.blurred(0.01).estimate()[1], cov / 4 + 1e-4 * np.eye(6), rtol=1e-6)
