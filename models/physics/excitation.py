@@ -1,6 +1,12 @@
-"""Coloured stochastic excitation: white noise through a second-order low-pass filter (Eqs. 7-12)."""
+"""Coloured stochastic excitation: white noise through a linear filter (Eqs. 7-12).
+
+The paper's filter is a second-order low-pass. Machines are not all like that, so the order may be one to four
+(Butterworth) and a broad hump may stand on the low-pass floor: Eqs. (7)-(8) with other matrices R and S*, and A* and B*
+that grow with them. Every source has unit variance before `force_rms_N`, whatever its shape.
+"""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -11,12 +17,15 @@ from models.signals.block import FloatArray
 
 __all__ = [
     "FILTER_DAMPING",
+    "ColouringFilter",
     "Source",
+    "colouring_filter",
     "expanded_A",
     "expanded_B",
     "filter_R",
     "low_pass",
     "low_pass_slope",
+    "source_spectrum",
     "unit_spectrum",
 ]
 
@@ -35,6 +44,14 @@ class Source(BaseModel):
         Column of S (Eq. 15) on (y1, y2, psi, z1, z2, phi): dimensionless on translations, m (lever arm) on tilts.
     force_rms_N : float
         Root mean square of the coloured force that `direction` distributes.
+    order : int
+        Order of the Butterworth low-pass, 1 to 4: the force falls by 6 dB per octave and order above the cutoff.
+    hump_share : float
+        Part of the force's variance in a broad hump, 0 to 1; the rest is the low-pass floor. Hump and floor are driven
+        by independent white noise, so that their spectra add.
+    hump_hz, hump_damping : float
+        Centre and damping ratio of the hump, white noise through a second-order band-pass; its half-power width is
+        2 · damping · centre.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -42,6 +59,86 @@ class Source(BaseModel):
     cutoff_hz: float = Field(gt=0, le=1e5)
     direction: tuple[float, float, float, float, float, float]
     force_rms_N: float = Field(ge=0, le=1e9)
+    order: int = Field(default=2, ge=1, le=4)
+    hump_share: float = Field(default=0.0, ge=0, le=1)
+    hump_hz: float = Field(default=80.0, gt=0, le=1e5)
+    hump_damping: float = Field(default=0.4, gt=0, le=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ColouringFilter:
+    """ż = R z + S* w, u = output · z, with unit variance of u for white noise of unit intensity (Eqs. 7-8).
+
+    Attributes
+    ----------
+    R : ndarray, shape (n, n)
+    S : ndarray, shape (n, p)
+        One column for each of the p independent white drives.
+    output : ndarray, shape (n,)
+        Dimensionless.
+    """
+
+    R: FloatArray
+    S: FloatArray
+    output: FloatArray
+
+
+def colouring_filter(source: Source) -> ColouringFilter:
+    """Filter of one source.
+
+    A low-pass of order n has the states (u, u̇/ω_c, …), all of one unit, and the normalised Butterworth polynomial in
+    its last row; a hump adds two states (v, v̇/ω_h) of which the second is the band-pass' output.
+    """
+    floor = _butterworth(source.cutoff_hz, source.order)
+    if source.hump_share == 0:
+        return floor
+    w = 2 * math.pi * source.hump_hz
+    n = source.order
+    R = np.zeros((n + 2, n + 2))
+    R[:n, :n] = floor.R
+    R[n:, n:] = w * np.array([[0.0, 1.0], [-1.0, -2 * source.hump_damping]])
+    S = np.zeros((n + 2, 2))
+    S[:n, :1] = floor.S
+    S[n + 1, 1] = 2 * math.sqrt(source.hump_damping * w)  # makes both states of unit variance, like filter_gain
+    output = np.zeros(n + 2)
+    output[0] = math.sqrt(1 - source.hump_share)
+    output[n + 1] = math.sqrt(source.hump_share)
+    return ColouringFilter(R, S, output)
+
+
+def _butterworth(cutoff_hz: float, order: int) -> ColouringFilter:
+    output = np.zeros(order)
+    output[0] = 1.0
+    S = np.zeros((order, 1))
+    if order == 2:
+        S[1, 0] = filter_gain(cutoff_hz)
+        return ColouringFilter(filter_R(cutoff_hz), S, output)
+    w = 2 * math.pi * cutoff_hz
+    angles = math.pi * (2 * np.arange(order) + 1 + order) / (2 * order)
+    polynomial = np.poly(np.exp(1j * angles)).real  # highest power first, 1 at both ends
+    R = np.diag(np.ones(order - 1), 1)
+    R[-1] = -polynomial[:0:-1]
+    S[-1, 0] = w * math.sqrt(_floor_density(cutoff_hz, order))
+    return ColouringFilter(w * R, S, output)
+
+
+def _floor_density(cutoff_hz: float, order: int) -> float:
+    """Two-sided density at zero frequency of unit variance through a Butterworth low-pass, 1/Hz.
+
+    Its noise bandwidth, both sides, is 2 f_c (π/2n) / sin(π/2n).
+    """
+    return math.sin(math.pi / (2 * order)) * order / (math.pi * cutoff_hz)
+
+
+def source_spectrum(frequency_hz: FloatArray, source: Source) -> FloatArray:
+    """Two-sided power spectral density of a source's force, N²/Hz; same shape as `frequency_hz`."""
+    floor = _floor_density(source.cutoff_hz, source.order) / (
+        1 + (frequency_hz / source.cutoff_hz) ** (2 * source.order)
+    )
+    r2 = (frequency_hz / source.hump_hz) ** 2
+    hump = 2 * source.hump_damping / (math.pi * source.hump_hz) * r2 / ((1 - r2) ** 2 + 4 * source.hump_damping**2 * r2)
+    density = (1 - source.hump_share) * floor + source.hump_share * hump
+    return np.asarray(source.force_rms_N**2 * density, dtype=np.float64)
 
 
 def filter_R(cutoff_hz: float) -> FloatArray:
@@ -77,21 +174,32 @@ def unit_spectrum(frequency_hz: FloatArray, cutoff_hz: float) -> FloatArray:
 
 
 def expanded_A(rotor: RotorParameters, speed_rad_s: float, sources: tuple[Source, ...]) -> FloatArray:
-    """System matrix A* of rotor and filters (Eq. 12), shape (12 + 2 n_sources, 12 + 2 n_sources)."""
-    size = 12 + 2 * len(sources)
+    """System matrix A* of rotor and filters (Eq. 12), shape (n, n): 12 rotor states, then each source's filter."""
+    filters = [colouring_filter(source) for source in sources]
+    size = 12 + sum(colour.output.size for colour in filters)
     A = np.zeros((size, size))
     A[:12, :12] = system_A(rotor, speed_rad_s)
     inverse_masses = 1 / np.diag(M_matrix(rotor))
-    for number, source in enumerate(sources):
-        u = 12 + 2 * number
-        A[6:12, u] = inverse_masses * np.array(source.direction) * source.force_rms_N
-        A[u : u + 2, u : u + 2] = filter_R(source.cutoff_hz)
+    u = 12
+    for source, colour in zip(sources, filters, strict=True):
+        end = u + colour.output.size
+        for state in np.flatnonzero(colour.output):
+            A[6:12, u + state] = inverse_masses * np.array(source.direction) * source.force_rms_N * colour.output[state]
+        A[u:end, u:end] = colour.R
+        u = end
     return A
 
 
 def expanded_B(sources: tuple[Source, ...]) -> FloatArray:
-    """Input matrix B* (Eq. 11) for independent white noise of unit intensity, shape (12 + 2 n_sources, n_sources)."""
-    B = np.zeros((12 + 2 * len(sources), len(sources)))
-    for number, source in enumerate(sources):
-        B[12 + 2 * number + 1, number] = filter_gain(source.cutoff_hz)
+    """Input matrix B* (Eq. 11) for independent white noise of unit intensity, shape (n, p).
+
+    One column per source, two for a source with a hump.
+    """
+    filters = [colouring_filter(source) for source in sources]
+    B = np.zeros((12 + sum(len(colour.S) for colour in filters), sum(colour.S.shape[1] for colour in filters)))
+    row, column = 12, 0
+    for colour in filters:
+        states, drives = colour.S.shape
+        B[row : row + states, column : column + drives] = colour.S
+        row, column = row + states, column + drives
     return B
