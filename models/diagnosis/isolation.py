@@ -24,7 +24,7 @@ from models.diagnosis.stretch import Stretch, from_scale, slope, stretch_of
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = ["Isolation", "isolate", "isolate_window", "outside_confidence"]
+__all__ = ["Isolation", "isolate", "isolate_window", "outside_confidence", "restricted"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,12 +121,12 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
     for A, share in zip(sets, weight, strict=True):
         for i in A:
             probability[known[i]] += share
-    chosen = sets[best]
+    changed = tuple(PARAMETERS[known[i]] for i in sets[best])
     return Isolation(
-        changed=tuple(PARAMETERS[known[i]] for i in chosen),
+        changed=changed,
         confidence=float(weight[best]),
         probability=tuple(np.minimum(probability, 1.0).tolist()),
-        readings=_restricted(J, b, chosen, tuple(PARAMETERS[i] for i in known), by),
+        readings=restricted(stretch, changed, by),
         outside=outside,
         outside_confidence=confidence,
     )
@@ -153,17 +153,26 @@ def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) 
     return explained
 
 
-def _restricted(
-    J: FloatArray, b: FloatArray, chosen: tuple[int, ...], names: tuple[str, ...], by: str
-) -> tuple[ParameterReading, ...]:
-    """Readings of the chosen parameters with the others held at nominal."""
+def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[ParameterReading, ...]:
+    """Read some parameters with all others held at nominal.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What the data says.
+    names : tuple of str
+        Parameters that may differ from nominal; those that were not evaluable are left out.
+    by : str
+        Who said it.
+    """
+    chosen = [i for i in stretch.known if PARAMETERS[i] in names]
     if not chosen:
         return ()
-    covariance = np.linalg.inv(J[np.ix_(chosen, chosen)])
-    values = covariance @ b[list(chosen)]
+    covariance = np.linalg.inv(stretch.information[np.ix_(chosen, chosen)])
+    values = covariance @ stretch.vector[chosen]
     readings = []
     for i, value, variance in zip(chosen, values.tolist(), np.diag(covariance).tolist(), strict=True):
-        name = names[i]
+        name = PARAMETERS[i]
         error = math.sqrt(variance) * slope(name, value)
         readings.append(ParameterReading(name, by, from_scale(name, value), error))
     return tuple(readings)

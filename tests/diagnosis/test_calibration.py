@@ -65,5 +65,4 @@ def test_rates_that_make_no_sense_are_refused() -> None:
         window_thresholds(0, 6)
     with pytest.raises(ValueError, match="expected positive numbers"):
         month_thresholds(-1, 5.0, 12, 6)
-    with pytest.raises(ValueError, match="expected less than about 0.1"):
-        month_thresholds(1e9, 5.0, 12, 6)
+    assert month_thresholds(1e9, 5.0, 12, 6).first == 1.0  # more often than that nothing is crossed

@@ -1,0 +1,191 @@
+"""The sequential test on Gaussian hops: declared rate, delays, location, repair, checkpoint."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.diagnosis.calibration import MONTH_S, month_thresholds
+from models.diagnosis.delay import GaussianHops, detection_delays
+from models.diagnosis.detectable import length_for
+from models.diagnosis.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
+from models.diagnosis.stretch import Stretch, to_scale
+from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
+
+SEED = 88_300
+SETTINGS = SequentialSettings(hop_s=5.0, window_hops=12)
+ERRORS = np.array([0.0036, 0.0135, 0.0036, 0.0135, 0.018, 0.002])
+"""Of the rotor kit in 60 s, at the limit of what any method can read."""
+COVARIANCE = np.diag(ERRORS**2)
+
+
+def true(**changes: float) -> FloatArray:
+    values = np.zeros(len(PARAMETERS))
+    for name, change in changes.items():
+        values[PARAMETERS.index(name)] = to_scale(name, change)
+    return values
+
+
+def play(
+    test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]
+) -> list[tuple[int, SequentialVerdict]]:
+    """Feed hops with these true values; verdicts with the number of the hop."""
+    verdicts, number = [], 0
+    for count, values in story:
+        for _ in range(count):
+            looks = hops.looks(values)
+            if looks:
+                verdicts.append((number, test.update(looks)))
+            number += 1
+    return verdicts
+
+
+def gaussian(seed: int, settings: SequentialSettings = SETTINGS) -> GaussianHops:
+    return GaussianHops(settings, COVARIANCE, np.random.default_rng(seed))
+
+
+def fixed_length_s(name: str, change: float) -> float:
+    """Data that a test of one fixed length needs at the same rate, with 95 % power."""
+    length_s = 60.0
+    for _ in range(50):
+        thresholds = month_thresholds(1.0, 5.0, max(1, round(length_s / 5.0)), len(PARAMETERS))
+        length_s = length_for(name, change, float(ERRORS[PARAMETERS.index(name)]), 60.0, thresholds)
+    return length_s
+
+
+@pytest.mark.slow
+def test_false_alarms_come_at_the_declared_rate() -> None:
+    """27.8 hours of a healthy machine at 2000 declared false alarms per month: 77 are expected."""
+    declared, n_hops = 2000.0, 20_000
+    settings = replace(SETTINGS, false_alarms_per_month=declared, systematic=0.0)
+    verdicts = play(SequentialTest(settings), gaussian(SEED, settings), (n_hops, true()))
+    last, count = -1000, 0
+    for number, verdict in verdicts:
+        if verdict.detected:
+            # What one stretch of noise does to stretches of several lengths is one alarm.
+            count += number - last > 24
+            last = number
+    expected = declared * n_hops * SETTINGS.hop_s / MONTH_S
+    # Lengths overlap, so what they see is partly the same: the declared rate is an upper bound.
+    assert 0.4 * expected < count < expected + 3 * expected**0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "change"), [("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2)])
+def test_delays_stay_within_twice_those_of_a_fixed_length(name: str, change: float) -> None:
+    """95 of 100 changes are found, and named, within twice the data of a test made for exactly this change."""
+    study = detection_delays(SETTINGS, COVARIANCE, {name: change}, trials=100, seed=SEED, before_hops=24, after_hops=30)
+    allowed_s = 2 * fixed_length_s(name, change)
+    assert np.quantile(study.detected_s, 0.95) <= allowed_s
+    assert np.quantile(study.named_s, 0.95) <= allowed_s
+    assert study.wrong == 0
+    assert study.early == 0
+
+
+def test_a_small_change_accumulates_over_windows() -> None:
+    """Damping 4 % down is no more than three standard errors of a window; sums of windows find it."""
+    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 2), (24, true()), (160, true(c_by=-0.04)))
+    number, first = next((n, v) for n, v in verdicts if v.findings)
+    (finding,) = first.findings
+    assert finding.name == "c_by"
+    assert finding.stretch_s >= 120.0
+    assert 36 < number < 24 + 120
+    assert {f.name for _, verdict in verdicts for f in verdict.findings} == {"c_by"}
+
+
+def test_large_changes_are_named_within_two_hops_and_nothing_else_ever() -> None:
+    study = detection_delays(
+        SETTINGS, COVARIANCE, {"k_by": -0.25}, trials=40, seed=SEED + 3, before_hops=20, after_hops=40
+    )
+    assert study.named_s.max() <= 10.0
+    assert study.wrong == 0
+
+
+def straddling(looks: dict[int, Stretch], since: int, bias: FloatArray) -> dict[int, Stretch]:
+    """The same, but stretches that straddle the change some hops ago read another parameter wrong."""
+    return {
+        hops: replace(look, vector=look.vector + look.information @ (bias * 4 * (since / hops) * (1 - since / hops)))
+        if since < hops
+        else look
+        for hops, look in looks.items()
+    }
+
+
+def test_what_a_straddling_window_reads_wrong_is_not_named() -> None:
+    """k_by drops by 25 %; stretches across the change read c_by up to 7 % too large, five standard errors."""
+    for seed in range(20):
+        test, hops = SequentialTest(SETTINGS), gaussian(SEED + 100 + seed)
+        play(test, hops, (20, true()))
+        said: list[tuple[str, ...]] = []
+        for since in range(1, 40):
+            looks = straddling(hops.looks(true(k_by=-0.25)), since, true(c_by=0.07))
+            said.append(tuple(finding.name for finding in test.update(looks).findings))
+        assert set(said[1:]) == {("k_by",)}
+
+
+def test_two_changes_at_once_and_one_after_the_other() -> None:
+    both, first = true(k_by=-0.2, c_bz=-0.25), true(k_by=-0.2)
+    for story in [((20, true()), (30, both)), ((20, true()), (30, first), (30, both))]:
+        verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 4), *story)
+        assert [f.name for f in verdicts[-1][1].findings] == ["k_by", "c_bz"]
+        named = {tuple(f.name for f in verdict.findings) for _, verdict in verdicts}
+        assert named <= {(), ("k_by",), ("c_bz",), ("k_by", "c_bz")}
+    k_by, c_bz = verdicts[-1][1].findings
+    assert k_by.since_ns < c_bz.since_ns  # each change has its own date
+    assert abs(k_by.since_ns / 5e9 - 20) <= 2
+    assert abs(c_bz.since_ns / 5e9 - 50) <= 4
+
+
+def test_a_repair_is_noticed_within_seconds() -> None:
+    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 5), (20, true()), (30, true(k_by=-0.25)), (20, true()))
+    late = [verdict for number, verdict in verdicts if number >= 50 + 4]
+    assert all(not verdict.findings for verdict in late)
+    assert not late[0].settled
+    (k_by,) = (reading for reading in late[0].current if reading.name == "k_by")
+    assert abs(k_by.change or 1.0) < 0.04
+
+
+def test_readings_are_those_of_the_new_machine_while_the_window_straddles() -> None:
+    verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 6), (20, true()), (6, true(k_by=-0.25)))
+    last = verdicts[-1][1]
+    (k_by,) = (reading for reading in last.current if reading.name == "k_by")
+    assert k_by.change == pytest.approx(-0.25, abs=0.03)
+    assert not last.settled
+
+
+def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 7)
+    for misfit, outside in [(1.0, False), (8.0, True)]:
+        for _ in range(20):
+            looks = {h: replace(look, misfit_z=misfit) for h, look in hops.looks(true()).items()}
+            if looks:
+                assert test.update(looks).isolation.outside == outside
+
+
+def test_a_gap_is_no_part_of_a_sum() -> None:
+    test, hops = SequentialTest(SETTINGS), gaussian(SEED + 8)
+    play(test, hops, (24, true()))
+    assert len(test.state.sums[2]) == 1
+    shift_ns = 3_600_000_000_000
+    looks = hops.looks(true())
+    moved = {
+        h: replace(look, start_ns=look.start_ns + shift_ns, end_ns=look.end_ns + shift_ns) for h, look in looks.items()
+    }
+    test.update(moved)
+    assert len(test.state.sums[1]) == 1
+    assert len(test.state.sums[2]) == 1  # nothing was added to what was there before
+    assert test.state.sums[2][0].end_ns < shift_ns
+
+
+def test_a_restored_test_goes_on_as_if_nothing_had_happened() -> None:
+    hops = gaussian(SEED + 9)
+    going = SequentialTest(SETTINGS)
+    play(going, hops, (60, true()), (30, true(c_by=-0.15)))
+    restored = SequentialTest(SETTINGS, SequentialState.restored(going.state.checkpoint()))
+    for _ in range(30):
+        looks = hops.looks(true(c_by=-0.15))
+        assert restored.update(looks) == going.update(looks)
+    assert going.state.findings[0].name == "c_by"
+    going.clear()
+    assert SequentialState.restored(going.state.checkpoint()) == SequentialState()
