@@ -19,15 +19,27 @@ from models.machine import Machine
 from models.physics.lyapunov import stochastic_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import PARAMETERS, changed
-from models.signals.channels import Channel
-from simulator.scenario import Event, NamedSource, Scenario, Sensors
+from models.signals.channels import Channel, Quantity
+from simulator.integrator import theoretical_rms
+from simulator.scenario import Event, NamedSource, Rub, Scenario, Sensors
 from simulator.stream import blocks
+from simulator.timeline import Condition
 
-__all__ = ["Draw", "Layout", "Purpose", "draw_condition", "simulate_window", "windows", "with_tilt"]
+__all__ = [
+    "Anomaly",
+    "Draw",
+    "Excitation",
+    "Layout",
+    "Purpose",
+    "draw_condition",
+    "simulate_window",
+    "windows",
+    "with_tilt",
+]
 
 _BLOCK_S = 5.0
 
-_REALISATION = 1
+_REALISATION, _EXCITATION, _ANOMALY = 1, 2, 3
 
 
 class Purpose(IntEnum):
@@ -45,6 +57,40 @@ class Layout(IntEnum):
     """One source of random direction over all six degrees of freedom."""
     INDEPENDENT = 1
     """Independent sources of random level at bearing and disc, horizontal and vertical."""
+
+
+class Excitation(IntEnum):
+    """Colour and level of the stochastic force."""
+
+    SECOND_ORDER = 0
+    """What the likelihood assumes: second-order low-pass, one cutoff for all sources, constant level."""
+    FIRST_ORDER = 1
+    FOURTH_ORDER = 2
+    OWN_CUTOFFS = 3
+    """Second order, each source with a cutoff of its own; with one source the same as SECOND_ORDER."""
+    HUMP = 4
+    """A hump at 40 to 120 Hz, damping ratio 0.3 to 0.5, with 30 to 80 % of the variance, common to all sources."""
+    DRIFT = 5
+    """The level doubles or halves over the window, linearly or in eight equal ratios; drawn at random."""
+
+
+class Anomaly(IntEnum):
+    """A fault that none of the diagnosed parameters describes; in parentheses its size if none is given."""
+
+    NONE = 0
+    CRACK = 1
+    """Breathing crack (0.3 of the shaft's bending stiffness)."""
+    RUB = 2
+    """Disc touching the casing (0.2 of the shaft's stiffness), clearance 1.5 times the disc's radial rms."""
+    ADDED_MASS = 3
+    """Even deposit on the disc (0.07 of its mass)."""
+    GAIN_DRIFT = 4
+    """One vibration channel reads wrong (by 0.1), from the start or growing over the window; drawn at random."""
+
+
+_SIZES = {Anomaly.NONE: 0.0, Anomaly.CRACK: 0.3, Anomaly.RUB: 0.2, Anomaly.ADDED_MASS: 0.07, Anomaly.GAIN_DRIFT: 0.1}
+_CLEARANCE = 1.5
+_DRIFT_STEPS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +116,12 @@ class Draw:
     fixed_condition : bool
         All windows share the condition drawn for number 0; only the realisation of force and noise differs. The number
         0 itself has another realisation than without.
+    excitation : Excitation
+        Another one leaves everything else of the condition as it is.
+    anomaly : Anomaly
+        The same holds for this.
+    anomaly_size : float or None
+        As `simulator.scenario.Event.size`, for GAIN_DRIFT the relative change of gain; None is the anomaly's own.
     """
 
     machine: Machine
@@ -81,6 +133,9 @@ class Draw:
     faults: dict[str, float] = field(default_factory=dict)
     layout: Layout | None = None
     fixed_condition: bool = False
+    excitation: Excitation = Excitation.SECOND_ORDER
+    anomaly: Anomaly = Anomaly.NONE
+    anomaly_size: float | None = None
 
 
 def with_tilt(machine: Machine) -> Machine:
@@ -104,7 +159,8 @@ def with_tilt(machine: Machine) -> Machine:
 def draw_condition(draw: Draw, number: int) -> Scenario:
     """Draw the operating condition of one window: cutoff, layout, levels, speed, noise, and varying parameters."""
     machine, condition = draw.machine, draw.machine.condition
-    rng = _generator(draw, 0 if draw.fixed_condition else number)
+    condition_number = 0 if draw.fixed_condition else number
+    rng = _generator(draw, condition_number)
     changes = {
         name: float(rng.uniform(-draw.spread, draw.spread)) for name in PARAMETERS if name not in draw.kept_nominal
     } | draw.faults
@@ -113,20 +169,30 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     cutoff_hz = float(rng.uniform(*condition.cutoff_hz))
     layout = Layout(int(rng.integers(2))) if draw.layout is None else draw.layout
     ratio = float(rng.uniform(*condition.stochastic_to_1x))
-    sources = _scaled(_sources(layout, cutoff_hz, machine, rng), ratio, machine, changes, speed_rpm)
+    excitation_rng = _generator(draw, condition_number, _EXCITATION)
+    coloured = _coloured(_sources(layout, cutoff_hz, machine, rng), draw, excitation_rng)
+    sources = _scaled(coloured, ratio, machine, changes, speed_rpm)
     corner_hz = None if rng.random() < 0.5 else float(np.exp(rng.uniform(np.log(50), np.log(500))))
     sensors = Sensors(noise_relative=float(rng.uniform(*condition.noise_relative)), noise_corner_hz=corner_hz)
     events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in changes.items()]
+    events.append(Event(at_s=0, speed_rpm=speed_rpm))
     plan = plan_for(machine)
     realisation = _generator(draw, number, _REALISATION) if draw.fixed_condition else rng
+    duration_s = (plan.preamble + plan.hops * plan.hop) / machine.rate_hz
+    if draw.excitation is Excitation.DRIFT:
+        sources, drift = _drifting(sources, duration_s, excitation_rng)
+        events += drift
+    rub, anomaly = _anomaly(draw, sources, changes, speed_rpm, duration_s, _generator(draw, condition_number, _ANOMALY))
+    events += anomaly
     return Scenario(
         name=f"draw {draw.purpose.name.lower()} {draw.stream}.{number}",
         machine=machine.name,
         seed=int(realisation.integers(2**62)),
-        duration_s=(plan.preamble + plan.hops * plan.hop) / machine.rate_hz,
+        duration_s=duration_s,
         sources=sources,
         sensors=sensors,
-        events=(*events, Event(at_s=0, speed_rpm=speed_rpm)),
+        rub=rub,
+        events=tuple(events),
     )
 
 
@@ -148,6 +214,64 @@ def _sources(layout: Layout, cutoff_hz: float, machine: Machine, rng: np.random.
         )
         for n, (direction, level) in enumerate(parts)
     )
+
+
+def _coloured(sources: tuple[NamedSource, ...], draw: Draw, rng: np.random.Generator) -> tuple[NamedSource, ...]:
+    """Give the sources the colour that is asked for."""
+    match draw.excitation:
+        case Excitation.FIRST_ORDER:
+            colours: list[dict[str, float]] = [{"order": 1}] * len(sources)
+        case Excitation.FOURTH_ORDER:
+            colours = [{"order": 4}] * len(sources)
+        case Excitation.OWN_CUTOFFS if len(sources) > 1:
+            colours = [{"cutoff_hz": float(rng.uniform(*draw.machine.condition.cutoff_hz))} for _ in sources]
+        case Excitation.HUMP:
+            names = ("hump_share", "hump_hz", "hump_damping")
+            values = (float(rng.uniform(*limits)) for limits in ((0.3, 0.8), (40.0, 120.0), (0.3, 0.5)))
+            colours = [dict(zip(names, values, strict=True))] * len(sources)
+        case _:
+            return sources
+    return tuple(source.model_copy(update=colour) for source, colour in zip(sources, colours, strict=True))
+
+
+def _drifting(
+    sources: tuple[NamedSource, ...], duration_s: float, rng: np.random.Generator
+) -> tuple[tuple[NamedSource, ...], list[Event]]:
+    """Let the level double or halve from start to end, the drawn level being the geometric middle."""
+    end = 2.0 if rng.random() < 0.5 else 0.5
+    sources = tuple(source.model_copy(update={"force_rms_N": source.force_rms_N / end**0.5}) for source in sources)
+    if rng.random() < 0.5:
+        return sources, [Event(at_s=0, ramp_s=duration_s, excitation_level=end)]
+    return sources, [
+        Event(at_s=duration_s * step / (_DRIFT_STEPS + 1), excitation_level=end ** (step / _DRIFT_STEPS))
+        for step in range(1, _DRIFT_STEPS + 1)
+    ]
+
+
+def _anomaly(
+    draw: Draw,
+    sources: tuple[NamedSource, ...],
+    changes: dict[str, float],
+    speed_rpm: float,
+    duration_s: float,
+    rng: np.random.Generator,
+) -> tuple[Rub | None, list[Event]]:
+    """What a scenario needs for the anomaly that is asked for."""
+    size = _SIZES[draw.anomaly] if draw.anomaly_size is None else draw.anomaly_size
+    match draw.anomaly:
+        case Anomaly.NONE:
+            return None, []
+        case Anomaly.GAIN_DRIFT:
+            channels = [channel.name for channel in draw.machine.sensors if channel.quantity != Quantity.SHAFT_ANGLE]
+            channel = channels[int(rng.integers(len(channels)))]
+            ramp_s = duration_s if rng.random() < 0.5 else 0.0
+            return None, [Event(at_s=0, ramp_s=ramp_s, sensor=channel, sensor_fault="gain", value_SI=1 + size)]
+        case Anomaly.RUB:
+            rms = theoretical_rms(draw.machine, Condition(changes, speed_rpm, sources))
+            clearance_m = _CLEARANCE * float(np.hypot(rms[STATE_INDEX["y2"]], rms[STATE_INDEX["z2"]]))
+            return Rub(clearance_m=clearance_m), [Event(at_s=0, anomaly="rub", size=size)]
+        case _:
+            return None, [Event(at_s=0, anomaly=draw.anomaly.name.lower(), size=size)]
 
 
 def _scaled(

@@ -14,11 +14,11 @@ from models.machine import Machine
 from models.physics.discretise import DiscreteSystem, advance, discretise
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.lyapunov import stationary_covariance, synchronous_response
-from models.physics.parameters import changed
+from models.physics.parameters import RotorParameters, changed
 from models.signals.block import FloatArray
 from simulator.timeline import Condition
 
-__all__ = ["Plant", "PlantSamples", "theoretical_rms"]
+__all__ = ["Plant", "PlantSamples", "rotor_in", "theoretical_rms"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Plant:
         self._start_revolution = 0.0
         self._since_change = 0
         covariance = stationary_covariance(self._A, expanded_B(condition.sources))
-        self._d = _draw(covariance, rng)
+        self._d = _draw(covariance * condition.excitation_level**2, rng)
 
     @property
     def theta_rad(self) -> float:
@@ -91,7 +91,7 @@ class Plant:
     def advance(self, n_samples: int) -> PlantSamples:
         """Return the next `n_samples` samples and move on behind them."""
         theta = self._angles(n_samples)
-        noise = self._rng.standard_normal((n_samples, self._d.size))
+        noise = self._noise(n_samples)
         after = advance(self._system, self._d, noise)
         states = self._synchronous(theta)
         states[0] += self._d[:12]
@@ -100,8 +100,15 @@ class Plant:
         self._since_change += n_samples
         return PlantSamples(states, theta)
 
+    def _noise(self, n_samples: int) -> FloatArray:
+        """White noise of the next samples, at the level of the excitation; shape (n_samples, n)."""
+        noise = self._rng.standard_normal((n_samples, self._d.size))
+        # All noise of the discrete system comes from the white drives, so their level scales it exactly.
+        return noise if self._level == 1 else noise * self._level
+
     def _set(self, condition: Condition) -> None:
-        rotor = changed(self._machine.rotor, condition.relative_changes)
+        self._level = condition.excitation_level
+        rotor = rotor_in(self._machine, condition)
         speed_rad_s = condition.speed_rpm * 2 * np.pi / 60
         A = expanded_A(rotor, speed_rad_s, condition.sources)
         if not np.array_equal(A, self._A):  # a changed unbalance alone leaves the discretisation as it is
@@ -123,12 +130,35 @@ class Plant:
         return np.asarray(self._q1 * np.cos(angle) + self._q2 * np.sin(angle), dtype=np.float64)
 
 
-def theoretical_rms(machine: Machine, condition: Condition) -> FloatArray:
-    """Root mean square of each of the twelve states in a condition, stochastic and synchronous together; SI."""
+def rotor_in(machine: Machine, condition: Condition) -> RotorParameters:
+    """Return the rotor in a condition: changed parameters, and a deposit on the disc.
+
+    The deposit lies evenly around the shaft: masses and moments of inertia of the disc grow by the same part, and the
+    unbalance m₂e stays what it is.
+    """
     rotor = changed(machine.rotor, condition.relative_changes)
+    factor = 1 + condition.anomalies.get("added_mass", 0.0)
+    if factor == 1:
+        return rotor
+    return rotor.model_copy(
+        update={
+            "m2_kg": rotor.m2_kg * factor,
+            "I2_kg_m2": rotor.I2_kg_m2 * factor,
+            "I2p_kg_m2": rotor.I2p_kg_m2 * factor,
+            "e_m": rotor.e_m / factor,
+        }
+    )
+
+
+def theoretical_rms(machine: Machine, condition: Condition) -> FloatArray:
+    """Root mean square of each of the twelve states in a condition, stochastic and synchronous together; SI.
+
+    Of the linear rotor: a crack or a rub is left out.
+    """
+    rotor = rotor_in(machine, condition)
     speed_rad_s = condition.speed_rpm * 2 * np.pi / 60
     A, B = expanded_A(rotor, speed_rad_s, condition.sources), expanded_B(condition.sources)
-    variance = np.diag(stationary_covariance(A, B))[:12]
+    variance = np.diag(stationary_covariance(A, B))[:12] * condition.excitation_level**2
     q1, q2 = synchronous_response(rotor, speed_rad_s)
     return np.asarray(np.sqrt(variance + (q1**2 + q2**2) / 2), dtype=np.float64)
 

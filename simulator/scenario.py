@@ -4,8 +4,9 @@ Every field carries its unit in its name; unknown keys are refused. ``docs/scena
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -17,10 +18,12 @@ from models.physics.parameters import PARAMETERS
 from models.signals.channels import Channel, Quantity
 
 __all__ = [
+    "ANOMALIES",
     "SENSOR_FAULTS_WITH_VALUE",
     "ChannelSettings",
     "Event",
     "NamedSource",
+    "Rub",
     "Scenario",
     "SensorFault",
     "SensorSettings",
@@ -38,6 +41,9 @@ SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "c
 
 SENSOR_FAULTS_WITH_VALUE = ("offset", "gain", "noise_relative", "clip")
 """Kinds of sensor fault that have a value."""
+
+ANOMALIES: Mapping[str, float] = MappingProxyType({"crack": 0.8, "rub": 10.0, "added_mass": 10.0})
+"""What can go wrong that no diagnosed parameter describes, and the largest size of it."""
 
 _WITH_RAMP = ("offset", "gain", "noise_relative")
 
@@ -94,8 +100,17 @@ class Sensors(SensorSettings):
         return SensorSettings.model_validate({**common, **own})
 
 
+class Rub(BaseModel):
+    """Where the disc may touch the casing; how hard is the size of the event that brings it there."""
+
+    model_config = _STRICT
+
+    clearance_m: float = Field(gt=0, le=0.1, description="radial, around the disc's place at rest")
+    friction: float = Field(default=0.1, ge=0, le=1, description="sliding friction coefficient")
+
+
 class Event(BaseModel):
-    """One change at one time: of a parameter, the speed, a source, or a sensor.
+    """One change at one time: of a parameter, the speed, the excitation, a source, a sensor, or outside the model.
 
     Attributes
     ----------
@@ -109,6 +124,11 @@ class Event(BaseModel):
         New speed.
     source, cutoff_hz, force_rms_N, direction
         Name of a source, and exactly one new setting of it.
+    excitation_level : float
+        Factor on the white noise that drives all sources; 1 at the start.
+    anomaly, size
+        "crack", "rub" or "added_mass" and how much of it: relative loss of the shaft's bending stiffness across the
+        open crack; stiffness of the contact over the shaft's 3EI/L³; relative increase of the disc's mass. 0 is none.
     sensor, sensor_fault, value_SI
         Channel name, kind of fault ("none" ends all faults of the channel), and its value: in the SI unit of the
         channel for offset and clip, a plain ratio for gain and noise_relative.
@@ -125,22 +145,27 @@ class Event(BaseModel):
     cutoff_hz: float | None = Field(default=None, gt=0, le=1e5)
     force_rms_N: float | None = Field(default=None, ge=0, le=1e9)
     direction: tuple[float, float, float, float, float, float] | None = None
+    excitation_level: float | None = Field(default=None, ge=0, le=1e3)
+    anomaly: str | None = None
+    size: float | None = Field(default=None, ge=0)
     sensor: str | None = None
     sensor_fault: SensorFault | None = None
     value_SI: float | None = None
 
     @model_validator(mode="after")
     def _one_change(self) -> Self:
-        kinds = [name for name in ("parameter", "speed_rpm", "source", "sensor") if getattr(self, name) is not None]
-        if len(kinds) != 1:
-            found = " and ".join(kinds) or "none"
-            raise ValueError(f"expected exactly one of parameter, speed_rpm, source, sensor; found {found}")
         allowed = {
             "parameter": ("relative_change",),
             "speed_rpm": (),
             "source": ("cutoff_hz", "force_rms_N", "direction"),
             "sensor": ("sensor_fault", "value_SI"),
+            "excitation_level": (),
+            "anomaly": ("size",),
         }
+        kinds = [name for name in allowed if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            found = " and ".join(kinds) or "none"
+            raise ValueError(f"expected exactly one of {', '.join(allowed)}; found {found}")
         for kind, fields in allowed.items():
             stray = [field for field in fields if kind != kinds[0] and getattr(self, field) is not None]
             if stray:
@@ -148,6 +173,7 @@ class Event(BaseModel):
         self._check_parameter()
         self._check_source()
         self._check_sensor()
+        self._check_anomaly()
         return self
 
     def _check_parameter(self) -> None:
@@ -166,6 +192,18 @@ class Event(BaseModel):
             raise ValueError(
                 f"change of source {self.source!r}: expected exactly one of cutoff_hz, force_rms_N, direction; "
                 f"found {' and '.join(given) or 'none'}"
+            )
+
+    def _check_anomaly(self) -> None:
+        if self.anomaly is None:
+            return
+        if self.anomaly not in ANOMALIES:
+            raise ValueError(f"anomaly {self.anomaly!r} is not one of {', '.join(ANOMALIES)}")
+        if self.size is None:
+            raise ValueError(f"anomaly {self.anomaly} without size")
+        if self.size > ANOMALIES[self.anomaly]:
+            raise ValueError(
+                f"size of anomaly {self.anomaly} is {self.size}, expected 0 to {ANOMALIES[self.anomaly]:g}"
             )
 
     def _check_sensor(self) -> None:
@@ -194,6 +232,7 @@ class Scenario(BaseModel):
     duration_s: float = Field(gt=0, le=1e8, description="data seconds from first to last sample")
     sources: tuple[NamedSource, ...] = Field(default=(), max_length=16)
     sensors: Sensors = Sensors()
+    rub: Rub | None = Field(default=None, description="needed where an event is a rub")
     events: tuple[Event, ...] = ()
 
     @model_validator(mode="after")
@@ -206,6 +245,8 @@ class Scenario(BaseModel):
             if event.source is not None and event.source not in names:
                 known = ", ".join(names) or "none"
                 raise ValueError(f"events.{number}.source: {event.source!r} is not among the sources ({known})")
+            if event.anomaly == "rub" and self.rub is None:
+                raise ValueError(f"events.{number}.anomaly: a rub needs the table [rub] with its clearance_m")
             if event.at_s + event.ramp_s > self.duration_s:
                 raise ValueError(
                     f"events.{number}: ends at {event.at_s + event.ramp_s:g} s, after duration_s {self.duration_s:g}"

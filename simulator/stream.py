@@ -14,6 +14,7 @@ import numpy.typing as npt
 from models.machine import Machine
 from models.signals.block import FloatArray, SampleBlock
 from simulator.integrator import Plant, theoretical_rms
+from simulator.nonlinear_plant import NONLINEAR, NonlinearPlant
 from simulator.scenario import Scenario
 from simulator.sensors import SensorBank
 from simulator.timeline import Condition, compile_timeline
@@ -92,7 +93,10 @@ class _Simulation:
         self._truth = deque(entry for entry in timeline.truth if entry[0] < self.n_samples)
         plant_seed, *sensor_seeds = np.random.SeedSequence(scenario.seed).spawn(1 + len(machine.sensors))
         initial = self._past[0][1]
-        self._plant = Plant(machine, initial, np.random.default_rng(plant_seed))
+        # The exact linear plant wherever it serves: only a crack or a rub needs the other one.
+        nonlinear = any(NONLINEAR & set(condition.anomalies) for _, condition in timeline.conditions)
+        plant = NonlinearPlant if nonlinear else Plant
+        self._plant = plant(machine, initial, np.random.default_rng(plant_seed))
         self._sensors = SensorBank(
             machine,
             scenario.sensors,
@@ -147,6 +151,8 @@ class _Simulation:
             relative_changes=dict(condition.relative_changes),
             speed_rpm=condition.speed_rpm,
             sources=condition.sources,
+            excitation_level=condition.excitation_level,
+            anomalies=dict(condition.anomalies),
             sensor_faults={name: dict(faults) for name, faults in self._sensors.faults_at(sample).items()},
             ramping=ramping,
         )

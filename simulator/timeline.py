@@ -10,12 +10,12 @@ A ramp becomes a staircase of 0.1 s steps, each at the value the ramp has in its
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import get_args
 
 from models.machine import Machine
 from models.physics.parameters import PARAMETERS
-from simulator.scenario import SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Scenario, SensorFault
+from simulator.scenario import ANOMALIES, SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Rub, Scenario, SensorFault
 
 __all__ = ["RAMP_STEP_S", "Condition", "SensorFaults", "Timeline", "compile_timeline"]
 
@@ -42,11 +42,20 @@ class Condition:
     speed_rpm : float
     sources : tuple of NamedSource
         Always as many and in the same order, so that the state carries over.
+    excitation_level : float
+        Factor on the white noise that drives all sources.
+    anomalies : mapping of str to float
+        Size of what the diagnosis knows nothing of, by kind; kinds of size 0 are left out.
+    rub : Rub or None
+        Where the disc may touch the casing.
     """
 
     relative_changes: Mapping[str, float]
     speed_rpm: float
     sources: tuple[NamedSource, ...]
+    excitation_level: float = 1.0
+    anomalies: Mapping[str, float] = field(default_factory=dict)
+    rub: Rub | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +90,7 @@ def compile_timeline(scenario: Scenario, machine: Machine) -> Timeline:
     events = sorted(scenario.events, key=lambda event: event.at_s)  # stable: equal times keep the file's order
     plant_events = [event for event in events if event.sensor is None]
     return Timeline(
-        conditions=_conditions(plant_events, scenario.sources, machine.operation.speed_rpm, rate_hz),
+        conditions=_conditions(plant_events, scenario, machine.operation.speed_rpm, rate_hz),
         sensor_faults={
             channel.name: _sensor_faults(
                 [event for event in events if event.sensor == channel.name],
@@ -96,23 +105,25 @@ def compile_timeline(scenario: Scenario, machine: Machine) -> Timeline:
 
 
 def _conditions(
-    events: list[Event], sources: tuple[NamedSource, ...], speed_rpm: float, rate_hz: float
+    events: list[Event], scenario: Scenario, speed_rpm: float, rate_hz: float
 ) -> tuple[tuple[int, Condition], ...]:
     values: dict[_Target, _Values] = {("parameter", name): (0.0,) for name in PARAMETERS}
     values["speed_rpm",] = (speed_rpm,)
-    for source in sources:
+    values["excitation_level",] = (1.0,)
+    values |= {("anomaly", kind): (0.0,) for kind in ANOMALIES}
+    for source in scenario.sources:
         values["source", source.name, "cutoff_hz"] = (source.cutoff_hz,)
         values["source", source.name, "force_rms_N"] = (source.force_rms_N,)
         values["source", source.name, "direction"] = source.direction
     changes = _steps(values, [(event, *_plant_target(event)) for event in events], rate_hz)
-    conditions = [(0, _condition(values, sources))]
+    conditions = [(0, _condition(values, scenario))]
     for sample, due in _by_sample(changes):
         values.update(due)
-        conditions.append((sample, _condition(values, sources)))
+        conditions.append((sample, _condition(values, scenario)))
     return tuple(conditions[1:] if len(conditions) > 1 and conditions[1][0] == 0 else conditions)
 
 
-def _condition(values: Mapping[_Target, _Values], sources: tuple[NamedSource, ...]) -> Condition:
+def _condition(values: Mapping[_Target, _Values], scenario: Scenario) -> Condition:
     def current(source: NamedSource) -> NamedSource:
         cutoff_hz, force_rms_N, direction = (
             values["source", source.name, field] for field in ("cutoff_hz", "force_rms_N", "direction")
@@ -124,19 +135,26 @@ def _condition(values: Mapping[_Target, _Values], sources: tuple[NamedSource, ..
     return Condition(
         relative_changes={name: values["parameter", name][0] for name in PARAMETERS},
         speed_rpm=values["speed_rpm",][0],
-        sources=tuple(current(source) for source in sources),
+        sources=tuple(current(source) for source in scenario.sources),
+        excitation_level=values["excitation_level",][0],
+        anomalies={kind: values["anomaly", kind][0] for kind in ANOMALIES if values["anomaly", kind][0]},
+        rub=scenario.rub,
     )
 
 
 def _plant_target(event: Event) -> tuple[_Target, _Values]:
     if event.parameter is not None and event.relative_change is not None:
         return ("parameter", event.parameter), (event.relative_change,)
-    if event.speed_rpm is not None:
-        return ("speed_rpm",), (event.speed_rpm,)
-    if event.cutoff_hz is not None:
-        return ("source", str(event.source), "cutoff_hz"), (event.cutoff_hz,)
-    if event.force_rms_N is not None:
-        return ("source", str(event.source), "force_rms_N"), (event.force_rms_N,)
+    for name in ("speed_rpm", "excitation_level"):
+        value = getattr(event, name)
+        if value is not None:
+            return (name,), (value,)
+    if event.anomaly is not None and event.size is not None:
+        return ("anomaly", event.anomaly), (event.size,)
+    for name in ("cutoff_hz", "force_rms_N"):
+        value = getattr(event, name)
+        if value is not None:
+            return ("source", str(event.source), name), (value,)
     return ("source", str(event.source), "direction"), event.direction or ()
 
 
@@ -223,4 +241,6 @@ def _truth_times(events: list[Event], rate_hz: float) -> tuple[tuple[int, tuple[
 def _label(event: Event) -> str:
     if event.speed_rpm is not None:
         return "speed"
-    return str(event.parameter or event.source or event.sensor)
+    if event.excitation_level is not None:
+        return "excitation_level"
+    return str(event.parameter or event.source or event.sensor or event.anomaly)

@@ -21,10 +21,14 @@ class TruthRecord(BaseModel):
     relative_changes: dict[str, float] = Field(description="every parameter's change from the original machine")
     speed_rpm: float
     sources: tuple[NamedSource, ...]
+    excitation_level: float = Field(default=1.0, description="factor on the white noise that drives all sources")
+    anomalies: dict[str, float] = Field(default={}, description="size of a crack, a rub, added mass; absent if none")
     sensor_faults: dict[str, dict[str, float | None]] = Field(
         description="by channel the active faults and their values, null where the kind has none"
     )
-    ramping: tuple[str, ...] = Field(description="what is still on its way: parameters, sources, sensors, 'speed'")
+    ramping: tuple[str, ...] = Field(
+        description="what is still on its way: parameters, sources, sensors, anomalies, 'speed', …"
+    )
 
     @property
     def text(self) -> str:
@@ -37,6 +41,7 @@ class TruthRecord(BaseModel):
         'k_by -20 %'
         """
         parts = [f"{name} {change:+.3g} %" for name, change in self._percent() if change]
+        parts += [f"{kind.replace('_', ' ')} {100 * size:.3g} %" for kind, size in self.anomalies.items()]
         parts += [f"{channel} {'+'.join(faults)}" for channel, faults in self.sensor_faults.items()]
         return ", ".join(parts) or "no fault"
 

@@ -14,9 +14,11 @@ from models.physics.lyapunov import stochastic_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import PARAMETERS
 from simulator.scenario import (
+    ANOMALIES,
     ChannelSettings,
     Event,
     NamedSource,
+    Rub,
     Scenario,
     SensorFault,
     SensorSettings,
@@ -44,6 +46,17 @@ def _file(folder: Path, text: str, name: str = "mine.toml") -> Path:
     path = folder / name
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def test_shapes_and_anomalies_survive_the_file(tmp_path: Path) -> None:
+    text = MINIMAL + "order = 1\nhump_share = 0.5\nhump_hz = 60.0\nhump_damping = 0.3\n[rub]\nclearance_m = 5e-5\n"
+    text += '[[events]]\nat_s = 1.0\nanomaly = "rub"\nsize = 0.2\n[[events]]\nat_s = 2.0\nexcitation_level = 2.0\n'
+    scenario, _ = load_scenario(_file(tmp_path, text))
+    (source,) = scenario.sources
+    assert (source.order, source.hump_share, source.hump_hz, source.hump_damping) == (1, 0.5, 60.0, 0.3)
+    assert scenario.rub == Rub(clearance_m=5e-5, friction=0.1)
+    assert [(e.anomaly, e.size, e.excitation_level) for e in scenario.events] == [("rub", 0.2, None), (None, None, 2.0)]
+    assert Scenario.model_validate_json(scenario.model_dump_json()) == scenario
 
 
 def test_the_shipped_scenarios_are_what_they_are_called() -> None:
@@ -119,7 +132,16 @@ def test_unusable_files_are_refused_with_file_field_and_value(tmp_path: Path, te
     ("event", "message"),
     [
         ("speed_rpm = 900.0", r"events\.0\.at_s: Field required"),
-        ("at_s = 1.0", "expected exactly one of parameter, speed_rpm, source, sensor; found none"),
+        (
+            "at_s = 1.0",
+            "one of parameter, speed_rpm, source, sensor, excitation_level, anomaly; found none",
+        ),
+        ('at_s = 1.0\nanomaly = "looseness"\nsize = 0.1', "'looseness' is not one of crack, rub, added_mass"),
+        ('at_s = 1.0\nanomaly = "crack"', "anomaly crack without size"),
+        ('at_s = 1.0\nanomaly = "crack"\nsize = 0.9', "size of anomaly crack is 0.9, expected 0 to 0.8"),
+        ('at_s = 1.0\nanomaly = "rub"\nsize = 0.2', r"events\.0\.anomaly: a rub needs the table \[rub\]"),
+        ("at_s = 1.0\nexcitation_level = 2.0\nsize = 0.2", "size belongs to an event with anomaly"),
+        ("at_s = 1.0\nexcitation_level = -2.0", "excitation_level: .*greater than or equal to 0"),
         ('at_s = 1.0\nspeed_rpm = 900.0\nparameter = "e"\nrelative_change = 0.1', "found parameter and speed_rpm"),
         ('at_s = 1.0\nparameter = "k_xx"\nrelative_change = 0.1', "parameter 'k_xx' is not one of k_by, c_by"),
         ('at_s = 1.0\nparameter = "e"', "change of parameter e without relative_change"),
@@ -200,7 +222,7 @@ def test_the_page_example_loads(tmp_path: Path) -> None:
     assert scenario.sensors.noise_relative == 0.02
 
 
-@pytest.mark.parametrize("model", [Scenario, NamedSource, SensorSettings, ChannelSettings, Event, TruthRecord])
+@pytest.mark.parametrize("model", [Scenario, NamedSource, Rub, SensorSettings, ChannelSettings, Event, TruthRecord])
 def test_the_page_explains_every_field(model: type[BaseModel]) -> None:
     cells = " ".join(re.findall(r"^\| ([^|]+) \|", PAGE, re.MULTILINE))
     missing = [field for field in model.model_fields if f"`{field}`" not in cells]
@@ -211,7 +233,7 @@ def test_the_page_explains_every_field(model: type[BaseModel]) -> None:
 
 
 def test_the_page_names_every_scenario_fault_and_parameter() -> None:
-    names: list[Any] = [*shipped_scenarios(), *get_args(SensorFault), *PARAMETERS]
+    names: list[Any] = [*shipped_scenarios(), *get_args(SensorFault), *PARAMETERS, *ANOMALIES]
     assert [name for name in names if f"`{name}`" not in PAGE] == []
 
 

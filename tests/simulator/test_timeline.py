@@ -131,3 +131,18 @@ def test_sensor_ramps_start_at_neutral_and_may_overlap(machine: Machine) -> None
     assert states[3000] == {"gain": pytest.approx(1.55), "offset": pytest.approx(5e-5)}
     assert states[4000] == {"gain": 2.0, "offset": pytest.approx(5.5e-4)}
     assert states[5000] == {"gain": 2.0, "offset": 1e-3}
+
+
+def test_level_and_anomalies_ramp_and_end(machine: Machine) -> None:
+    timeline = _compiled(
+        machine,
+        Event(at_s=1, ramp_s=10, excitation_level=2.0),
+        Event(at_s=2, anomaly="crack", size=0.3),
+        Event(at_s=20, anomaly="crack", size=0),
+    )
+    assert (_at(timeline, 0).excitation_level, dict(_at(timeline, 0).anomalies)) == (1.0, {})
+    middle = _at(timeline, 2000 * 6)
+    assert middle.excitation_level == pytest.approx(1.505)
+    assert dict(middle.anomalies) == {"crack": 0.3}
+    assert (_at(timeline, 2000 * 30).excitation_level, dict(_at(timeline, 2000 * 30).anomalies)) == (2.0, {})
+    assert ("excitation_level",) in [names for _, names in timeline.truth]
