@@ -167,18 +167,25 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
 
 
 def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
-    """Sums of products at all lags through zero-padded Fourier transforms: history as reference, hop as response."""
-    longest = int(plan.lags[-1])
-    reference = a[plan.preamble - longest :]
-    response = a[plan.preamble :]
-    size = _fast_length(reference.shape[0])
-    spectrum_reference = np.fft.rfft(reference, size, axis=0)
-    spectrum_response = np.fft.rfft(np.vstack([np.zeros((longest, a.shape[1])), response]), size, axis=0)
-    products = np.empty((plan.lags.size, a.shape[1], a.shape[1]))
-    for i in range(a.shape[1]):
-        cross = np.fft.irfft(spectrum_reference[:, i, None].conj() * spectrum_response, size, axis=0)
-        products[:, i, :] = cross[plan.lags]
-    return products
+    """Sums of products at all lags: history as reference, hop as response.
+
+    The lags are short and the hop is long, so the hop is cut into blocks of twice the longest lag; their cross-spectra
+    (each block's reference reaches back by the longest lag, its response is zero there) are added up before one inverse
+    transform of a block's length.
+    """
+    longest, n = int(plan.lags[-1]), a.shape[1]
+    size = _fast_length(longest + max(2 * longest, 256))
+    block = size - longest
+    count = -(-plan.hop // block)
+    padded = np.zeros((n, longest + count * block))
+    padded[:, : longest + plan.hop] = a[plan.preamble - longest :].T
+    reference = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::block]
+    response = reference.copy()
+    response[:, :, :longest] = 0
+    spectrum_reference, spectrum_response = np.fft.rfft(reference), np.fft.rfft(response)  # (n, count, n_frequencies)
+    cross = spectrum_reference.transpose(2, 0, 1).conj() @ spectrum_response.transpose(2, 1, 0)
+    products = np.fft.irfft(np.ascontiguousarray(cross.reshape(-1, n * n).T), size)[:, plan.lags]
+    return np.ascontiguousarray(products.T).reshape(-1, n, n)
 
 
 def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:

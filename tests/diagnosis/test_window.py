@@ -1,6 +1,6 @@
 """Sliding correlations: online equals batch for any splitting; offsets, gaps and the synchronous part."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from models.diagnosis.moments import Plan, plan_for
+from models.diagnosis.moments import Plan, hop_moments, plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
@@ -74,6 +74,21 @@ def batch_correlation(plan: Plan, samples: FloatArray, end: int) -> FloatArray:
     beta = np.linalg.lstsq(regressors[start:end], x[start:end], rcond=None)[0]
     rest = x - regressors @ beta
     return np.stack([rest[start - lag : end - lag].T @ rest[start:end] / (end - start) for lag in plan.lags])
+
+
+@pytest.mark.parametrize("hop", [100, 306, 307, 2000])
+def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
+    """Shorter and longer than a block of the transform, with channels six orders of magnitude apart."""
+    plan = replace(small_plan(), hop=hop)
+    samples = signal(plan.preamble + hop, 31)
+    samples[:, 1] *= 1e6
+    products = hop_moments(plan, samples, np.zeros(2), 0).products
+    theta = samples[:, 2]
+    a = np.column_stack([samples[:, :2], np.ones(len(theta)), np.cos(theta), np.sin(theta)])
+    now = slice(plan.preamble, plan.preamble + hop)
+    direct = np.stack([a[plan.preamble - lag : plan.preamble + hop - lag].T @ a[now] for lag in plan.lags])
+    scale = np.sqrt(np.diag(direct[0]))
+    np.testing.assert_allclose(products / np.outer(scale, scale), direct / np.outer(scale, scale), atol=1e-12)
 
 
 @settings(max_examples=30, deadline=None)
