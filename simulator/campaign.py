@@ -7,7 +7,7 @@ made in any order by any number of processes, and no purpose ever shares a reali
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import partial
 
@@ -15,12 +15,14 @@ import numpy as np
 
 from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.lyapunov import stochastic_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import PARAMETERS, changed
 from models.signals.channels import Channel, Quantity
 from simulator.integrator import theoretical_rms
+from simulator.nonlinear_plant import NonlinearPlant
 from simulator.scenario import Event, NamedSource, Rub, Scenario, Sensors
 from simulator.stream import blocks
 from simulator.timeline import Condition
@@ -79,9 +81,12 @@ class Anomaly(IntEnum):
 
     NONE = 0
     CRACK = 1
-    """Breathing crack (0.3 of the shaft's bending stiffness)."""
+    """Breathing crack (0.3 of the shaft's bending stiffness); halved until the machine is stable at its speed."""
     RUB = 2
-    """Disc touching the casing (0.2 of the shaft's stiffness), clearance 1.5 times the disc's radial rms."""
+    """Disc touching the casing (0.2 of the shaft's stiffness), clearance 1.5 times the disc's radial rms.
+
+    That is a contact a tenth of the time. Sizes of 1 and more may be unstable on lightly damped machines.
+    """
     ADDED_MASS = 3
     """Even deposit on the disc (0.07 of its mass)."""
     GAIN_DRIFT = 4
@@ -270,8 +275,23 @@ def _anomaly(
             rms = theoretical_rms(draw.machine, Condition(changes, speed_rpm, sources))
             clearance_m = _CLEARANCE * float(np.hypot(rms[STATE_INDEX["y2"]], rms[STATE_INDEX["z2"]]))
             return Rub(clearance_m=clearance_m), [Event(at_s=0, anomaly="rub", size=size)]
-        case _:
-            return None, [Event(at_s=0, anomaly=draw.anomaly.name.lower(), size=size)]
+        case Anomaly.CRACK:
+            size = _stable_crack(size, draw.machine, Condition(changes, speed_rpm, ()))
+            return None, [Event(at_s=0, anomaly="crack", size=size)]
+        case Anomaly.ADDED_MASS:
+            return None, [Event(at_s=0, anomaly="added_mass", size=size)]
+
+
+def _stable_crack(size: float, machine: Machine, condition: Condition) -> float:
+    """Halve a crack until the machine can be run: a lightly damped one has speeds at which a deep crack is unstable."""
+    plant = NonlinearPlant(machine, condition, np.random.default_rng(0))
+    while True:
+        try:
+            plant.change(replace(condition, anomalies={"crack": size}))
+        except EstimationError:
+            size /= 2
+        else:
+            return size
 
 
 def _scaled(

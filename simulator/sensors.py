@@ -52,6 +52,8 @@ class Sensor:
     def noise(self, n_samples: int) -> FloatArray:
         """Draw the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
         white = self._rng.standard_normal(n_samples)
+        if self._memory == 0:
+            return white
         innovation = float(np.sqrt(1 - self._memory**2))
         # Stationary from the first sample on: it has the full variance instead of one innovation's.
         carried = white[0] * (1 - innovation) if self._noise is None else self._memory * self._noise

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
+from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.campaign import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition
-from simulator.scenario import Scenario
+from simulator.integrator import rotor_in
+from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
+from simulator.timeline import compile_timeline
 
 LAB = load_machine("lab")
 
@@ -96,3 +99,22 @@ def test_anomalies_have_their_effect() -> None:
     assert harmonic(shown[Anomaly.ADDED_MASS], 1) > 1.01 * harmonic(usual, 1)
     factors = shown[Anomaly.GAIN_DRIFT].std(axis=0) / usual.std(axis=0)
     np.testing.assert_allclose(np.sort(factors), [*np.ones(8), 1.1], rtol=1e-3)
+
+
+def test_a_crack_is_no_deeper_than_the_machine_can_be_run_with() -> None:
+    light = load_machine("light")
+    light = light.model_copy(update={"operation": light.operation.model_copy(update={"speed_tolerance": 0.0})})
+    nominal = light.operation.model_copy(update={"speed_rpm": 1.11 * light.operation.speed_rpm})
+    for machine, depth in ((light, 0.3), (light.model_copy(update={"operation": nominal}), 0.15)):
+        scenario = draw_condition(Draw(machine, 12, Purpose.EVALUATION, anomaly=Anomaly.CRACK, anomaly_size=0.3), 0)
+        assert [event.size for event in scenario.events if event.anomaly == "crack"] == [depth]
+    deep = scenario.model_copy(update={"events": (*scenario.events, Event(at_s=0, anomaly="crack", size=0.3))})
+    with pytest.raises(EstimationError, match=r"machine light: a crack of 0\.3 is unstable, the motion grows"):
+        next(blocks(deep, machine))
+
+
+def test_a_deposit_adds_mass_and_inertia_but_no_unbalance() -> None:
+    condition = compile_timeline(draw_condition(_plain(anomaly=Anomaly.ADDED_MASS, anomaly_size=0.1), 5), LAB)
+    rotor = rotor_in(LAB, condition.conditions[0][1])
+    ratios = [getattr(rotor, name) / getattr(LAB.rotor, name) for name in ("m2_kg", "I2_kg_m2", "I2p_kg_m2", "e_m")]
+    assert ratios == pytest.approx([1.1, 1.1, 1.1, 1 / 1.1])
