@@ -15,7 +15,7 @@ from models.diagnosis.equations import (
     SynchronousEquation,
     missing,
 )
-from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
@@ -25,6 +25,7 @@ __all__ = [
     "EquationNetwork",
     "Healthy",
     "Network",
+    "RelationDiagnostician",
     "equation_by_number",
     "hop_views",
     "read_equation",
@@ -71,10 +72,10 @@ class Healthy:
     msd : float
         Mean of the mean squared deviation.
     z_scale : tuple of float
-        Standard deviation of each own parameter's reading in its own standard errors: the standard errors are
-        multiplied by it.
+        What the standard errors are multiplied by so that 95 % intervals hold 95 %: from quantiles of the readings in
+        their own standard errors, not from their mean square, which a few windows with one source decide.
     spread : tuple of float
-        Standard deviation of each own parameter's reading.
+        Robust standard deviation of each own parameter's reading.
     """
 
     windows: int
@@ -136,18 +137,17 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     residual = _residual(trained.network, rows, norm)
     projection = np.linalg.pinv(rows.signatures / norm)
     change = projection @ residual
-    hops = np.stack(
-        [
-            projection @ _residual(trained.network, equation.rows(view, machine), norm)
-            for view in hop_views(window, machine)
-        ]
-    )
+    hop_rows = [equation.rows(view, machine) for view in hop_views(window, machine)]
+    n_hops = len(hop_rows)
+    inputs = np.concatenate([hop.inputs for hop in hop_rows]) / norm
+    targets = np.concatenate([hop.target for hop in hop_rows]) / norm
+    hops = (targets - trained.network(inputs)).reshape(n_hops, -1) @ projection.T
     error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
     healthy = trained.healthy
     if healthy is not None:
         error = error * np.array(healthy.z_scale)
     readings = tuple(
-        ParameterReading(name, "network", float(value), float(spread))
+        ParameterReading(name, "relation", float(value), float(spread))
         for name, value, spread in zip(equation.parameters, change, error, strict=True)
     )
     return EquationReading(
@@ -166,3 +166,38 @@ def _residual(network: Network, rows: EquationRows, norm: float) -> FloatArray:
 def equation_by_number(number: str) -> Equation | SynchronousEquation:
     """Look an equation up; KeyError for a number that is not in the table."""
     return {equation.number: equation for equation in EQUATIONS}[number]
+
+
+class RelationDiagnostician:
+    """Reads the parameters of a window from the residuals of equations (28)-(31).
+
+    Parameters
+    ----------
+    machine : Machine
+    networks : tuple of EquationNetwork
+        The trained networks, calibrated.
+    """
+
+    def __init__(self, machine: Machine, networks: tuple[EquationNetwork, ...]) -> None:
+        self._machine = machine
+        self._networks = {trained.equation.number: trained for trained in networks}
+
+    @property
+    def by(self) -> str:
+        """Name under which it is reported."""
+        return "relation"
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
+        equations, parameters = [], []
+        for equation in EQUATIONS:
+            trained = self._networks.get(equation.number)
+            if trained is None:
+                reading = EquationReading(equation.number, equation.title, reason="no trained network")
+            else:
+                reading = read_equation(trained, window, self._machine)
+            equations.append(reading)
+            parameters += reading.parameters or [
+                ParameterReading(name, self.by, reason=reading.reason) for name in equation.parameters
+            ]
+        return Diagnosis(self.by, tuple(parameters), tuple(equations))

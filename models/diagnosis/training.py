@@ -21,6 +21,12 @@ __all__ = ["calibrate", "train_network"]
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25
 
+_LEVELS = [0.9, 0.95]
+_NORMAL = np.array([[1.644854], [1.959964]])
+"""Quantiles of |z| that calibrate the standard errors, and those of the normal distribution; two scatter less than one."""
+_MAD = 1.4826
+"""Median absolute deviation to standard deviation."""
+
 
 def train_network(
     equation: Equation | SynchronousEquation,
@@ -110,8 +116,8 @@ def calibrate(trained: EquationNetwork, windows: Sequence[WindowStatistics], mac
     healthy = Healthy(
         windows=len(windows),
         msd=float(np.mean([reading.msd for reading in readings])),
-        z_scale=tuple(float(value) for value in np.sqrt(np.mean(z**2, axis=0))),
-        spread=tuple(float(value) for value in np.sqrt(np.mean(change**2, axis=0))),
+        z_scale=tuple(float(value) for value in np.mean(np.quantile(np.abs(z), _LEVELS, axis=0) / _NORMAL, axis=0)),
+        spread=tuple(float(value) for value in np.median(np.abs(change), axis=0) * _MAD),
     )
     return EquationNetwork(trained.equation, trained.network, healthy)
 

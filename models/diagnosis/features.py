@@ -1,0 +1,275 @@
+"""What the amortised networks look at: a window's cross-spectra, brought into a form in which faults stand out.
+
+The cross-spectra are the Fourier transforms of the correlation functions (Eq. 18): the same information. They are taken
+through the *nominal* machine backwards: the motion of the measured degrees of freedom times the nominal dynamic
+stiffness is the force that the nominal machine would have needed. Where the machine is nominal these force spectra are
+those of the excitation: smooth, with one constant coherence. A changed parameter leaves its own trace, the measured
+motion times the change. And every frequency gets the weight it has in the likelihood: logarithms of the force spectra,
+and coherences instead of cross-spectra, have the same sampling error at all frequencies, loud or quiet. Levels drop
+out.
+
+Frequencies are then condensed by principal components of *expected* features over random machines and conditions:
+directions in which nothing but sampling error varies are left out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.diagnosis.moments import ComplexArray, plan_for
+from models.machine import Machine
+from models.physics.excitation import Source
+from models.physics.lyapunov import stochastic_covariance
+from models.physics.matrices import STATE_INDEX, M_matrix, P_matrix, Q_matrix
+from models.signals.block import FloatArray
+
+__all__ = ["FeatureBasis", "Float32Array", "ForceFeatures", "fit_basis", "principal_directions"]
+
+Float32Array = npt.NDArray[np.float32]
+
+_BANDS = 8
+_FLOOR = 1e-9
+_LEAST_VARIANCE = 1e-3
+
+
+class ForceFeatures:
+    """Features of one machine's windows before they are condensed.
+
+    Parameters
+    ----------
+    machine : Machine
+        Nominal rotor and window.
+    states : tuple of str or None
+        Measured states to look at; None takes all that the machine measures.
+    """
+
+    def __init__(self, machine: Machine, states: tuple[str, ...] | None = None) -> None:
+        plan = plan_for(machine)
+        self.states, self.frequencies_hz = plan.states if states is None else states, plan.frequencies_hz
+        self.has_angle = plan.angle_column is not None
+        self._machine = machine
+        self._duration_s = plan.hops * plan.hop / plan.rate_hz
+        index = np.array([STATE_INDEX[name] for name in self.states])
+        self._dofs = sorted(set(index % 6))
+        self._pairs = tuple((i, j) for i in range(len(self._dofs)) for j in range(i))
+        self._twice = tuple(
+            (self.states.index(name), self.states.index(f"{name}_dot"))
+            for name in self.states
+            if f"{name}_dot" in self.states
+        )
+        self._motion = self._motion_weights(index)
+        w = 2 * np.pi * self.frequencies_hz
+        self._force = self._to_force(w, np.full(w.size, machine.operation.speed_rad_s))
+        self._force_adjoint = np.ascontiguousarray(self._force.conj().swapaxes(1, 2))
+        self._bands = np.linspace(0, w.size, _BANDS + 1)[:-1].astype(int)
+
+    @property
+    def n_series(self) -> int:
+        """Number of functions of frequency: force spectra, and real and imaginary parts of their coherences."""
+        return len(self._dofs) + 2 * len(self._pairs)
+
+    def _motion_weights(self, index: npt.NDArray[np.intp]) -> FloatArray:
+        """Corner ω where rates take over from displacements, for each measured degree of freedom, rad/s.
+
+        Their noise is proportional to their own rms, so that ω is the ratio of the two, here of the nominal machine
+        under equal forces. 0 where only the rate is measured, infinite where only the displacement is.
+        """
+        machine = self._machine
+        cutoff = float(np.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1]))
+        sources = tuple(
+            Source(cutoff_hz=cutoff, direction=tuple(np.eye(6)[dof]), force_rms_N=1.0) for dof in (0, 1, 3, 4)
+        )
+        variance = np.diag(stochastic_covariance(machine.rotor, machine.operation.speed_rad_s, sources))
+        corner = np.sqrt(variance[6:] / variance[:6])
+        present = set(index.tolist())
+        return np.array(
+            [0.0 if d not in present else np.inf if d + 6 not in present else corner[d] for d in self._dofs]
+        )
+
+    def _to_force(self, w: FloatArray, speed_rad_s: FloatArray) -> ComplexArray:
+        """Matrices that turn measured states into equivalent forces, shape (n_frequencies, n_dofs, n).
+
+        Parameters
+        ----------
+        w : ndarray, shape (n_frequencies,)
+            Angular frequencies, rad/s.
+        speed_rad_s : ndarray, shape (n_frequencies,)
+            Speed Ω at each of them.
+        """
+        rotor = self._machine.rotor
+        still = P_matrix(rotor, 0.0)
+        gyroscopic = P_matrix(rotor, 1.0) - still  # linear in Ω
+        W = w[:, None, None]
+        dynamic = 1j * W * (still + speed_rad_s[:, None, None] * gyroscopic) - W**2 * M_matrix(rotor) + Q_matrix(rotor)
+        stiffness = np.linalg.inv(np.linalg.inv(dynamic)[:, self._dofs][:, :, self._dofs])
+        motion = np.zeros((w.size, len(self._dofs), len(self.states)), dtype=np.complex128)
+        for row, (dof, corner) in enumerate(zip(self._dofs, self._motion, strict=True)):
+            rate = np.ones_like(w) if corner == 0 else 1 / (1 + (corner / w) ** 2)
+            for column, name in enumerate(self.states):
+                if STATE_INDEX[name] == dof:
+                    motion[:, row, column] = 1 - rate
+                elif STATE_INDEX[name] == dof + 6:
+                    motion[:, row, column] = rate / (1j * w)
+        return np.asarray(stiffness @ motion, dtype=np.complex128)
+
+    def force(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
+        """Cross-spectra of the equivalent forces, shape (n_windows, n_bins, n_dofs, n_dofs).
+
+        Parameters
+        ----------
+        spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
+            Cross-spectra of the measured states, SI²/Hz.
+        """
+        return np.asarray(self._force @ spectrum @ self._force_adjoint, dtype=np.complex128)
+
+    def series(self, force: npt.NDArray[np.complexfloating]) -> Float32Array:
+        """Functions of frequency, shape (n_series, n_windows, n_bins), of the cross-spectra of the forces."""
+        m = len(self._dofs)
+        power = np.maximum(np.einsum("bfii->ibf", force).real, np.finfo(np.float32).tiny)
+        out = np.empty((self.n_series, *force.shape[:2]), dtype=np.float32)
+        out[:m] = np.log(power)
+        out[:m] -= out[:m].mean(axis=(0, 2), keepdims=True)
+        amplitude = np.sqrt(power)
+        for k, (i, j) in enumerate(self._pairs):
+            coherence = force[:, :, i, j] / (amplitude[i] * amplitude[j])
+            out[m + 2 * k], out[m + 2 * k + 1] = coherence.real, coherence.imag
+        return out
+
+    def consistency(self, spectrum: npt.NDArray[np.complexfloating], speed_rad_s: FloatArray) -> Float32Array:
+        """Speed, and agreement of displacement and rate, shape (n_windows, n).
+
+        For every degree of freedom measured twice, in eight bands: the logarithm of the ratio of the two powers, which
+        shows a sensor at fault, and of what is not coherent between them, which shows the sensor noise.
+        """
+        n_windows = spectrum.shape[0]
+        speed = np.where(np.isfinite(speed_rad_s), speed_rad_s / self._machine.operation.speed_rad_s - 1, 0.0)
+        parts = [speed[:, None]]
+        w = 2 * np.pi * self.frequencies_hz
+        if self._twice:
+            x, v = (list(side) for side in zip(*self._twice, strict=True))
+            sums = (
+                np.add.reduceat(part, self._bands, axis=1)
+                for part in (
+                    spectrum[:, :, x, x].real * w[:, None] ** 2,
+                    spectrum[:, :, v, v].real,
+                    spectrum[:, :, x, v] * w[:, None],
+                )
+            )
+            s_x, s_v, s_xv = sums
+            apart = 1 - np.abs(s_xv) ** 2 / (s_x * s_v)
+            parts += [
+                np.log(s_x / s_v).reshape(n_windows, -1),
+                np.log(np.maximum(apart, _FLOOR)).reshape(n_windows, -1),
+            ]
+        return np.asarray(np.concatenate(parts, axis=1).reshape(n_windows, -1), dtype=np.float32)
+
+    def unbalance(
+        self,
+        spectrum: npt.NDArray[np.complexfloating],
+        synchronous: npt.NDArray[np.complexfloating],
+        speed_rad_s: FloatArray,
+    ) -> Float32Array:
+        """What equation 29 looks at besides, shape (n_windows, 3 n_dofs).
+
+        The rotation-synchronous vectors as forces, in units of the nominal unbalance force (real parts, imaginary
+        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them.
+
+        Parameters
+        ----------
+        spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
+        synchronous : ndarray of complex, shape (n_windows, n)
+        speed_rad_s : ndarray, shape (n_windows,)
+        """
+        machine = self._machine
+        unbalance = machine.rotor.m2_kg * machine.rotor.e_m * speed_rad_s**2
+        transfer = self._to_force(speed_rad_s, speed_rad_s)  # each window's vectors stand at its own speed
+        force = (transfer @ synchronous[:, :, None])[:, :, 0]
+        force = force * np.exp(-1j * machine.operation.unbalance_phase_rad) / unbalance[:, None]
+        nearest = np.argmin(np.abs(self.frequencies_hz - speed_rad_s[:, None] / (2 * np.pi)), axis=1)
+        nearest = np.clip(nearest, 6, self.frequencies_hz.size - 7)
+        beside = np.concatenate([np.arange(-6, -2), np.arange(3, 7)])  # the rotation's own bins lack its part
+        around = spectrum[np.arange(nearest.size)[:, None], nearest[:, None] + beside].mean(axis=1)
+        power = np.einsum("bij,bjk,bik->bi", transfer, around, transfer.conj()).real
+        error = np.log(np.maximum(power, np.finfo(np.float64).tiny) * 4 / self._duration_s / unbalance[:, None] ** 2)
+        return np.asarray(np.concatenate([force.real, force.imag, error], axis=1), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureBasis:
+    """How raw features become the inputs of the networks, float32.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (n_series, 1, n_bins)
+    directions : ndarray, shape (n_series, n_bins, n_kept)
+        Principal components of every function of frequency.
+    centre, scale : ndarray, shape (n_inputs,)
+        Of all inputs over random machines and conditions; those of equation 29 alone stand last.
+    precision_factor : ndarray, shape (n_common, n_common)
+        Factor F of their inverse covariance F Fᵀ, without those of equation 29.
+    """
+
+    mean: Float32Array
+    directions: Float32Array
+    centre: Float32Array
+    scale: Float32Array
+    precision_factor: Float32Array
+
+    @property
+    def n_common(self) -> int:
+        """Inputs that all networks share."""
+        return int(self.precision_factor.shape[0])
+
+    def condensed(self, series: Float32Array) -> Float32Array:
+        """Scores of the functions of frequency, shape (n_windows, n_series · n_kept)."""
+        scores = (series - self.mean) @ self.directions
+        flat: Float32Array = np.ascontiguousarray(scores.transpose(1, 0, 2)).reshape(series.shape[1], -1)
+        return flat
+
+    def standardised(self, raw: Float32Array) -> Float32Array:
+        """Inputs in units of their usual deviation; `raw` may lack those of equation 29."""
+        n = raw.shape[1]
+        return np.asarray((raw - self.centre[:n]) / self.scale[:n], dtype=np.float32)
+
+    def novelty(self, inputs: Float32Array) -> FloatArray:
+        """Squared Mahalanobis distance per input from the windows trained on, shape (n_windows,): one is usual."""
+        n = self.n_common
+        return np.asarray(np.mean((inputs[:, :n] @ self.precision_factor) ** 2, axis=1), dtype=np.float64)
+
+
+def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Array, Float32Array]:
+    """Mean, shape (n_series, 1, n_bins), and first principal components, shape (n_series, n_bins, n_kept).
+
+    Parameters
+    ----------
+    series : ndarray, shape (n_series, n_windows, n_bins)
+        Of expected spectra, without sampling error.
+    n_kept : int
+    """
+    mean = series.mean(axis=1, keepdims=True)
+    deviation = (series - mean).astype(np.float64)
+    vectors = np.linalg.eigh(deviation.swapaxes(1, 2) @ deviation)[1]  # ascending
+    directions = vectors[:, :, ::-1][:, :, :n_kept]
+    return mean, np.ascontiguousarray(directions, dtype=np.float32)
+
+
+def fit_basis(mean: Float32Array, directions: Float32Array, raw: Float32Array, n_common: int) -> FeatureBasis:
+    """Standardise features and measure their covariance.
+
+    Parameters
+    ----------
+    mean, directions : ndarray
+        From `principal_directions`.
+    raw : ndarray, shape (n_windows, n_inputs)
+        Condensed features of windows with sampling error.
+    n_common : int
+        How many of the inputs all networks share.
+    """
+    centre = raw.mean(axis=0)
+    scale = raw.std(axis=0) + np.float32(1e-6)
+    common = ((raw - centre) / scale)[:, :n_common].astype(np.float64)
+    values, vectors = np.linalg.eigh(common.T @ common / common.shape[0])
+    # What hardly varies in training would make every real window a stranger: it counts with a little variance.
+    factor = vectors / np.sqrt(values + _LEAST_VARIANCE)
+    return FeatureBasis(mean, directions, centre, scale, np.ascontiguousarray(factor, dtype=np.float32))
