@@ -219,6 +219,49 @@ def reproduce(
         _fail(error)
 
 
+@app.command()
+def peers(
+    machine: MachineOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="JSON file for the numbers; the figure goes beside it.")],
+    bundle: Annotated[
+        str | None,
+        typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
+    ] = None,
+    windows: Annotated[int, typer.Option(min=2, help="Windows per true change and setting.")] = 100,
+    healthy: Annotated[
+        int, typer.Option(min=9, help="Healthy windows to learn from; as many again set the limits.")
+    ] = 199,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-6, max=0.5, help="Declared false-alarm rate per window, for every method.")
+    ] = 0.01,
+    seed: SeedOption = _SEED,
+    processes: ProcessesOption = _CORES,
+) -> None:
+    """Compare with operational modal analysis and a feature vector, on the same windows.
+
+    Bearing stiffness, bearing damping and unbalance change by 5, 10 and 20 %; once in the laboratory, where nothing
+    varies but the realisation, and once with a condition drawn for every window. Needs the extra "peers".
+
+    Example: rotortrain peers --machine lab --out peers.json --windows 100
+    """
+    _one_thread_per_process()
+    from simulator.peers_command import compare_peers  # noqa: PLC0415  # start-up stays free of numpy and torch
+
+    try:
+        compare_peers(
+            machine,
+            machine if bundle is None else bundle,
+            out,
+            windows=windows,
+            healthy=healthy,
+            false_alarm_rate=false_alarms,
+            seed=seed,
+            processes=processes,
+        )
+    except RotorwatchError as error:
+        _fail(error)
+
+
 def _one_thread_per_process() -> None:
     """Keep the linear algebra to one thread: the workers are processes. Takes effect before numpy is first imported."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):

@@ -17,11 +17,11 @@ from models.signals.block import FloatArray
 from simulator.study import REALISATIONS, Realisation, Study, StudyCell
 from simulator.study_windows import CONDITIONS, EQUATIONS, METHODS, own_equations
 
-__all__ = ["COLOURS", "METHOD_TEXT", "STYLE", "draw_study", "save_figure"]
+__all__ = ["COLOURS", "MARKERS", "METHOD_TEXT", "STYLE", "draw_study", "save_figure"]
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """After Okabe and Ito: told apart with any colour vision."""
-_MARKERS = ("o", "s", "^", "D", "v")
+MARKERS = ("o", "s", "^", "D", "v", "P")
 STYLE = {
     "font.size": 9.0,
     "axes.titlesize": 9.0,
@@ -109,7 +109,7 @@ def _deviations(study: Study, realisation: Realisation) -> Figure:
     figure.supxlabel("cutoff of the excitation, Hz", fontsize=9)
     figure.supylabel("MSD over the healthy limit (above 1: named)", fontsize=9)
     handles = [
-        axes.plot([], [], linestyle="", marker=_MARKERS[n], color=COLOURS[n], label=f"equation {equation}")[0]
+        axes.plot([], [], linestyle="", marker=MARKERS[n], color=COLOURS[n], label=f"equation {equation}")[0]
         for n, equation in enumerate(EQUATIONS)
     ]
     handles.append(axes.plot([], [], "k--", linewidth=0.9, label="healthy limit")[0])
@@ -140,7 +140,7 @@ def _interval(
         middle,
         yerr=[middle - low, high - middle],
         color=COLOURS[n],
-        marker=_MARKERS[n],
+        marker=MARKERS[n],
         markerfacecolor=COLOURS[n] if filled else "white",
         markersize=6 if filled else 4.5,
         linestyle="",
@@ -205,7 +205,7 @@ def _noise(study: Study) -> Figure:
             if all(equation in cell.msd[method] for cell in cells):
                 x = np.array([100 * cell.noise_relative for cell in cells]) + 0.1 * (n - 1.5)
                 _interval(axes, x, [np.array(cell.msd[method][equation]) for cell in cells], n, filled=True)
-                axes.plot([], [], linestyle="", marker=_MARKERS[n], color=COLOURS[n], label=f"equation {equation}")
+                axes.plot([], [], linestyle="", marker=MARKERS[n], color=COLOURS[n], label=f"equation {equation}")
         axes.set_yscale("log")
         axes.set_xticks([100 * cell.noise_relative for cell in cells])
         axes.set_title(f"{METHOD_TEXT[method]}, {REALISATION_TEXT[realisation]}", loc="left")

@@ -1,0 +1,318 @@
+"""What a user would otherwise pick, on the same samples: operational modal analysis, and a feature vector.
+
+Both learn how healthy windows are and say how far a window is from that (Hotelling's T²). Neither knows a parameter of
+the machine, and neither says which one changed.
+
+The subspace identification is pyOMA2's covariance-driven SSI. Its defaults are not used where they would reject the
+modes of a rotor: hard criteria on mode phase collinearity or deviation throw out complex mode shapes, which forward and
+backward whirl are, and a damping limit of 10 % throws out well-damped bearings.
+"""
+
+import logging
+import os
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+import scipy.optimize
+import scipy.signal
+import scipy.stats
+
+from models.diagnosis.moments import plan_for
+from models.errors import EstimationError
+from models.machine import Machine
+from models.physics.matrices import STATE_INDEX, system_A
+from models.signals.block import FloatArray
+
+__all__ = ["FeatureVector", "Peer", "SubspaceModes", "hotelling_limit", "reference_modes", "score_limit"]
+
+_MORE_ORDERS = 16
+"""Model orders from twice the number of modes to this many above it, as in a stabilisation diagram; the median over
+them counts."""
+
+_BLOCK_ROWS_PER_PERIOD = 1.4
+_MOST_DAMPING = 0.3
+_NEAREST = 0.3
+"""A pole further than this from a reference mode in relative frequency is not that mode."""
+
+_LEAST_MAC = 0.5
+_MOST_SHARE_LOST = 0.5
+_LEAST_SHARE_THERE = 0.8
+
+
+class Peer(Protocol):
+    """A method that knows only how the machine used to be."""
+
+    @property
+    def name(self) -> str:
+        """Name under which it is reported."""
+
+    def features(self, samples: FloatArray) -> FloatArray:
+        """Features of one window of SI samples, shape (n_features,); nan where there is nothing to be found.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_states [+ 1])
+            As `models.diagnosis.moments.Plan.to_si` gives them, the shaft angle last.
+        """
+
+    def fit(self, healthy: FloatArray) -> None:
+        """Learn from the features of healthy windows, shape (n_windows, n_features)."""
+
+    def score(self, features: FloatArray) -> float:
+        """Distance of one window's features from healthy; nan if it has none."""
+
+
+def score_limit(healthy_scores: FloatArray, false_alarm_rate: float) -> float:
+    """Limit that a further healthy window exceeds with the declared probability at most, whatever the distribution.
+
+    Parameters
+    ----------
+    healthy_scores : ndarray, shape (n,)
+        Of healthy windows that `Peer.fit` did not see.
+    false_alarm_rate : float
+        α per window: the ⌈(n+1)(1-α)⌉-th smallest score is the limit.
+
+    Raises
+    ------
+    EstimationError
+        If there are fewer than 1/α - 1 scores.
+    """
+    n = healthy_scores.size
+    rank = int(np.ceil((n + 1) * (1 - false_alarm_rate) - 1e-9))
+    if rank > n:
+        raise EstimationError(
+            f"{n} healthy scores for a false-alarm rate of {false_alarm_rate:g}, expected at least "
+            f"{int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1}"
+        )
+    return float(np.sort(healthy_scores)[rank - 1])
+
+
+def hotelling_limit(n_windows: int, n_features: int, false_alarm_rate: float) -> float:
+    """Limit of T² for Gaussian features, mean and covariance estimated from n windows (F distribution)."""
+    n, p = n_windows, n_features
+    if n <= p:
+        raise EstimationError(f"{n} healthy windows for {p} features, expected more windows than features")
+    return float(p * (n - 1) * (n + 1) / (n * (n - p)) * scipy.stats.f.isf(false_alarm_rate, p, n - p))
+
+
+def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:
+    """Modes of the nominal machine within the likelihood's band: what a user would pick from the diagram.
+
+    Returns
+    -------
+    frequencies_hz : ndarray, shape (n_modes,)
+    shapes : ndarray of complex, shape (n_modes, n_states)
+        At the measured states, velocities divided by the mode's own frequency.
+    """
+    values, vectors = np.linalg.eig(system_A(machine.rotor, machine.operation.speed_rad_s))
+    frequency = np.abs(values) / (2 * np.pi)
+    low, high = machine.window.band_hz
+    keep = np.flatnonzero((values.imag > 0) & (frequency > low) & (frequency < high))
+    keep = keep[np.argsort(frequency[keep])]
+    states = plan_for(machine).states
+    shapes = vectors[[STATE_INDEX[name] for name in states]][:, keep].T
+    return frequency[keep], shapes / _units(states, frequency[keep])
+
+
+def _units(states: tuple[str, ...], frequency_hz: FloatArray) -> FloatArray:
+    """What velocities are divided by to stand beside displacements, shape (n_modes, n_states)."""
+    rates = np.array([name.endswith("_dot") for name in states])
+    return np.where(rates, 2 * np.pi * frequency_hz[:, None], 1.0)
+
+
+class SubspaceModes:
+    """Natural frequencies and damping ratios by SSI-cov, tracked by frequency and mode shape.
+
+    Parameters
+    ----------
+    machine : Machine
+        Sampling rate, channels, and the modes to track.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        plan = plan_for(machine)
+        self._states, self._has_angle = plan.states, plan.angle_column is not None
+        # Half the new rate stays 30 % above the band, as the decimation filter needs it.
+        self._factor = max(1, int(plan.rate_hz / (2.6 * machine.window.band_hz[1])))
+        self._rate_hz = plan.rate_hz / self._factor
+        self._frequency, self._shapes = reference_modes(machine)
+        self._block_rows = max(8, round(_BLOCK_ROWS_PER_PERIOD * self._rate_hz / self._frequency[0]))
+        self._orders = range(2 * self._frequency.size, 2 * self._frequency.size + _MORE_ORDERS + 1, 2)
+        self._t2 = _Hotelling(shrink=False)
+
+    @property
+    def name(self) -> str:
+        """Name under which it is reported."""
+        return "SSI-cov"
+
+    def features(self, samples: FloatArray) -> FloatArray:
+        """Frequencies (Hz) and damping ratios of the tracked modes, shape (2 n_modes,); nan where a mode is lost."""
+        rest, _ = _without_rotation(samples, len(self._states), self._has_angle)
+        if self._factor > 1:
+            rest = scipy.signal.decimate(rest, self._factor, ftype="fir", axis=0)
+        deviation = rest.std(axis=0)
+        frequency, damping, shapes = _poles(rest / deviation, self._block_rows, self._orders[-1], self._rate_hz)
+        found = np.full((len(self._orders), 2, self._frequency.size), np.nan)
+        for row, order in enumerate(n // 2 for n in self._orders):
+            there = np.flatnonzero(np.isfinite(frequency[:, order]))
+            if there.size:
+                own = shapes[there, order] * deviation
+                for mode, pole in self._matched(frequency[there, order], own):
+                    found[row, :, mode] = frequency[there[pole], order], damping[there[pole], order]
+        lost = np.isnan(found[:, 0]).mean(axis=0) > _MOST_SHARE_LOST
+        middle = np.array([[_median(values) for values in kind.T] for kind in found.transpose(1, 0, 2)])
+        middle[:, lost] = np.nan
+        return middle.ravel()
+
+    def _matched(self, frequency: FloatArray, shapes: FloatArray) -> list[tuple[int, int]]:
+        """Pairs of reference mode and pole: assignment by distance in frequency and 1 - MAC."""
+        away = np.abs(frequency[None, :] / self._frequency[:, None] - 1)
+        mac = np.stack([_mac(reference, shapes / _units(self._states, frequency)) for reference in self._shapes])
+        modes, poles = scipy.optimize.linear_sum_assignment(away + (1 - mac))
+        return [
+            (int(mode), int(pole))
+            for mode, pole in zip(modes, poles, strict=True)
+            if away[mode, pole] < _NEAREST and mac[mode, pole] > _LEAST_MAC
+        ]
+
+    def fit(self, healthy: FloatArray) -> None:
+        """Learn from the features of healthy windows."""
+        self._t2.fit(healthy)
+
+    def score(self, features: FloatArray) -> float:
+        """T² of one window."""
+        return self._t2.score(features)
+
+
+class FeatureVector:
+    """Rms, kurtosis, 1× amplitude and band levels of every channel; levels as logarithms.
+
+    Parameters
+    ----------
+    machine : Machine
+    n_bands : int
+        Bands of equal logarithmic width within the likelihood's band.
+    """
+
+    def __init__(self, machine: Machine, n_bands: int = 6) -> None:
+        plan = plan_for(machine)
+        self._n_states, self._has_angle = len(plan.states), plan.angle_column is not None
+        self._rate_hz = plan.rate_hz
+        self._edges_hz = np.geomspace(*machine.window.band_hz, n_bands + 1)
+        self._segment = round(machine.window.segment_s * plan.rate_hz)
+        self._t2 = _Hotelling(shrink=True)
+
+    @property
+    def name(self) -> str:
+        """Name under which it is reported."""
+        return "features"
+
+    def features(self, samples: FloatArray) -> FloatArray:
+        """All features, shape (n_channels · (2 + n_bands [+ 1]),)."""
+        rest, amplitude = _without_rotation(samples, self._n_states, self._has_angle)
+        x = samples[:, : self._n_states]
+        frequency, density = scipy.signal.welch(rest, self._rate_hz, nperseg=self._segment, axis=0)
+        bands = [
+            np.log(density[(frequency >= low) & (frequency < high)].mean(axis=0))
+            for low, high in zip(self._edges_hz[:-1], self._edges_hz[1:], strict=True)
+        ]
+        parts = [np.log(x.std(axis=0)), scipy.stats.kurtosis(x, axis=0), *bands]
+        if self._has_angle:
+            parts.append(np.log(amplitude))
+        return np.concatenate(parts)
+
+    def fit(self, healthy: FloatArray) -> None:
+        """Learn from the features of healthy windows."""
+        self._t2.fit(healthy)
+
+    def score(self, features: FloatArray) -> float:
+        """T² of one window, with a covariance shrunk after Ledoit and Wolf."""
+        return self._t2.score(features)
+
+
+class _Hotelling:
+    """Hotelling's T² of features from the mean and covariance of healthy windows.
+
+    Features that more than a fifth of the healthy windows lack are not used; of the others, T² of a window is that of
+    the features it has.
+    """
+
+    def __init__(self, *, shrink: bool) -> None:
+        self._shrink = shrink
+        self._used: npt.NDArray[np.intp] = np.empty(0, dtype=np.intp)
+
+    def fit(self, healthy: FloatArray) -> None:
+        used = np.flatnonzero(np.isfinite(healthy).mean(axis=0) >= _LEAST_SHARE_THERE)
+        complete = healthy[np.all(np.isfinite(healthy[:, used]), axis=1)][:, used]
+        n, p = complete.shape
+        if p == 0 or n < 4 or (not self._shrink and n <= p):
+            raise EstimationError(f"{n} complete healthy windows for {p} features, expected at least {max(4, p + 1)}")
+        self._mean, self._scale = complete.mean(axis=0), complete.std(axis=0)
+        standard = (complete - self._mean) / self._scale
+        if self._shrink:
+            from sklearn.covariance import ledoit_wolf  # noqa: PLC0415  # an optional extra
+
+            covariance = np.asarray(ledoit_wolf(standard, assume_centered=True)[0], dtype=np.float64)
+        else:
+            covariance = standard.T @ standard / (n - 1)
+        self._used, self._covariance = used, covariance
+
+    def score(self, features: FloatArray) -> float:
+        if not self._used.size:
+            raise EstimationError("a window was to be scored before any healthy window was learned from")
+        standard = (features[self._used] - self._mean) / self._scale
+        there = np.flatnonzero(np.isfinite(standard))
+        if not there.size:
+            return float("nan")
+        return float(standard[there] @ np.linalg.solve(self._covariance[np.ix_(there, there)], standard[there]))
+
+
+def _without_rotation(samples: FloatArray, n_states: int, has_angle: bool) -> tuple[FloatArray, FloatArray]:
+    """Channels without mean and 1× part, and the 1× amplitudes (zero without a shaft angle)."""
+    x = samples[:, :n_states]
+    columns = [np.ones(len(x))]
+    if has_angle:
+        columns += [np.cos(samples[:, n_states]), np.sin(samples[:, n_states])]
+    regressors = np.stack(columns, axis=1)
+    beta = np.linalg.lstsq(regressors, x, rcond=None)[0]
+    amplitude = np.hypot(beta[1], beta[2]) if has_angle else np.zeros(n_states)
+    return x - regressors @ beta, amplitude
+
+
+def _poles(
+    x: FloatArray, block_rows: int, most_order: int, rate_hz: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Frequencies, damping ratios and shapes of all poles, one column for each even order from 0 on."""
+    os.environ.setdefault("TQDM_DISABLE", "1")  # the library draws progress bars otherwise
+    with np.errstate():  # and changes numpy's error state on import
+        from pyoma2.functions.ssi import SSI_fast, SSI_poles, build_hank  # noqa: PLC0415  # an optional extra
+
+        logging.getLogger("pyoma2").setLevel(logging.WARNING)  # it reports every step
+        np.seterr(divide="ignore", invalid="ignore")
+        hankel, _ = build_hank(x.T, x.T, block_rows, "cov_R")
+        observability, A, C, _ = SSI_fast(hankel, block_rows, most_order, step=2)
+        frequency, damping, shapes, *_ = SSI_poles(  # type: ignore[arg-type]  # lists, as its documentation says
+            observability,
+            A,
+            C,
+            most_order,
+            1 / rate_hz,
+            step=2,
+            HC=True,
+            xi_max=_MOST_DAMPING,
+        )
+    return frequency, damping, shapes
+
+
+def _mac(reference: FloatArray, shapes: FloatArray) -> FloatArray:
+    """Modal assurance criterion of complex shapes with a reference, shape (n_poles,)."""
+    overlap = np.abs(shapes.conj() @ reference) ** 2
+    norms = np.sum(np.abs(shapes) ** 2, axis=1) * np.sum(np.abs(reference) ** 2)
+    return np.asarray(overlap / norms, dtype=np.float64)
+
+
+def _median(values: FloatArray) -> float:
+    values = values[np.isfinite(values)]
+    return float(np.median(values)) if values.size else np.nan
