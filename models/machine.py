@@ -152,8 +152,14 @@ class AlarmSettings(BaseModel):
 
     limits: AlarmLimits = AlarmLimits()
     parameters: dict[str, AlarmLimits] = Field(default={}, description="limits of single parameters instead")
-    raise_z: float = Field(default=5.0, ge=2, le=20, description="the change must exceed this many standard errors")
-    on_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must last before the alarm")
+    false_alarms_per_month: float = Field(
+        default=1.0,
+        gt=0,
+        le=1000,
+        description="how often a machine on which nothing has changed may be said to have changed, in 30 days of data; "
+        "sets how many standard errors a change must exceed",
+    )
+    on_delay_s: float = Field(default=10.0, ge=0, le=86400, description="how long it must last before the alarm")
     off_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must be gone before it clears")
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Alarms on parameter changes: a pure state machine per parameter, time as an argument.
+"""Alarms on changes: a pure state machine per parameter and one for the model, time as an argument.
 
 ::
 
@@ -9,18 +9,27 @@
       '--------------------------'          for off_delay  CLEARING ----------'
       '------------------------------------------------------'
 
-A window that could not be evaluated changes nothing: missing data neither raises nor clears, and an uncertain reading
-that is still large clears nothing either.
+Beyond the limit is a parameter that the sequential test names as changed, by more than its limit. A window that could
+not be evaluated changes nothing: missing data neither raises nor clears, and an uncertain reading that is still large
+clears nothing either.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from types import MappingProxyType
 
 from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
 
-__all__ = ["Alarm", "AlarmBook", "AlarmEvent", "AlarmState", "Severity"]
+__all__ = ["ALARM_TEXT", "MODEL", "Alarm", "AlarmBook", "AlarmEvent", "AlarmState", "Severity"]
+
+MODEL = "model"
+"""What the alarm is about that says: outside the model."""
+
+ALARM_TEXT: Mapping[str, str] = MappingProxyType({**PARAMETER_TEXT, MODEL: "outside the model"})
+"""What each alarm is about, in words."""
 
 
 class AlarmState(StrEnum):
@@ -41,12 +50,12 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """Alarm of one parameter.
+    """Alarm of one parameter, or of the model.
 
     Attributes
     ----------
     parameter : str
-        Which parameter.
+        Which parameter, or `MODEL`.
     state : AlarmState
         Where it is.
     severity : Severity
@@ -58,7 +67,9 @@ class Alarm:
     occurrence : int
         Counts the times it became active.
     change, standard_error : float
-        Latest relative change and its standard error.
+        Latest relative change and its standard error; nan for the model.
+    low_confidence : bool
+        The data were outside the model too: that this parameter is the one that changed is to be taken with reserve.
     """
 
     parameter: str
@@ -69,6 +80,7 @@ class Alarm:
     occurrence: int = 0
     change: float = 0.0
     standard_error: float = float("inf")
+    low_confidence: bool = False
 
     @property
     def raised(self) -> bool:
@@ -89,13 +101,21 @@ class AlarmEvent:
     def text(self) -> str:
         """The event in a sentence."""
         alarm = self.alarm
+        if alarm.parameter == MODEL:
+            if self.kind == "cleared":
+                return "cleared: the model describes the machine again"
+            return (
+                f"{alarm.severity.upper()}: outside the model: something has changed that no parameter describes, or a "
+                "sensor is at fault"
+            )
         what = f"{PARAMETER_TEXT[alarm.parameter]} ({alarm.parameter})"
         size = f"{alarm.change:+.1%} ± {1.96 * alarm.standard_error:.1%}"
+        reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
         match self.kind:
             case "raised":
-                return f"{alarm.severity.upper()}: {what} changed by {size}"
+                return f"{alarm.severity.upper()}: {what} changed by {size}{reserve}"
             case "escalated":
-                return f"{alarm.severity.upper()}: {what} changed further, now {size}"
+                return f"{alarm.severity.upper()}: {what} changed further, now {size}{reserve}"
             case _:
                 return f"cleared: {what} is back within its limits at {size}"
 
@@ -133,8 +153,17 @@ class AlarmBook:
             if alarm.state in {AlarmState.PENDING, AlarmState.CLEARING}:
                 self._alarms[name] = replace(alarm, since_ns=time_ns)
 
-    def update(self, parameter: str, change: float, standard_error: float, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """Judge one evaluated parameter of one window.
+    def update(
+        self,
+        parameter: str,
+        change: float,
+        standard_error: float,
+        time_ns: int,
+        *,
+        named: bool,
+        low_confidence: bool = False,
+    ) -> tuple[AlarmEvent, ...]:
+        """Judge one evaluated parameter at the end of a hop.
 
         Parameters
         ----------
@@ -143,7 +172,11 @@ class AlarmBook:
         change, standard_error : float
             Relative change and standard error.
         time_ns : int
-            Data time of the end of the window.
+            Data time of the end of the hop.
+        named : bool
+            Whether the parameter is among those found to have changed.
+        low_confidence : bool
+            Whether the data are outside the model.
 
         Returns
         -------
@@ -152,15 +185,39 @@ class AlarmBook:
         """
         if not (math.isfinite(change) and 0 < standard_error < math.inf):
             return ()
-        settings, limits = self._settings, self._settings.for_parameter(parameter)
+        limits, size = self._settings.for_parameter(parameter), abs(change)
         alarm = replace(
             self._alarms.get(parameter, Alarm(parameter, since_ns=time_ns)),
             change=change,
             standard_error=standard_error,
+            low_confidence=low_confidence,
         )
-        size, z = abs(change), abs(change) / standard_error
-        beyond = size > limits.raise_above and z > settings.raise_z
-        small = size < limits.clear_below
+        return self._judge(
+            alarm,
+            time_ns,
+            beyond=named and size > limits.raise_above,
+            small=size < limits.clear_below,
+            danger=size > limits.danger_above,
+        )
+
+    def update_model(self, outside: bool, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Judge the model itself at the end of a hop.
+
+        Parameters
+        ----------
+        outside : bool
+            Whether the data are further from the model than sampling explains.
+        time_ns : int
+            Data time of the end of the hop.
+        """
+        alarm = replace(
+            self._alarms.get(MODEL, Alarm(MODEL, since_ns=time_ns)), change=math.nan, standard_error=math.nan
+        )
+        return self._judge(alarm, time_ns, beyond=outside, small=not outside, danger=False)
+
+    def _judge(self, alarm: Alarm, time_ns: int, *, beyond: bool, small: bool, danger: bool) -> tuple[AlarmEvent, ...]:
+        """Move an alarm on."""
+        settings = self._settings
         lasted_s = (time_ns - alarm.since_ns) / 1e9
         kind = None
         match alarm.state:
@@ -175,11 +232,10 @@ class AlarmBook:
             case AlarmState.CLEARING if not small:
                 alarm = replace(alarm, state=AlarmState.ACTIVE, since_ns=time_ns)
         if alarm.state is AlarmState.PENDING and lasted_s >= settings.on_delay_s:
-            severity = Severity.DANGER if size > limits.danger_above else Severity.ALERT
             alarm = replace(
                 alarm,
                 state=AlarmState.ACTIVE,
-                severity=severity,
+                severity=Severity.DANGER if danger else Severity.ALERT,
                 since_ns=time_ns,
                 raised_ns=time_ns,
                 occurrence=alarm.occurrence + 1,
@@ -188,10 +244,10 @@ class AlarmBook:
         elif alarm.state is AlarmState.CLEARING and lasted_s >= settings.off_delay_s:
             alarm = replace(alarm, state=AlarmState.NORMAL, since_ns=time_ns, raised_ns=None)
             kind = "cleared"
-        elif alarm.state is AlarmState.ACTIVE and alarm.severity is Severity.ALERT and size > limits.danger_above:
+        elif alarm.state is AlarmState.ACTIVE and alarm.severity is Severity.ALERT and danger:
             alarm = replace(alarm, severity=Severity.DANGER)
             kind = "escalated"
-        self._alarms[parameter] = alarm
+        self._alarms[alarm.parameter] = alarm
         if kind is None:
             return ()
         event = AlarmEvent(kind, time_ns, self._sequence, alarm)

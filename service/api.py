@@ -16,6 +16,7 @@ from service.page import front_page
 from service.schemas import (
     AlarmCloudEvent,
     AlarmStates,
+    DetectableChanges,
     Health,
     MachineDescription,
     Problem,
@@ -43,6 +44,9 @@ class MachineView(Protocol):
 
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
+
+    def detectable(self, change: float | None) -> DetectableChanges:
+        """Return what would be found on the machine as it runs now."""
 
     def reports(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[Report, ...]:
         """Window reports with since_ns ≤ end_ns < until_ns, newest first."""
@@ -100,6 +104,9 @@ class Alive(BaseModel):
 
 _SinceNs = Annotated[int | None, Query(ge=0, description="from this time on, ns since 1970-01-01 UTC")]
 _UntilNs = Annotated[int | None, Query(ge=0, description="before this time, ns since 1970-01-01 UTC")]
+_Change = Annotated[
+    float | None, Query(gt=-1, le=10, description="relative change to be found, -0.05 for a loss of 5 %")
+]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many, the newest")]
 
 
@@ -149,6 +156,15 @@ def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
     ) -> AlarmStates:
         """Alarms that are pending, active or clearing."""
         return _find(service, site, machine).alarms(include_normal=all_)
+
+    @app.get(
+        "/api/v1/machines/{site}/{machine}/detectable",
+        tags=["machines"],
+        responses=_responses(DetectableChanges, 404, 422),
+    )
+    def detectable(site: str, machine: str, change: _Change = None) -> DetectableChanges:
+        """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
+        return _find(service, site, machine).detectable(change or None)
 
 
 def _add_history_routes(app: FastAPI, service: ServiceView) -> None:

@@ -7,29 +7,40 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
+from models.diagnosis.detectable import DetectableChange, length_to_find
 from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.sequential import SequentialVerdict
 from models.machine import Machine
 from models.physics.parameters import PARAMETER_TEXT
-from service.alarms import Alarm, AlarmEvent, AlarmState
+from service.alarms import ALARM_TEXT, Alarm, AlarmEvent, AlarmState
 from service.monitor import DataQuality, HealthState, MachineHealth, WindowReport
+from service.residuals import Opinion
+from service.schemas import Agreement as AgreementJson
 from service.schemas import Alarm as AlarmJson
 from service.schemas import (
     AlarmCloudEvent,
     AlarmEventData,
     AlarmStates,
+    Detectable,
+    DetectableChanges,
+    DetectableParameter,
+    Finding,
     Health,
     MachineDescription,
     Quality,
     Report,
     StreamStatus,
+    Verdict,
 )
 from service.schemas import Equation as EquationJson
+from service.schemas import Opinion as OpinionJson
 from service.schemas import Parameter as ParameterJson
 
 __all__ = [
     "Identity",
     "alarm_cloud_event",
     "alarm_states",
+    "detectable_changes",
     "health",
     "machine_description",
     "machine_hash",
@@ -65,9 +76,13 @@ def report(identity: Identity, window: WindowReport) -> Report:
         state=window.state,
         filled=window.filled,
         speed_rad_s=_finite(window.speed_rad_s),
-        misfit=_finite(window.misfit),
+        misfit_z=_finite(window.misfit_z),
+        suspect=window.suspect,
+        verdict=None if window.verdict is None else _verdict(window.verdict),
         parameters=_parameters(window.parameters),
+        opinions=tuple(_opinion(opinion) for opinion in window.opinions),
         equations=tuple(_equation(reading) for reading in window.equations),
+        detectable=tuple(_detectable(found) for found in window.detectable),
         reason=window.reason,
         bundle=identity.bundle,
         machine_hash=identity.machine_hash,
@@ -97,9 +112,13 @@ def health(
         window_start_ns=None if window is None else window.start_ns,
         window_end_ns=None if window is None else window.end_ns,
         speed_rad_s=None if window is None else window.speed_rad_s,
-        misfit=None if window is None else window.misfit,
+        misfit_z=None if window is None else window.misfit_z,
+        suspect="" if window is None else window.suspect,
+        verdict=None if window is None else window.verdict,
         parameters=() if window is None else window.parameters,
+        opinions=() if window is None else window.opinions,
         equations=() if window is None else window.equations,
+        detectable=() if window is None else window.detectable,
         alarms=_alarms(record.alarms, include_normal=False),
         quality=_quality(record.quality, queue_dropped_blocks, link_missed_blocks),
         stream=stream,
@@ -139,6 +158,7 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
             "sequence": event.sequence,
             "relative_change": _finite(alarm.change),
             "standard_error": _finite(alarm.standard_error),
+            "low_confidence": alarm.low_confidence,
             "bundle": identity.bundle,
             "machine_hash": identity.machine_hash,
         }
@@ -177,6 +197,38 @@ def machine_description(identity: Identity, machine: Machine, state: HealthState
     )
 
 
+def detectable_changes(
+    identity: Identity, machine: Machine, record: MachineHealth, change: float | None
+) -> DetectableChanges:
+    """Say what the latest window would have shown, and how much data a wished change takes."""
+    latest = record.latest
+    found = () if latest is None else latest.detectable
+    reason = ""
+    if not found:
+        reason = f"window {record.filled:.0%} full" if latest is None or not latest.reason else latest.reason
+    return DetectableChanges(
+        site=identity.site,
+        machine=identity.machine,
+        window_end_ns=None if latest is None else latest.end_ns,
+        window_length_s=machine.window.length_s,
+        false_alarms_per_month=machine.alarms.false_alarms_per_month,
+        change=change,
+        parameters=tuple(
+            DetectableParameter(
+                name=one.name,
+                text=PARAMETER_TEXT[one.name],
+                loss=one.loss,
+                gain=one.gain,
+                length_s=None if change is None else length_to_find(one, change),
+            )
+            for one in found
+        ),
+        reason=reason,
+        bundle=identity.bundle,
+        machine_hash=identity.machine_hash,
+    )
+
+
 def _finite(value: float | None) -> float | None:
     """JSON has no infinity and no NaN: both become null."""
     return value if value is not None and math.isfinite(value) else None
@@ -201,6 +253,73 @@ def _parameter(reading: ParameterReading) -> ParameterJson:
     )
 
 
+def _verdict(verdict: SequentialVerdict) -> Verdict:
+    isolation = verdict.isolation
+    return Verdict(
+        changed=tuple(
+            Finding(
+                name=finding.name,
+                text=PARAMETER_TEXT[finding.name],
+                since_ns=finding.since_ns,
+                found_ns=finding.found_ns,
+                stretch_s=finding.stretch_s,
+            )
+            for finding in verdict.findings
+        ),
+        text=_verdict_text(verdict),
+        detected=verdict.detected,
+        confidence=isolation.confidence,
+        low_confidence=isolation.low_confidence,
+        outside_model=isolation.outside,
+        outside_confidence=_finite(isolation.outside_confidence),
+        decided_s=verdict.decided_s,
+        settled=verdict.settled,
+        current=_parameters(verdict.current),
+    )
+
+
+def _verdict_text(verdict: SequentialVerdict) -> str:
+    isolation = verdict.isolation
+    if verdict.findings:
+        found = ", ".join(
+            f"{PARAMETER_TEXT[one.name]} ({one.name}) since {_clock(one.since_ns)}, found {_clock(one.found_ns)} in "
+            f"{one.stretch_s:.0f} s of data"
+            for one in verdict.findings
+        )
+        # Never more sure than can be.
+        sure = "above 99.9 %" if isolation.confidence > 0.9995 else f"{100 * isolation.confidence:.1f} %"
+        text = f"changed: {found}; confidence {sure}"
+    elif verdict.detected:
+        text = "something has changed; too little data yet to say what"
+    else:
+        text = "nothing has changed"
+    if isolation.outside:
+        text += "; outside the model: something has changed that no parameter describes, or a sensor is at fault"
+    return text
+
+
+def _clock(time_ns: int) -> str:
+    return _rfc3339(time_ns)[11:19]
+
+
+def _opinion(opinion: Opinion) -> OpinionJson:
+    return OpinionJson(
+        by=opinion.by,
+        parameters=_parameters(opinion.parameters),
+        agreement=tuple(
+            AgreementJson(
+                name=one.name, between=one.between, verdict=one.verdict, difference_z=_finite(one.difference_z)
+            )
+            for one in opinion.agreement
+        ),
+        reason=opinion.reason,
+    )
+
+
+def _detectable(found: DetectableChange) -> Detectable:
+    return Detectable(name=found.name, loss=found.loss, gain=found.gain, length_s=found.length_s)
+
+
 def _equation(reading: EquationReading) -> EquationJson:
     return EquationJson(
         equation=reading.equation,
@@ -217,7 +336,7 @@ def _alarms(alarms: Iterable[Alarm], *, include_normal: bool) -> tuple[AlarmJson
     return tuple(
         AlarmJson(
             parameter=alarm.parameter,
-            text=PARAMETER_TEXT[alarm.parameter],
+            text=ALARM_TEXT[alarm.parameter],
             state=alarm.state,
             raised=alarm.raised,
             severity=alarm.severity,
@@ -226,6 +345,7 @@ def _alarms(alarms: Iterable[Alarm], *, include_normal: bool) -> tuple[AlarmJson
             occurrence=alarm.occurrence,
             relative_change=_finite(alarm.change),
             standard_error=_finite(alarm.standard_error),
+            low_confidence=alarm.low_confidence,
         )
         for alarm in alarms
         if include_normal or alarm.state is not AlarmState.NORMAL

@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, Parameter, Report
+from service.schemas import AlarmCloudEvent, AlarmStates, Health, Opinion, Parameter, Report, Verdict
 
 __all__ = ["alarm_event_line", "alarm_state_lines", "health_line", "report_line"]
 
@@ -10,16 +10,23 @@ _Z95 = 1.959964
 
 
 def report_line(report: Report) -> str:
-    """One window in a line: time (UTC, of the data), machine, state, every parameter with its 95 % half width.
+    """One window in a line: time (UTC, of the data), machine, state, parameters with 95 % half widths, verdict.
+
+    While the window straddles a change the parameters are those of the data since the change.
 
     Examples
     --------
     >>> from service.schemas import Report, example
     >>> report_line(Report.model_validate(example(Report)))
-    '00:03:25  lab  alert          k_by −24.7±1.4 %'
+    '00:03:25  lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
     """
     if report.parameters:
-        tail = "  ".join(_parameter(parameter) for parameter in report.parameters)
+        verdict = report.verdict
+        shown = report.parameters if verdict is None or verdict.settled else verdict.current
+        parts = ["  ".join(_parameter(parameter) for parameter in shown) or "too little data since the change"]
+        parts += [] if verdict is None else [_verdict(verdict)]
+        parts += [_opinion(opinion) for opinion in report.opinions]
+        tail = "  |  ".join(parts)
     else:
         tail = report.reason or f"window {report.filled:.0%} full"
     return f"{_clock(report.end_ns)}  {report.machine}  {report.state:<13}  {tail}"
@@ -59,6 +66,20 @@ def health_line(health: Health) -> str:
     at = "--:--:--" if health.window_end_ns is None else _clock(health.window_end_ns)
     why = f": {health.reason}" if health.reason else ""
     return f"{at}  {health.machine}  state is {health.state}{why}"
+
+
+def _verdict(verdict: Verdict) -> str:
+    names = ", ".join(finding.name for finding in verdict.changed)
+    text = f"changed: {names or '?'}" if verdict.detected or names else "no change"
+    return f"{text}, outside the model" if verdict.outside_model else text
+
+
+def _opinion(opinion: Opinion) -> str:
+    """Whether another diagnostician agrees."""
+    if opinion.reason:
+        return f"{opinion.by} n/a"
+    apart = [one.name for one in opinion.agreement if one.verdict == "disagree"]
+    return f"{opinion.by} disagrees on {', '.join(apart)}" if apart else f"{opinion.by} agrees"
 
 
 def _clock(time_ns: int) -> str:

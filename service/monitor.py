@@ -2,8 +2,8 @@
 
 ::
 
-    SampleBlock -> Gate -> SlidingWindow -> WindowEvaluator -> AlarmBook -> MonitorReport
-                 (ingest)  (correlations)     (residuals)      (alarms)
+    SampleBlock -> Gate -> SlidingWindow -> WindowEvaluator -> SequentialTest -> AlarmBook -> MonitorReport
+                 (ingest)  (correlations)     (residuals)     (what changed)     (alarms)
 
 `MachineMonitor` knows no network, clock or thread: all times are the data's own. Live running and replay are two ways
 of feeding it, and the same blocks give the same reports.
@@ -14,18 +14,24 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from models.diagnosis.bundle import Bundle
+from models.diagnosis.detectable import DetectableChange, detectable_changes
 from models.diagnosis.moments import plan_for
-from models.diagnosis.readings import EquationReading, ParameterReading
-from models.diagnosis.window import SlidingWindow
+from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
+from models.diagnosis.sequential import SequentialSettings, SequentialTest, SequentialVerdict
+from models.diagnosis.stretch import Stretch, stretch_of
+from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError, WireError
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import decode_block
 from service.alarms import Alarm, AlarmBook, AlarmEvent, Severity
 from service.ingest import Gate, Reason, Verdict
-from service.residuals import WindowEvaluator
+from service.residuals import Opinion, WindowEvaluator
 
 __all__ = ["DataQuality", "HealthState", "MachineHealth", "MachineMonitor", "MonitorReport", "WindowReport"]
+
+_SHORT_HOPS = (2, 4)
+"""Stretches shorter than the window in which large changes are looked for."""
 
 
 class HealthState(StrEnum):
@@ -35,6 +41,7 @@ class HealthState(StrEnum):
     HEALTHY = "healthy"
     ALERT = "alert"
     DANGER = "danger"
+    OUTSIDE_MODEL = "outside-model"
     NO_DATA = "no-data"
     NOT_EVALUABLE = "not-evaluable"
 
@@ -76,18 +83,25 @@ class WindowReport:
     start_ns, end_ns : int
         Oldest and newest data in the window.
     state : HealthState
-        After this window: warming, healthy, alert, danger or not-evaluable.
+        After this window: warming, healthy, alert, danger, outside-model or not-evaluable.
     filled : float
         Fraction of a full window.
     speed_rad_s : float or None
         Mean speed in the window.
     parameters : tuple of ParameterReading
-        What the alarms are decided on.
+        The likelihood's readings of the whole window.
     equations : tuple of EquationReading
         The networks' opinion, equation by equation.
-    misfit : float or None
-        How much worse the theory fits than sampling alone explains (0 = as well as it can). Not calibrated: only its
-        change from the healthy value of the same machine means something.
+    opinions : tuple of Opinion
+        What the other diagnosticians read, and whether they agree.
+    misfit_z : float or None
+        How far the window is from what the model can explain; standard normal where the model holds.
+    suspect : str
+        What explains the misfit best, if one thing does.
+    verdict : SequentialVerdict or None
+        What has changed since the machine was nominal; the alarms are decided on it.
+    detectable : tuple of DetectableChange
+        What would have been noticed in this window, parameter by parameter.
     reason : str
         Why the window was not evaluated; empty if it was.
     """
@@ -99,7 +113,11 @@ class WindowReport:
     speed_rad_s: float | None = None
     parameters: tuple[ParameterReading, ...] = ()
     equations: tuple[EquationReading, ...] = ()
-    misfit: float | None = None
+    opinions: tuple[Opinion, ...] = ()
+    misfit_z: float | None = None
+    suspect: str = ""
+    verdict: SequentialVerdict | None = None
+    detectable: tuple[DetectableChange, ...] = ()
     reason: str = ""
 
 
@@ -150,6 +168,14 @@ class MachineMonitor:
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
         self._evaluator = WindowEvaluator(machine, bundle)
+        self._test = SequentialTest(
+            SequentialSettings(
+                hop_s=machine.window.hop_s,
+                window_hops=machine.window.hops,
+                short_hops=tuple(hops for hops in _SHORT_HOPS if hops < machine.window.hops),
+                false_alarms_per_month=machine.alarms.false_alarms_per_month,
+            )
+        )
         self._alarms = AlarmBook(machine.alarms)
         self._quality = DataQuality()
         self._refused: Counter[str] = Counter()
@@ -186,6 +212,7 @@ class MachineMonitor:
             self._window.gap()
         if verdict.clock_step_s:
             self._window.clear()
+            self._test.clear()
             self._alarms.clock_stepped(block.start_ns)
         windows: list[WindowReport] = []
         events: list[AlarmEvent] = []
@@ -226,30 +253,58 @@ class MachineMonitor:
             report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
             self._latest = report
             return report, ()
+        short = {hops: self._window.statistics(hops) for hops in self._test.settings.short_hops}
+        present = {hops: latest for hops, latest in short.items() if latest is not None}
         try:
-            evaluation = self._evaluator.evaluate(statistics)
+            evaluation = self._evaluator.evaluate(statistics, present)
         except EstimationError as error:
             report = WindowReport(
                 statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
             )
             self._latest = report
             return report, ()
-        events: list[AlarmEvent] = []
-        for reading in evaluation.parameters:
-            if reading.change is not None and reading.standard_error is not None:
-                events.extend(self._alarms.update(reading.name, reading.change, reading.standard_error, end_ns))
+        looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
+        whole = self._test.settings.window_hops
+        looks[whole] = _stretch(evaluation.deciding, statistics)
+        verdict = self._test.update(looks)
+        events = self._alarm(verdict, end_ns)
+        outside = verdict.isolation.outside
         report = WindowReport(
             start_ns=statistics.start_ns,
             end_ns=end_ns,
-            state=self._state(HealthState.HEALTHY),
+            state=self._state(HealthState.OUTSIDE_MODEL if outside else HealthState.HEALTHY),
             filled=filled,
             speed_rad_s=evaluation.speed_rad_s,
-            parameters=evaluation.parameters,
+            parameters=evaluation.deciding.parameters,
             equations=evaluation.equations,
-            misfit=evaluation.misfit,
+            opinions=evaluation.opinions,
+            misfit_z=evaluation.deciding.misfit_z,
+            suspect=evaluation.deciding.suspect if outside else "",
+            verdict=verdict,
+            detectable=detectable_changes(looks[whole], self._test.thresholds(whole), self.machine.window.length_s),
         )
         self._latest = report
-        return report, tuple(events)
+        return report, events
+
+    def _alarm(self, verdict: SequentialVerdict, end_ns: int) -> tuple[AlarmEvent, ...]:
+        """Bring what was found to the alarms; without clean data they stay where they are."""
+        named = {finding.name for finding in verdict.findings}
+        events: list[AlarmEvent] = []
+        for reading in verdict.current:
+            if reading.change is not None and reading.standard_error is not None:
+                events.extend(
+                    self._alarms.update(
+                        reading.name,
+                        reading.change,
+                        reading.standard_error,
+                        end_ns,
+                        named=reading.name in named,
+                        low_confidence=verdict.isolation.outside,
+                    )
+                )
+        if verdict.current:
+            events.extend(self._alarms.update_model(verdict.isolation.outside, end_ns))
+        return tuple(events)
 
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
@@ -260,3 +315,7 @@ class MachineMonitor:
                 return HealthState.ALERT
             case None:
                 return otherwise
+
+
+def _stretch(diagnosis: Diagnosis, window: WindowStatistics) -> Stretch:
+    return stretch_of(diagnosis, window.start_ns, window.end_ns)

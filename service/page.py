@@ -2,20 +2,23 @@
 
 import html
 
-from service.schemas import Health, Parameter
+from service.alarms import Severity
+from service.schemas import Health, Opinion, Parameter, Verdict
 
 __all__ = ["front_page"]
 
 _RELOAD_S = 5
 _STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; color: #1c2530 }
+body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #1c2530 }
 h2 { margin: 2rem 0 .3rem } h2 span { font-size: 1rem; padding: .1rem .6rem; border-radius: 1rem; color: #fff }
 .healthy { background: #23804b } .warming, .not-evaluable { background: #66727f } .alert { background: #b26a00 }
-.danger { background: #b3261e } .no-data { background: #7a3e9d } table { border-collapse: collapse; margin: .6rem 0 }
+.danger { background: #b3261e } .outside-model { background: #8a5a00 } .no-data { background: #7a3e9d }
+table { border-collapse: collapse; margin: .6rem 0 }
 td, th { padding: .2rem 1rem .2rem 0; text-align: left; border-bottom: 1px solid #dde2e7 }
 td.number { text-align: right; font-variant-numeric: tabular-nums } .raised { font-weight: bold }
+.disagree { color: #b3261e } .note { color: #66727f }
 """
-_ROUTES = ("health", "reports", "alarms", "alarms/events")
+_ROUTES = ("health", "reports", "alarms", "alarms/events", "detectable")
 
 
 def front_page(healths: tuple[Health, ...]) -> str:
@@ -34,25 +37,58 @@ def _machine(health: Health) -> str:
     place = f"/api/v1/machines/{name}"
     links = ", ".join(f'<a href="{place}/{part}">{part}</a>' for part in _ROUTES)
     raised = {alarm.parameter: alarm.severity for alarm in health.alarms if alarm.raised}
-    rows = "".join(_row(parameter, raised.get(parameter.name, "")) for parameter in health.parameters)
-    table = (
-        "<table><tr><th>parameter<th>relative change<th>95 % interval<th>alarm</tr>" + rows + "</table>" if rows else ""
-    )
     reason = f"<p>{html.escape(health.reason)}</p>" if health.reason else ""
+    suspect = f" Best explained by: {html.escape(health.suspect)}." if health.suspect else ""
+    verdict = f"<p>{html.escape(health.verdict.text)}.{suspect}</p>" if health.verdict else ""
     return (
         f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span></h2>'
-        f"{reason}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
-        f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>{table}"
+        f"{reason}{verdict}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
+        f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>"
+        f"{_table(health, raised)}"
     )
 
 
-def _row(parameter: Parameter, alarm: str) -> str:
-    text = f"{html.escape(parameter.text)} ({html.escape(parameter.name)})"
-    if parameter.relative_change is None or parameter.interval_95 is None:
-        return f"<tr><td>{text}<td colspan=2>not evaluable: {html.escape(parameter.reason)}<td>{alarm}</tr>"
-    low, high = parameter.interval_95
-    marked = ' class="raised"' if alarm else ""
+def _table(health: Health, raised: dict[str, Severity]) -> str:
+    """Who reads what of each parameter, and what would have been noticed."""
+    verdict = health.verdict
+    if verdict is None or not health.parameters:
+        return ""
+    readings = {parameter.name: parameter for parameter in (() if verdict.settled else verdict.current)}
+    limits = {found.name: found for found in health.detectable}
+    heads = "".join(f"<th>{html.escape(opinion.by)}" for opinion in health.opinions)
+    rows = ""
+    for stated in health.parameters:
+        parameter, alarm = readings.get(stated.name, stated), raised.get(stated.name, "")
+        marked = ' class="raised"' if alarm else ""
+        others = "".join(_other(opinion, stated.name) for opinion in health.opinions)
+        found = limits.get(stated.name)
+        least = "" if found is None else f"{found.loss:+.1%} / {found.gain:+.1%}"
+        rows += (
+            f"<tr{marked}><td>{html.escape(stated.text)} ({html.escape(stated.name)}){_reading(parameter, verdict)}"
+            f'{others}<td class="number">{least}<td>{alarm}</tr>'
+        )
+    whole = "" if verdict.settled else " since the last change"
     return (
-        f'<tr{marked}><td>{text}<td class="number">{parameter.relative_change:+.1%}'
-        f'<td class="number">{low:+.1%} … {high:+.1%}<td>{alarm}</tr>'
+        f"<table><tr><th>parameter<th>relative change{whole}<th>95 % interval{heads}<th>noticed from<th>alarm</tr>"
+        f'{rows}</table><p class="note">Decided on the likelihood; the others read the whole window beside it. '
+        "Noticed from: smallest loss and gain that one window shows with 95 % probability.</p>"
     )
+
+
+def _reading(parameter: Parameter, verdict: Verdict) -> str:
+    if not verdict.settled and not verdict.current:
+        return "<td colspan=2>too little data since the change"
+    if parameter.relative_change is None or parameter.interval_95 is None:
+        return f"<td colspan=2>not evaluable: {html.escape(parameter.reason)}"
+    low, high = parameter.interval_95
+    return f'<td class="number">{parameter.relative_change:+.1%}<td class="number">{low:+.1%} … {high:+.1%}'
+
+
+def _other(opinion: Opinion, name: str) -> str:
+    """What another diagnostician reads of a parameter, and whether that agrees."""
+    said = next((one for one in opinion.parameters if one.name == name), None)
+    if said is None or said.relative_change is None or said.standard_error is None:
+        return '<td class="number">–'
+    apart = any(one.name == name and one.verdict == "disagree" for one in opinion.agreement)
+    text = f"{said.relative_change:+.1%} ± {1.96 * said.standard_error:.1%}"
+    return f'<td class="number disagree">{text} disagrees' if apart else f'<td class="number">{text}'

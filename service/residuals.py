@@ -1,23 +1,25 @@
-"""Evaluation of one window: physical parameters by likelihood, the equations' networks beside them."""
+"""Evaluation of one window: several diagnosticians side by side, and whether they agree."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from models.diagnosis.agreement import Agreement, agreements
+from models.diagnosis.amortised import NetworkDiagnostician
 from models.diagnosis.bundle import Bundle
-from models.diagnosis.equations import EQUATIONS
 from models.diagnosis.likelihood import LikelihoodFit
-from models.diagnosis.networks import read_equation
-from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.networks import RelationDiagnostician
+from models.diagnosis.readings import Diagnosis, Diagnostician, EquationReading, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.parameters import PARAMETERS
 
-__all__ = ["Evaluation", "WindowEvaluator"]
+__all__ = ["Evaluation", "Opinion", "WindowEvaluator"]
 
 _VAGUE = 0.2
-"""A larger standard error is no longer one: the reading says nothing."""
+"""A larger standard error of a full window is no longer one: the reading says nothing."""
 
 _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}
 """Plane in which a bearing parameter acts."""
@@ -27,25 +29,50 @@ _STEADY = 0.05
 
 
 @dataclass(frozen=True, slots=True)
+class Opinion:
+    """What a diagnostician beside the deciding one says.
+
+    Attributes
+    ----------
+    by : str
+        Who.
+    parameters : tuple of ParameterReading
+        What it reads.
+    agreement : tuple of Agreement
+        How that compares with the likelihood.
+    reason : str
+        Why it could say nothing of this window; empty if it could.
+    """
+
+    by: str
+    parameters: tuple[ParameterReading, ...] = ()
+    agreement: tuple[Agreement, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Evaluation:
     """What the diagnosticians say about a window.
 
     Attributes
     ----------
-    parameters : tuple of ParameterReading
-        Every parameter, by likelihood, in the order of `PARAMETERS`.
+    deciding : Diagnosis
+        The likelihood's, every parameter in the order of `PARAMETERS`.
+    short : dict of int to Diagnosis
+        The same of the latest hops, by how many; without those that could not be evaluated.
     equations : tuple of EquationReading
         Every equation of the table, by its network, or why not.
+    opinions : tuple of Opinion
+        What the others say.
     speed_rad_s : float or None
         Mean speed.
-    misfit : float
-        How much worse the theory fits than sampling alone explains.
     """
 
-    parameters: tuple[ParameterReading, ...]
+    deciding: Diagnosis
+    short: Mapping[int, Diagnosis]
     equations: tuple[EquationReading, ...]
+    opinions: tuple[Opinion, ...]
     speed_rad_s: float | None
-    misfit: float
 
 
 class WindowEvaluator:
@@ -60,62 +87,106 @@ class WindowEvaluator:
 
     def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
         self._machine = machine
-        self._networks = {} if bundle is None else {network.equation.number: network for network in bundle.networks}
-        self._likelihood = LikelihoodFit(machine)
+        self._place = f"{machine.site}/{machine.name}"
+        # One fit per length: each starts from where it ended on the same length one hop before.
+        self._likelihoods: dict[int, LikelihoodFit] = {}
+        others: list[Diagnostician] = []
+        if bundle is not None and bundle.amortised is not None:
+            others.append(NetworkDiagnostician(machine, bundle.amortised))
+        others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
+        self._others = tuple(others)
 
-    def evaluate(self, window: WindowStatistics) -> Evaluation:
+    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window.
+
+        Parameters
+        ----------
+        window : WindowStatistics
+            The full window.
+        short : mapping of int to WindowStatistics
+            Its latest hops, by how many.
 
         Raises
         ------
         EstimationError
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
-        operation = self._machine.operation
-        speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
-        if speed is not None and abs(speed / operation.speed_rad_s - 1) > operation.speed_tolerance:
+        speed = self._speed(window)
+        deciding = self._decide(0, window)
+        evaluated = {}
+        for hops, statistics in short.items():
+            try:
+                evaluated[hops] = self._decide(hops, statistics)
+            except EstimationError:
+                continue  # too little data for itself; the window has said what there is to say
+        equations: tuple[EquationReading, ...] = ()
+        opinions = []
+        for other in self._others:
+            try:
+                diagnosis = other.diagnose(window)
+            except (EstimationError, np.linalg.LinAlgError) as error:
+                opinions.append(Opinion(other.by, reason=str(error)))
+                continue
+            equations = diagnosis.equations or equations
+            opinions.append(_opinion(deciding, diagnosis))
+        return Evaluation(deciding, evaluated, equations, tuple(opinions), speed)
+
+    def _speed(self, window: WindowStatistics) -> float | None:
+        """Mean speed, if it is one that is evaluated."""
+        if not np.isfinite(window.speed_rad_s):
+            return None
+        operation, speed = self._machine.operation, float(window.speed_rad_s)
+        if abs(speed / operation.speed_rad_s - 1) > operation.speed_tolerance:
             raise EstimationError(
-                f"{self._machine.site}/{self._machine.name}: speed is {speed * 30 / np.pi:.0f} rpm, evaluated are "
+                f"{self._place}: speed is {speed * 30 / np.pi:.0f} rpm, evaluated are "
                 f"{operation.speed_rpm:.0f} rpm ± {operation.speed_tolerance:.0%}"
             )
         slowest, fastest = window.speed_range
-        if speed is not None and fastest - slowest > _STEADY * operation.speed_rad_s:
+        if fastest - slowest > _STEADY * operation.speed_rad_s:
             raise EstimationError(
-                f"{self._machine.site}/{self._machine.name}: speed went from {slowest * 30 / np.pi:.0f} to "
+                f"{self._place}: speed went from {slowest * 30 / np.pi:.0f} to "
                 f"{fastest * 30 / np.pi:.0f} rpm within the window, evaluated is a steady speed (± {_STEADY / 2:.1%})"
             )
+        return speed
+
+    def _decide(self, hops: int, window: WindowStatistics) -> Diagnosis:
+        """The likelihood's diagnosis with what these sensors do not determine taken out."""
+        likelihood = self._likelihoods.setdefault(hops, LikelihoodFit(self._machine))
         try:
-            estimate, equations = self._likelihood.fit(window), self._equations(window)
+            diagnosis = likelihood.diagnose(window)
         except np.linalg.LinAlgError as error:
-            raise EstimationError(f"{self._machine.site}/{self._machine.name}: {error} in this window") from error
-        values = {
-            name: (float(change), float(error))
-            for name, change, error in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
-        }
-        parameters = tuple(_reading(name, values.get(name), window.states) for name in PARAMETERS)
-        return Evaluation(parameters, equations, speed, estimate.misfit)
-
-    def _equations(self, window: WindowStatistics) -> tuple[EquationReading, ...]:
-        readings = []
-        for equation in EQUATIONS:
-            trained = self._networks.get(equation.number)
-            if trained is None:
-                readings.append(EquationReading(equation.number, equation.title, reason="no trained network"))
-            else:
-                readings.append(read_equation(trained, window, self._machine))
-        return tuple(readings)
+            raise EstimationError(f"{self._place}: {error} in this window") from error
+        # A stretch of a tenth of the window has three times its errors, and says as much as that.
+        vague = _VAGUE * max(1.0, self._machine.window.length_s / window.duration_s) ** 0.5
+        found = {reading.name: reading for reading in diagnosis.parameters}
+        stated = tuple(_stated(name, found.get(name), window.states, vague) for name in PARAMETERS)
+        before = [reading.name for reading in diagnosis.evaluable]
+        kept = [before.index(reading.name) for reading in stated if reading.change is not None]
+        covariance = diagnosis.full_covariance[np.ix_(kept, kept)]
+        return replace(diagnosis, parameters=stated, covariance=covariance)
 
 
-def _reading(name: str, value: tuple[float, float] | None, states: tuple[str, ...]) -> ParameterReading:
-    """The likelihood's reading of one parameter, or why these sensors do not determine it."""
+def _stated(name: str, reading: ParameterReading | None, states: tuple[str, ...], vague: float) -> ParameterReading:
+    """The reading of one parameter, or why these sensors do not determine it."""
     plane = _PLANES.get(name)
-    if value is None:
+    if reading is None:
         return ParameterReading(name, "likelihood", reason="no phase reference")
     if plane is not None and not any(state.startswith(plane) for state in states):
         return ParameterReading(name, "likelihood", reason=f"no displacement or velocity measured in {plane}")
-    change, error = value
-    if not error < _VAGUE:
+    if reading.change is None or reading.standard_error is None:
+        return reading
+    if not reading.standard_error < vague:
         return ParameterReading(
-            name, "likelihood", reason=f"not determined in this window (standard error {error:.0%})"
+            name,
+            "likelihood",
+            reason=f"not determined in this window (standard error {reading.standard_error:.0%})",
         )
-    return ParameterReading(name, "likelihood", change, error)
+    return reading
+
+
+def _opinion(deciding: Diagnosis, other: Diagnosis) -> Opinion:
+    """What another diagnostician says; one that could read nothing says why, once."""
+    if other.evaluable:
+        return Opinion(other.by, other.parameters, agreements(deciding, other))
+    reasons = dict.fromkeys(reading.reason for reading in other.parameters)
+    return Opinion(other.by, other.parameters, reason="; ".join(reasons) or "nothing to read")

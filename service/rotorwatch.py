@@ -21,8 +21,14 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
 __all__ = ["app"]
 
 _ENDPOINT = "tcp/127.0.0.1:7447"
-_BAD_STATES = ("alert", "danger", "no-data")
-_STYLES = {"danger": "bold red", "alert": "bold yellow", "no-data": "magenta", "healthy": "green"}
+_BAD_STATES = ("alert", "danger", "outside-model", "no-data")
+_STYLES = {
+    "danger": "bold red",
+    "alert": "bold yellow",
+    "outside-model": "yellow",
+    "no-data": "magenta",
+    "healthy": "green",
+}
 
 app = typer.Typer(
     name="rotorwatch",
@@ -175,8 +181,8 @@ def status(
 ) -> None:
     """Table of all machines of a running monitor.
 
-    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if any is in alert, danger or without data, or
-    if the monitor does not answer.
+    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if any is in alert, danger, outside the model
+    or without data, or if the monitor does not answer.
 
     [bold]Example[/bold]
 

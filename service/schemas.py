@@ -9,25 +9,33 @@ from typing import Annotated, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from models.diagnosis.agreement import Verdict as AgreementVerdict
 from models.signals.channels import Channel
 from service.alarms import AlarmState, Severity
 from service.monitor import HealthState
 
 __all__ = [
+    "Agreement",
     "Alarm",
     "AlarmCloudEvent",
     "AlarmEventData",
     "AlarmStates",
+    "Detectable",
+    "DetectableChanges",
+    "DetectableParameter",
     "Equation",
+    "Finding",
     "Health",
     "MachineDescription",
     "MachineReadiness",
+    "Opinion",
     "Parameter",
     "Problem",
     "Quality",
     "Readiness",
     "Report",
     "StreamStatus",
+    "Verdict",
     "example",
 ]
 
@@ -46,6 +54,13 @@ _MachineHash = Annotated[
     Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
 ]
 _Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]
+_AlarmParameter = Annotated[
+    str, Field(description="k_by, c_by, k_bz, c_bz, e, EI, or model (outside the model)", examples=["k_by"])
+]
+_LowConfidence = Annotated[
+    bool,
+    Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
+]
 _State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
 
 
@@ -56,7 +71,7 @@ class Parameter(BaseModel):
 
     name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
     text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
-    by: str = Field(description="who says so: likelihood or network", examples=["likelihood"])
+    by: str = Field(description="who says so: likelihood, network or relation", examples=["likelihood"])
     relative_change: float | None = Field(
         description="relative change from nominal; null if not evaluable", examples=[-0.247]
     )
@@ -85,6 +100,110 @@ class Equation(BaseModel):
     reason: _Reason
 
 
+class Agreement(BaseModel):
+    """Whether two diagnosticians say the same of one parameter."""
+
+    model_config = _JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    between: tuple[str, str] = Field(description="who is compared", examples=[("likelihood", "relation")])
+    verdict: AgreementVerdict = Field(
+        description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
+    )
+    difference_z: float | None = Field(
+        description="second minus first change in combined standard errors", examples=[0.8]
+    )
+
+
+class Opinion(BaseModel):
+    """What a diagnostician other than the likelihood reads in the same window."""
+
+    model_config = _JSON
+
+    by: str = Field(description="who: network or relation", examples=["relation"])
+    parameters: tuple[Parameter, ...] = Field(description="what it reads")
+    agreement: tuple[Agreement, ...] = Field(description="how that compares with the likelihood")
+    reason: _Reason
+
+
+class Finding(BaseModel):
+    """One parameter that changed, and how that was found."""
+
+    model_config = _JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    since_ns: int = Field(
+        description="start of the stretch of data that found it first: the date of the change, as far as it is known",
+        examples=[_NS - 20_000_000_000],
+    )
+    found_ns: int = Field(description="end of that stretch", examples=[_NS - 10_000_000_000])
+    stretch_s: float = Field(description="length of that stretch", examples=[10.0])
+
+
+class Verdict(BaseModel):
+    """What has changed, from stretches of data of all lengths that end with this hop; alarms are decided on it."""
+
+    model_config = _JSON
+
+    changed: tuple[Finding, ...] = Field(description="parameters that changed; empty: none")
+    text: str = Field(
+        description="the verdict in a sentence",
+        examples=[
+            "changed: bearing stiffness, horizontal (k_by) since 00:03:05, found 00:03:15 in 10 s of data; "
+            "confidence 99.6 %"
+        ],
+    )
+    detected: bool = Field(description="something changed, whether or not it is clear yet what", examples=[True])
+    confidence: float = Field(
+        description="probability of exactly this set of parameters among all sets", examples=[0.996]
+    )
+    low_confidence: bool = Field(
+        description="take what is said of parameters with reserve: outside the model, or several sets explain the data",
+        examples=[False],
+    )
+    outside_model: bool = Field(
+        description="something changed that no parameter describes, or a sensor is at fault", examples=[False]
+    )
+    outside_confidence: float | None = Field(
+        description="how sure that is, 0.5 for not at all; null without a test", examples=[0.5]
+    )
+    decided_s: float = Field(description="length of the stretch of data that decided", examples=[20.0])
+    settled: bool = Field(
+        description="no change within the window: `parameters` hold for one state of the machine", examples=[False]
+    )
+    current: tuple[Parameter, ...] = Field(
+        description="readings of the data since the last change, at most one window, changed parameters with the "
+        "others held at nominal; empty while there is too little"
+    )
+
+
+class Detectable(BaseModel):
+    """Smallest change of one parameter, alone, that would be found with 95 % probability."""
+
+    model_config = _JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    loss: float = Field(description="relative change downwards; -1: not even a total loss", examples=[-0.025])
+    gain: float = Field(description="relative change upwards", examples=[0.026])
+    length_s: float = Field(description="data that takes", examples=[60.0])
+
+
+_MisfitZ = Annotated[
+    float | None,
+    Field(
+        description="distance of the window from what the model can explain, standard deviations; null without a test",
+        examples=[0.4],
+    ),
+]
+_Suspect = Annotated[
+    str, Field(description="what explains data outside the model best, if one thing does; else empty", examples=[""])
+]
+_Opinions = Annotated[tuple[Opinion, ...], Field(description="what the other diagnosticians read in the window")]
+_Verdict = Annotated[Verdict | None, Field(description="what has changed; null if the window was not evaluated")]
+_Detectable = Annotated[tuple[Detectable, ...], Field(description="what would have been found in this window")]
+
+
 class Report(BaseModel):
     """One evaluation of the sliding window."""
 
@@ -97,23 +216,25 @@ class Report(BaseModel):
     state: _State
     filled: float = Field(description="fraction of a full window", examples=[1.0])
     speed_rad_s: float | None = Field(description="mean speed in the window", examples=[138.23])
-    misfit: float | None = Field(
-        description="power beyond what the fitted theory says, relative; not calibrated yet", examples=[0.64]
-    )
-    parameters: tuple[Parameter, ...] = Field(description="what the alarms are decided on")
-    equations: tuple[Equation, ...] = Field(description="the networks' opinion, equation by equation")
+    misfit_z: _MisfitZ
+    suspect: _Suspect
+    verdict: _Verdict
+    parameters: tuple[Parameter, ...] = Field(description="the likelihood's readings of the whole window")
+    opinions: _Opinions
+    equations: tuple[Equation, ...] = Field(description="the networks' residuals, equation by equation")
+    detectable: _Detectable
     reason: _Reason
     bundle: _Bundle
     machine_hash: _MachineHash
 
 
 class Alarm(BaseModel):
-    """Alarm of one parameter."""
+    """Alarm of one parameter, or of the model."""
 
     model_config = _JSON
 
-    parameter: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    parameter: _AlarmParameter
+    text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
     state: AlarmState = Field(
         description="normal, pending (must last before it is raised), active, clearing (must last before it ends)",
         examples=["active"],
@@ -125,8 +246,9 @@ class Alarm(BaseModel):
     since_ns: int = Field(description="data time at which `state` was entered", examples=[_NS])
     raised_ns: int | None = Field(description="data time at which the present occurrence was raised", examples=[_NS])
     occurrence: int = Field(description="how often it was raised since the monitor started", examples=[1])
-    relative_change: float | None = Field(description="latest relative change", examples=[-0.247])
+    relative_change: float | None = Field(description="latest relative change; null for model", examples=[-0.247])
     standard_error: float | None = Field(description="its standard error", examples=[0.0071])
+    low_confidence: _LowConfidence
 
 
 class AlarmStates(BaseModel):
@@ -183,8 +305,8 @@ class Health(BaseModel):
     site: _Site
     machine: _Name
     state: HealthState = Field(
-        description="warming, healthy, alert, danger, no-data (silence; outranks everything, see `alarms`) or "
-        "not-evaluable",
+        description="warming, healthy, alert, danger, outside-model, no-data (silence; outranks everything, see "
+        "`alarms`) or not-evaluable",
         examples=["alert"],
     )
     reason: str = Field(description="why the state is no-data or not-evaluable; empty otherwise", examples=[""])
@@ -192,11 +314,13 @@ class Health(BaseModel):
     window_start_ns: int | None = Field(description="oldest data of the latest window", examples=[_NS - 60_000_000_000])
     window_end_ns: int | None = Field(description="end of the latest window", examples=[_NS])
     speed_rad_s: float | None = Field(description="mean speed in the latest window", examples=[138.23])
-    misfit: float | None = Field(
-        description="power beyond what the fitted theory says, relative; not calibrated yet", examples=[0.64]
-    )
+    misfit_z: _MisfitZ
+    suspect: _Suspect
+    verdict: _Verdict
     parameters: tuple[Parameter, ...] = Field(description="parameters in the latest window")
+    opinions: _Opinions
     equations: tuple[Equation, ...] = Field(description="equations in the latest window")
+    detectable: _Detectable
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
     quality: Quality = Field(description="what came in")
     stream: StreamStatus = Field(description="what is known about the publisher")
@@ -213,7 +337,7 @@ class AlarmEventData(BaseModel):
 
     site: _Site
     machine: _Name
-    parameter: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    parameter: _AlarmParameter
     text: str = Field(
         description="the event in a sentence",
         examples=["ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%"],
@@ -224,8 +348,9 @@ class AlarmEventData(BaseModel):
     raised_ns: int | None = Field(description="data time at which this occurrence was raised", examples=[_NS])
     occurrence: int = Field(description="how often the alarm was raised since the monitor started", examples=[1])
     sequence: int = Field(description="counts the machine's events since the monitor started, from 0", examples=[0])
-    relative_change: float | None = Field(description="relative change that decided", examples=[-0.247])
+    relative_change: float | None = Field(description="relative change that decided; null for model", examples=[-0.247])
     standard_error: float | None = Field(description="its standard error", examples=[0.0071])
+    low_confidence: _LowConfidence
     bundle: _Bundle
     machine_hash: _MachineHash
 
@@ -273,6 +398,37 @@ class MachineDescription(BaseModel):
         description="Zenoh keys by name",
         examples=[{"stream": "rotorwatch/demo/lab/stream", "health": "rotorwatch/demo/lab/health"}],
     )
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class DetectableParameter(BaseModel):
+    """What it takes to find a change of one parameter."""
+
+    model_config = _JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    loss: float = Field(description="smallest relative change downwards found in one window", examples=[-0.025])
+    gain: float = Field(description="smallest relative change upwards found in one window", examples=[0.026])
+    length_s: float | None = Field(
+        description="data it takes to find the wished `change`; null without a wish", examples=[16.0]
+    )
+
+
+class DetectableChanges(BaseModel):
+    """What would be found on this machine as it runs now, with 95 % probability."""
+
+    model_config = _JSON
+
+    site: _Site
+    machine: _Name
+    window_end_ns: int | None = Field(description="end of the window this is computed from", examples=[_NS])
+    window_length_s: float = Field(description="length of the window", examples=[60.0])
+    false_alarms_per_month: float = Field(description="declared in the machine file", examples=[1.0])
+    change: float | None = Field(description="relative change asked for; null without", examples=[-0.05])
+    parameters: tuple[DetectableParameter, ...] = Field(description="one entry per parameter that can be read")
+    reason: str = Field(description="why there is no entry; empty otherwise", examples=[""])
     bundle: _Bundle
     machine_hash: _MachineHash
 

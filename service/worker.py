@@ -15,7 +15,15 @@ from service.history import History
 from service.inbox import Inbox, RawBlock
 from service.logs import Limiter, logger
 from service.monitor import MachineHealth, MachineMonitor, MonitorReport
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report, StreamStatus
+from service.schemas import (
+    AlarmCloudEvent,
+    AlarmStates,
+    DetectableChanges,
+    Health,
+    MachineDescription,
+    Report,
+    StreamStatus,
+)
 
 __all__ = ["MachineWorker", "Outlet"]
 
@@ -148,6 +156,10 @@ class MachineWorker:
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
         return conversion.alarm_states(self.identity, self._snapshot.alarms, include_normal=include_normal)
+
+    def detectable(self, change: float | None) -> DetectableChanges:
+        """Return what would be found on the machine as it runs now."""
+        return conversion.detectable_changes(self.identity, self.machine, self._snapshot, change)
 
     def description(self) -> MachineDescription:
         """Identity, stream, keys, and the present state."""

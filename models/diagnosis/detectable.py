@@ -9,7 +9,7 @@ from scipy.special import ndtri
 from models.diagnosis.calibration import Thresholds
 from models.diagnosis.stretch import Stretch, from_scale, to_scale
 
-__all__ = ["DetectableChange", "detectable_changes", "length_for"]
+__all__ = ["DetectableChange", "detectable_changes", "length_for", "length_to_find"]
 
 _POWER = 0.95
 
@@ -96,3 +96,28 @@ def length_for(
         raise ValueError(f"change of {name} to be found is {change}, expected above -1 and not 0")
     needed = (thresholds.first + float(ndtri(power))) * standard_error / abs(to_scale(name, change))
     return length_s * needed**2
+
+
+def length_to_find(found: DetectableChange, change: float) -> float:
+    """Data it takes to find another change of the parameter than the smallest one of a known length.
+
+    Parameters
+    ----------
+    found : DetectableChange
+        Smallest change and the length it takes.
+    change : float
+        Relative change that is to be found instead, not 0 and above -1.
+
+    Returns
+    -------
+    float
+        Length, s.
+
+    Raises
+    ------
+    ValueError
+        If the change is 0 or -1 and below.
+    """
+    if change == 0 or not change > -1:
+        raise ValueError(f"change of {found.name} to be found is {change}, expected above -1 and not 0")
+    return found.length_s * (to_scale(found.name, found.gain) / to_scale(found.name, change)) ** 2

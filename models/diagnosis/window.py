@@ -191,8 +191,15 @@ class SlidingWindow:
         self.gap()
         self._hops.clear()
 
-    def statistics(self) -> WindowStatistics | None:
-        """Statistics of the window, or None while it is not full."""
-        if len(self._hops) < self.plan.hops:
+    def statistics(self, hops: int | None = None) -> WindowStatistics | None:
+        """Statistics of the window, or of its latest hops, or None while there are not so many.
+
+        Parameters
+        ----------
+        hops : int, optional
+            How many of the latest hops; all hops of a full window without it.
+        """
+        count = self.plan.hops if hops is None else hops
+        if not 0 < count <= len(self._hops):
             return None
-        return window_statistics(self.plan, tuple(self._hops))
+        return window_statistics(self.plan, tuple(self._hops)[-count:])

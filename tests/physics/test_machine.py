@@ -57,7 +57,7 @@ def test_the_light_machine_is_damped_as_its_file_says() -> None:
         ('name = "lab"', 'name = "la/b"', "'la/b' cannot be part of a key"),
         ("hop_s = 5.0", "hop_s = 7.0", "multiple of hop_s"),
         ("band_hz = [3.0, 150.0]", "band_hz = [3.0, 3.1]", "expected at least 20"),
-        ("on_delay_s = 60.0", "on_delay_s = -1.0", "alarms.on_delay_s"),
+        ("on_delay_s = 5.0", "on_delay_s = -1.0", "alarms.on_delay_s"),
         ('name = "z1"', 'name = "y1"', "channel name occurs twice: y1"),
         ("[rotor]", "[rotor", "not a TOML file"),
     ],
@@ -77,7 +77,7 @@ def test_a_missing_machine_file_names_the_shipped_ones(tmp_path: Path) -> None:
 
 def test_physics_hash_follows_what_networks_depend_on(tmp_path: Path) -> None:
     lab = load_machine("lab")
-    alarm = load_machine(write(tmp_path, LAB.replace("on_delay_s = 60.0", "on_delay_s = 61.0")))
+    alarm = load_machine(write(tmp_path, LAB.replace("on_delay_s = 5.0", "on_delay_s = 61.0")))
     rotor = load_machine(write(tmp_path, LAB.replace("m1_kg = 0.5", "m1_kg = 0.51")))
     assert alarm.physics_hash == lab.physics_hash
     assert rotor.physics_hash != lab.physics_hash

@@ -1,6 +1,7 @@
 """Alarm scenarios in compact notation: one character per window of five seconds.
 
-``.`` nothing, ``x`` beyond the limit, ``X`` beyond danger, ``o`` between the limits, ``_`` not evaluated.
+``.`` nothing, ``x`` beyond the limit, ``X`` beyond danger, ``o`` between the limits, ``?`` as large as ``x`` but not
+found to have changed, ``_`` not evaluated.
 Events: ``^`` raised, ``!`` escalated, ``v`` cleared.
 """
 
@@ -11,20 +12,18 @@ from hypothesis import strategies as st
 from models.machine import AlarmSettings
 from service.alarms import AlarmBook, AlarmEvent, AlarmState, Severity
 
-CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "X": 0.6}
+CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6}
 MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}
 SETTINGS = AlarmSettings(on_delay_s=10, off_delay_s=15)
 
 
-def play(
-    story: str, settings: AlarmSettings = SETTINGS, error: float = 0.01
-) -> tuple[str, AlarmBook, list[AlarmEvent]]:
+def play(story: str, settings: AlarmSettings = SETTINGS) -> tuple[str, AlarmBook, list[AlarmEvent]]:
     book, marks = AlarmBook(settings), ""
     events: list[AlarmEvent] = []
     for number, character in enumerate(story):
         heard: tuple[AlarmEvent, ...] = ()
         if character != "_":
-            heard = book.update("k_by", CHANGES[character], error, number * 5_000_000_000)
+            heard = book.update("k_by", CHANGES[character], 0.01, number * 5_000_000_000, named=character in "oxX")
         marks += MARKS[heard[0].kind] if heard else " "
         events += heard
     return marks, book, events
@@ -51,16 +50,28 @@ def test_stories(story: str, expected: str) -> None:
     assert play(story)[0] == expected
 
 
-def test_a_change_must_exceed_its_own_uncertainty() -> None:
-    assert "^" not in play("xxxxxxxx", error=0.041)[0]  # 4.9 standard errors
-    assert "^" in play("xxxxxxxx", error=0.039)[0]
+def test_a_change_must_have_been_found() -> None:
+    assert "^" not in play("????????")[0]
+    assert play("..xxx???...")[0] == "    ^      "  # nor does a large reading clear what it did not raise
+
+
+def test_outside_the_model_is_an_alarm_of_its_own() -> None:
+    book = AlarmBook(SETTINGS)
+    told = [event for n in range(4) for event in book.update_model(True, n * 5_000_000_000)]
+    assert [(event.kind, event.alarm.parameter) for event in told] == [("raised", "model")]
+    assert told[0].text.startswith("ALERT: outside the model: something has changed that no parameter describes")
+    assert not book.update("e", 0.3, 0.01, 0, named=True, low_confidence=True)
+    (event,) = book.update("e", 0.3, 0.01, 10**10, named=True, low_confidence=True)
+    assert event.text.endswith("changed by +30.0% ± 2.0% (low confidence: outside the model)")
+    told = [event for n in range(4, 9) for event in book.update_model(False, n * 5_000_000_000)]
+    assert [event.text for event in told] == ["cleared: the model describes the machine again"]
 
 
 @pytest.mark.parametrize("error", [0.05, 0.15, 0.0, float("inf"), float("nan")])
 def test_a_large_change_clears_no_alarm_however_uncertain_it_is(error: float) -> None:
     _, book, _ = play("xxx")
     for number in range(3, 10):
-        assert not book.update("k_by", -0.2, error, number * 5_000_000_000)
+        assert not book.update("k_by", -0.2, error, number * 5_000_000_000, named=False)
     assert book.alarms[0].state is AlarmState.ACTIVE
 
 
@@ -78,7 +89,7 @@ def test_severity_is_the_highest_of_the_raised_alarms() -> None:
     _, book, _ = play("xxx")
     severities = [book.severity]
     for number in range(4):
-        book.update("e", 0.9, 0.01, number * 5_000_000_000)
+        book.update("e", 0.9, 0.01, number * 5_000_000_000, named=True)
     severities.append(book.severity)
     assert severities == [Severity.ALERT, Severity.DANGER]
 
@@ -91,13 +102,13 @@ def test_own_limits_of_a_parameter() -> None:
 
 def test_a_stepped_clock_restarts_the_delays() -> None:
     book = AlarmBook(SETTINGS)
-    assert not book.update("k_by", -0.2, 0.01, 10**18)
+    assert not book.update("k_by", -0.2, 0.01, 10**18, named=True)
     book.clock_stepped(10**9)
-    assert not book.update("k_by", -0.2, 0.01, 2 * 10**9)
-    assert book.update("k_by", -0.2, 0.01, 12 * 10**9)[0].kind == "raised"
+    assert not book.update("k_by", -0.2, 0.01, 2 * 10**9, named=True)
+    assert book.update("k_by", -0.2, 0.01, 12 * 10**9, named=True)[0].kind == "raised"
 
 
-@given(story=st.text(".oxX_", max_size=80))
+@given(story=st.text(".oxX?_", max_size=80))
 def test_raised_and_cleared_alternate(story: str) -> None:
     _, book, events = play(story)
     kinds = [event.kind for event in events if event.kind != "escalated"]

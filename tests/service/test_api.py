@@ -12,7 +12,7 @@ from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
 from service.api import AlarmEventList, Alive, MachineList, ReportList, create_app
 from service.runtime import Runtime
-from service.schemas import AlarmStates, Health, MachineDescription, Problem, Readiness
+from service.schemas import AlarmStates, DetectableChanges, Health, MachineDescription, Problem, Readiness
 from service.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.live import START_NS, endpoint, machine_file, scenario_blocks, send, service, until
@@ -27,6 +27,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "/api/v1/machines/{site}/{machine}/health": Health,
     "/api/v1/machines/{site}/{machine}/reports": ReportList,
     "/api/v1/machines/{site}/{machine}/alarms": AlarmStates,
+    "/api/v1/machines/{site}/{machine}/detectable": DetectableChanges,
     "/api/v1/machines/{site}/{machine}/alarms/events": AlarmEventList,
     "/healthz": Alive,
     "/readyz": Readiness,
@@ -39,7 +40,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, Ma
     address = endpoint()
     file = machine_file(
         tmp_path_factory.mktemp("machine"),
-        ("on_delay_s = 60.0", "on_delay_s = 10.0"),
+        ("on_delay_s = 5.0", "on_delay_s = 10.0"),
         ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
     )
     with service(address, file, bundle="lab", when_full="wait") as (runtime, worker):
@@ -124,7 +125,7 @@ def test_alarms_and_their_events(client: httpx.Client) -> None:
     (active,) = get(client, f"{PLACE}/alarms", AlarmStates).alarms
     assert (active.parameter, active.state, active.severity, active.occurrence) == ("k_by", "active", "alert", 1)
     everything = get(client, f"{PLACE}/alarms?all=true", AlarmStates).alarms
-    assert {alarm.parameter for alarm in everything} == set(PARAMETERS)
+    assert {alarm.parameter for alarm in everything} == {*PARAMETERS, "model"}
     assert [alarm.parameter for alarm in everything if alarm.state != "normal"] == ["k_by"]
     (event,) = get(client, f"{PLACE}/alarms/events", AlarmEventList).events
     assert event.type == "org.rotorwatch.alarm.raised"
@@ -137,6 +138,38 @@ def test_alarms_and_their_events(client: httpx.Client) -> None:
     assert event.data.text.startswith("ALERT: bearing stiffness, horizontal (k_by) changed by -3")
     later = get(client, f"{PLACE}/alarms/events?since_ns={event.data.time_ns + 1}", AlarmEventList)
     assert later.events == ()
+
+
+def test_health_says_what_changed_since_when_and_who_agrees(client: httpx.Client) -> None:
+    health = get(client, f"{PLACE}/health", Health)
+    verdict = health.verdict
+    assert verdict is not None
+    (found,) = verdict.changed
+    assert (found.name, found.text) == ("k_by", "bearing stiffness, horizontal")
+    assert found.since_ns < found.found_ns
+    assert verdict.detected
+    assert not verdict.outside_model
+    assert verdict.confidence > 0.99
+    assert verdict.text.startswith("changed: bearing stiffness, horizontal (k_by) since 00:00:")
+    assert health.opinions
+    for opinion in health.opinions:
+        k_by = next(one for one in opinion.agreement if one.name == "k_by")
+        assert k_by.between == ("likelihood", opinion.by)
+        assert k_by.verdict == "agree"
+        assert abs(k_by.difference_z or 9.0) < 4
+
+
+def test_detectable_changes(client: httpx.Client) -> None:
+    plain = get(client, f"{PLACE}/detectable", DetectableChanges)
+    assert [parameter.name for parameter in plain.parameters] == list(PARAMETERS)
+    assert {parameter.length_s for parameter in plain.parameters} == {None}
+    sizes = {parameter.name: parameter.gain for parameter in plain.parameters}
+    assert 0.01 < sizes["k_by"] < 0.1 < sizes["c_by"] + 0.05 < 0.3
+    asked = get(client, f"{PLACE}/detectable?change=-0.1", DetectableChanges)
+    assert asked.change == -0.1
+    for parameter in asked.parameters:
+        assert parameter.length_s is not None
+        assert (parameter.length_s < 60.0) == (parameter.loss > -0.1)
 
 
 def test_service_routes(client: httpx.Client) -> None:
@@ -161,7 +194,7 @@ def test_page_for_people_needs_nothing_from_elsewhere(client: httpx.Client) -> N
         problem(client.get(path), 404)
 
 
-@pytest.mark.parametrize("route", ["", "/health", "/reports", "/alarms", "/alarms/events"])
+@pytest.mark.parametrize("route", ["", "/health", "/reports", "/alarms", "/alarms/events", "/detectable"])
 def test_unknown_machine_is_a_problem_that_names_the_known_ones(client: httpx.Client, route: str) -> None:
     found = problem(client.get(f"/api/v1/machines/demo/pump{route}"), 404)
     assert found.title == "Not Found"
@@ -182,6 +215,7 @@ def test_unknown_path_and_wrong_method_are_problems(client: httpx.Client) -> Non
         ("reports?limit=1001", "limit"),
         ("reports?since_ns=yesterday", "since_ns"),
         ("alarms?all=perhaps", "all"),
+        ("detectable?change=-1", "change"),
         ("alarms/events?until_ns=-1", "until_ns"),
     ],
 )

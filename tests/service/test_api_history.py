@@ -89,7 +89,7 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
         ParameterReading("EI", "likelihood", reason="no phase reference"),
     )
     equation = EquationReading("28", "bearing", float("inf"), float("nan"), readings)
-    latest = WindowReport(0, 1, HealthState.HEALTHY, 1.0, float("nan"), readings, (equation,), float("inf"))
+    latest = WindowReport(0, 1, HealthState.HEALTHY, 1.0, float("nan"), readings, (equation,), misfit_z=float("inf"))
     health = conversion.health(
         IDENTITY,
         MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", AlarmState.PENDING),), DataQuality()),
@@ -102,7 +102,7 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
 
     fields = json.loads(text, parse_constant=refuse)
     assert fields["speed_rad_s"] is None
-    assert fields["misfit"] is None
+    assert fields["misfit_z"] is None
     assert fields["equations"][0]["msd"] is None
     assert fields["alarms"][0]["standard_error"] is None
     assert [entry["interval_95"] for entry in fields["parameters"]] == [None, None, [0.1, 0.1], None]

@@ -156,7 +156,6 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
     address = endpoint()
     file = machine_file(
         tmp_path,
-        ("on_delay_s = 60.0", "on_delay_s = 5.0"),
         ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
     )
     watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")

@@ -23,7 +23,6 @@ from service.transport import LinkError, TopicMessage, follow
 from simulator.scenario import parse_fault
 from tests.service.live import Feed, endpoint, machine_file, open_session, scenario_blocks, send, service, until
 
-QUICK_ALARM = ("on_delay_s = 60.0", "on_delay_s = 5.0")
 SHORT_SILENCE = ("[operation]", "[ingest]\nno_data_after_s = 0.5\n\n[operation]")
 
 
@@ -38,7 +37,7 @@ class Topics:
 
 
 def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_nothing(tmp_path: Path) -> None:
-    file = machine_file(tmp_path, QUICK_ALARM, SHORT_SILENCE)
+    file = machine_file(tmp_path, SHORT_SILENCE)
     machine = load_machine(file)
     stream = scenario_blocks(85.0, parse_fault("c_bz=0.5@0"))
     offline = MachineMonitor(machine, load_bundle("lab", machine))

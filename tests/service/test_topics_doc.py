@@ -12,7 +12,16 @@ from models.signals.keys import MachineKeys
 from service.api import AlarmEventList, Alive, MachineList, ReportList, create_app
 from service.config import ServiceSettings, load_settings
 from service.runtime import Runtime
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, MachineDescription, Problem, Readiness, Report
+from service.schemas import (
+    AlarmCloudEvent,
+    AlarmStates,
+    DetectableChanges,
+    Health,
+    MachineDescription,
+    Problem,
+    Readiness,
+    Report,
+)
 from simulator.truth import TruthRecord
 from tests.service.live import LAB, ROOT, settings
 
@@ -33,6 +42,7 @@ ROUTES: dict[str, type[BaseModel]] = {
     "/api/v1/machines/{site}/{machine}/health": Health,
     "/api/v1/machines/{site}/{machine}/reports": ReportList,
     "/api/v1/machines/{site}/{machine}/alarms": AlarmStates,
+    "/api/v1/machines/{site}/{machine}/detectable": DetectableChanges,
     "/api/v1/machines/{site}/{machine}/alarms/events": AlarmEventList,
     "/healthz": Alive,
     "/readyz": Readiness,
@@ -74,7 +84,7 @@ def test_example_on_a_topic_is_valid_and_complete(name: str) -> None:
 
 def test_every_state_is_explained() -> None:
     text = sections("topics.md")[KEYS.health]
-    for state in ("warming", "healthy", "alert", "danger", "no-data", "not-evaluable"):
+    for state in ("warming", "healthy", "alert", "danger", "outside-model", "no-data", "not-evaluable"):
         assert f"`{state}`" in text
 
 
@@ -101,7 +111,7 @@ def test_every_query_argument_is_explained() -> None:
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     paths = create_app(Runtime(settings("tcp/127.0.0.1:0"))).openapi()["paths"]
     arguments = {p["name"] for path in paths.values() for p in path["get"].get("parameters", []) if p["in"] == "query"}
-    assert arguments == {"since_ns", "until_ns", "limit", "all"}
+    assert arguments == {"since_ns", "until_ns", "limit", "all", "change"}
     for name in arguments - {"all"}:
         assert f"| `{name}` |" in page
     assert "?all=true" in page
