@@ -293,8 +293,8 @@ def _poles(
         np.seterr(divide="ignore", invalid="ignore")
         hankel, _ = build_hank(x.T, x.T, block_rows, "cov_R")
         observability, A, C, _ = SSI_fast(hankel, block_rows, most_order, step=2)
-        frequency, damping, shapes, *_ = SSI_poles(  # type: ignore[arg-type]  # lists, as its documentation says
-            observability,
+        frequency, damping, shapes, *_ = SSI_poles(
+            observability,  # type: ignore[arg-type]  # SSI_fast calls this matrix a list
             A,
             C,
             most_order,

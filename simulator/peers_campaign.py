@@ -14,19 +14,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from models.diagnosis.bundle import Bundle
-from models.diagnosis.isolation import isolate_window
-from models.diagnosis.likelihood import LikelihoodFit
 from models.diagnosis.moments import plan_for
-from models.diagnosis.networks import read_equation
 from models.diagnosis.paper import PAPER_EQUATIONS, PaperDiagnostician, calibrate_paper
 from models.diagnosis.paper_training import train_paper_network
-from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 from simulator.campaign import Draw, Layout, Purpose, draw_condition
 from simulator.evaluation import Rate
+from simulator.opinions import diagnosticians, named_parameters, opinion_of
 from simulator.peers import FeatureVector, Peer, SubspaceModes, score_limit
 from simulator.scenario import Event
 from simulator.stream import blocks
@@ -270,14 +266,7 @@ def _simulate(plan: ComparisonPlan, series: _Series, number: int) -> tuple[Float
 
 def _verdicts(plan: ComparisonPlan, window: WindowStatistics) -> dict[str, tuple[str, ...] | None]:
     """Parameters that each diagnostician names; None where it cannot judge the window."""
-    named: dict[str, tuple[str, ...] | None] = {}
-    equations = tuple(read_equation(network, window, plan.machine) for network in plan.bundle.networks)
-    readings = tuple(reading for equation in equations for reading in equation.parameters)
-    named["relation"] = isolate_window(Diagnosis("relation", readings, equations), plan.false_alarm_rate).changed
-    try:
-        diagnosis = LikelihoodFit(plan.machine).diagnose(window)
-    except EstimationError:  # a refused window is a result: it is counted
-        named["likelihood"] = None
-    else:
-        named["likelihood"] = isolate_window(diagnosis, plan.false_alarm_rate).changed
-    return named
+    return {
+        one.by: named_parameters(opinion_of(one, window), plan.false_alarm_rate)
+        for one in diagnosticians(plan.machine, plan.bundle)
+    }

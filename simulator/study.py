@@ -20,7 +20,6 @@ from simulator.evaluation import Rate
 from simulator.study_windows import (
     CONDITIONS,
     EQUATIONS,
-    METHODS,
     Judged,
     Run,
     StudyPlan,
@@ -89,6 +88,11 @@ class Study(BaseModel):
     limits: dict[str, dict[str, float]]
     faults: tuple[StudyCell, ...]
     noise: tuple[StudyCell, ...]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Who judged, the paper's networks first."""
+        return tuple(self.faults[0].named)
 
     def cells(self, realisation: Realisation, condition: int) -> tuple[StudyCell, ...]:
         """Cells of one fault condition, by cutoff."""
@@ -238,7 +242,7 @@ def _cell(key: _Key, judged: Sequence[Judged]) -> StudyCell:
         condition=key.condition,
         cutoff_hz=key.cutoff_hz,
         noise_relative=key.noise_relative,
-        named={method: tuple(one.named[method] for one in judged) for method in METHODS},
+        named={method: tuple(one.named[method] for one in judged) for method in judged[0].named},
         msd={
             method: {equation: tuple(one.msd[method][equation] for one in judged) for equation in equations}
             for method, equations in measured.items()

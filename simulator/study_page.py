@@ -5,7 +5,7 @@ import textwrap
 from models.diagnosis.paper import PAPER_EQUATIONS
 from simulator.evaluation import Rate
 from simulator.study import REALISATIONS, Study
-from simulator.study_windows import CONDITIONS, EQUATIONS, METHODS, own_equations
+from simulator.study_windows import CONDITIONS, EQUATIONS, own_equations
 
 __all__ = ["METHOD_NAMES", "study_page"]
 
@@ -82,7 +82,7 @@ def _comparison(study: Study) -> list[str]:
         "|---|---|---|---|---|---|",
     ]
     for realisation in REALISATIONS:
-        for method in METHODS:
+        for method in study.methods:
             rates = (
                 study.exact(realisation, method),
                 study.found(realisation, method),
@@ -92,7 +92,7 @@ def _comparison(study: Study) -> list[str]:
             lines.append(
                 f"| {realisation} | {METHOD_NAMES[method]} | " + " | ".join(_text(rate) for rate in rates) + " |"
             )
-    refused = [f"{METHOD_NAMES[method]}: {study.refused(method)}" for method in METHODS if study.refused(method)]
+    refused = [f"{METHOD_NAMES[method]}: {study.refused(method)}" for method in study.methods if study.refused(method)]
     if refused:
         lines += ["", f"Windows that could not be judged, and count as not named: {'; '.join(refused)}."]
     return [*lines, "", "![Share of windows in which an equation is named](figures/reproduction-location.png)", ""]
@@ -115,14 +115,14 @@ def _conclusions(study: Study) -> list[str]:
         ),
         *_by_equation(study),
     ]
-    for method in METHODS[1:]:
+    for method in study.methods[1:]:
         one, other = (study.exact(realisation, method) for realisation in REALISATIONS)
         lines += _paragraph(
             f"- **{METHOD_NAMES[method].capitalize()}**: exact in {_text(one)} with shared and {_text(other)} with",
             f"independent realisations ({_compared(one, other)}).",
             indent="  ",
         )
-    alarms = {method: study.false_alarms("independent", method) for method in METHODS}
+    alarms = {method: study.false_alarms("independent", method) for method in study.methods}
     above = [
         f"{METHOD_NAMES[method]} ({_text(rate)})"
         for method, rate in alarms.items()
@@ -199,7 +199,7 @@ def _noise(study: Study) -> list[str]:
         "| method | " + " | ".join(f"{cell.noise_relative:.0%} noise" for cell in cells) + " |",
         "|---" * (len(cells) + 1) + "|",
     ]
-    for method in METHODS:
+    for method in study.methods:
         flagged = [Rate.of_counts(sum(map(bool, cell.named[method])), len(cell.named[method])) for cell in cells]
         lines.append(
             f"| {METHOD_NAMES[method]} | " + " | ".join(f"{rate.count} of {rate.of}" for rate in flagged) + " |"

@@ -15,7 +15,7 @@ from PIL import Image
 from models.physics.excitation import unit_spectrum
 from models.signals.block import FloatArray
 from simulator.study import REALISATIONS, Realisation, Study, StudyCell
-from simulator.study_windows import CONDITIONS, EQUATIONS, METHODS, own_equations
+from simulator.study_windows import CONDITIONS, EQUATIONS, own_equations
 
 __all__ = ["COLOURS", "MARKERS", "METHOD_TEXT", "STYLE", "draw_study", "save_figure"]
 
@@ -151,11 +151,11 @@ def _interval(
 
 def _location(study: Study) -> Figure:
     """Which equations each method names under each fault condition."""
-    figure = Figure(figsize=(2.35 * len(METHODS) + 1.2, 8.2), layout="constrained")
-    panels = figure.subplots(2, len(METHODS), sharey=True, squeeze=False)
+    figure = Figure(figsize=(2.35 * len(study.methods) + 1.2, 8.2), layout="constrained")
+    panels = figure.subplots(2, len(study.methods), sharey=True, squeeze=False)
     blues = LinearSegmentedColormap.from_list("share", ["#ffffff", "#0072B2"])
     for row, realisation in zip(panels, REALISATIONS, strict=True):
-        for axes, method in zip(row, METHODS, strict=True):
+        for axes, method in zip(row, study.methods, strict=True):
             share = np.array(
                 [
                     [study.naming(realisation, condition.number, method, equation).rate for equation in EQUATIONS]

@@ -5,10 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.diagnosis.bundle import Bundle
-from models.diagnosis.isolation import isolate_window
-from models.diagnosis.likelihood import LikelihoodFit
 from models.diagnosis.moments import plan_for
-from models.diagnosis.networks import read_equation
 from models.diagnosis.paper import (
     PAPER_EQUATIONS,
     PaperDiagnostician,
@@ -17,11 +14,11 @@ from models.diagnosis.paper import (
 )
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.lyapunov import stochastic_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
 from simulator.campaign import Purpose, with_tilt
+from simulator.opinions import diagnosticians, named_parameters, opinion_of
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.stream import blocks
 
@@ -29,7 +26,6 @@ __all__ = [
     "CONDITIONS",
     "CUTOFFS_HZ",
     "EQUATIONS",
-    "METHODS",
     "NOISE_LEVELS",
     "FaultCondition",
     "Judged",
@@ -46,7 +42,6 @@ CUTOFFS_HZ = (25.0, 50.0, 100.0, 200.0)
 NOISE_LEVELS = (0.01, 0.02, 0.03, 0.04, 0.05)
 """Coloured noise at the sensors in parts of each channel's rms (§4.2.3)."""
 
-METHODS = ("paper", "relation", "likelihood")
 EQUATIONS = tuple(equation.number for equation in PAPER_EQUATIONS)
 _OWN = {name: equation.number for equation in PAPER_EQUATIONS for name in equation.parameters}
 _NOISE_CORNER_HZ = 200.0
@@ -204,35 +199,29 @@ def judge(plan: StudyPlan, networks: tuple[PaperNetwork, ...], limits: dict[str,
     """
     whole = simulate(plan, run)
     machine = plan.machine
-    window = _seen_by(machine, whole)
+    seen = _seen_by(machine, whole)
     shared = run.realisation[0] == Purpose.TRAINING
     paper = PaperDiagnostician(machine, networks, limits["shared" if shared else "independent"])
     opinion = paper.diagnose(whole)
-    relation = _relation(plan, whole)
-    named: dict[str, tuple[str, ...] | None] = {
-        "paper": paper.flagged_equations(opinion),
-        "relation": _named(relation, plan.false_alarm_rate),
-    }
-    try:
-        named["likelihood"] = _named(LikelihoodFit(machine).diagnose(window), plan.false_alarm_rate)
-    except EstimationError:  # a refused window is a result: it is counted
-        named["likelihood"] = None
-    msd = {
-        diagnosis.by: {reading.equation: reading.msd for reading in diagnosis.equations if reading.msd is not None}
-        for diagnosis in (opinion, relation)
-    }
+    named: dict[str, tuple[str, ...] | None] = {"paper": paper.flagged_equations(opinion)}
+    msd = {"paper": _deviations(opinion)}
+    for one in diagnosticians(machine, plan.bundle):
+        # Equation 30 needs tilt; the others judge by the machine's own channels.
+        other = opinion_of(one, whole if one.by == "relation" else seen)
+        parameters = named_parameters(other, plan.false_alarm_rate)
+        named[one.by] = None if parameters is None else _equations_of(parameters)
+        if other is not None and other.equations:
+            msd[one.by] = _deviations(other)
     return Judged(named, msd)
 
 
-def _relation(plan: StudyPlan, window: WindowStatistics) -> Diagnosis:
-    equations = tuple(read_equation(network, window, plan.machine) for network in plan.bundle.networks)
-    parameters = tuple(reading for equation in equations for reading in equation.parameters)
-    return Diagnosis("relation", parameters, equations)
+def _deviations(diagnosis: Diagnosis) -> dict[str, float]:
+    return {reading.equation: reading.msd for reading in diagnosis.equations if reading.msd is not None}
 
 
-def _named(diagnosis: Diagnosis, false_alarm_rate: float) -> tuple[str, ...]:
-    """Equations that contain the parameters of the verdict."""
-    equations = {_OWN[name] for name in isolate_window(diagnosis, false_alarm_rate).changed}
+def _equations_of(parameters: tuple[str, ...]) -> tuple[str, ...]:
+    """Equations that contain any of the parameters."""
+    equations = {_OWN[name] for name in parameters}
     return tuple(number for number in EQUATIONS if number in equations)
 
 
