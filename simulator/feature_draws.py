@@ -67,6 +67,17 @@ class FeatureDraws:
         ]
         return cls(machine, seed, conditions, *principal_directions(np.concatenate(parts, axis=1), KEPT))
 
+    @property
+    def windows(self) -> int:
+        """Windows per batch."""
+        return self.conditions * _REALISATIONS
+
+    @property
+    def n_common(self) -> int:
+        """Inputs that all networks share, without those of equation 29."""
+        features = ForceFeatures(self.machine)
+        return features.n_series * int(self.directions.shape[2]) + features.n_consistency
+
     def batch(self, number: int) -> Batch:
         """Make one batch."""
         draws, features = SpectralDraws(self.machine), ForceFeatures(self.machine)
@@ -91,7 +102,7 @@ class FeatureDraws:
             scores = series.transpose(1, 0, 2).reshape(speed.size, features.n_series * n_kept)
             seen = agreement.copy()
             seen[:, n_speed:] += _CONSISTENCY_ERROR * rng.standard_normal(seen[:, n_speed:].shape, dtype=np.float32)
-            parts = [scores, seen]
+            parts: list[Float32Array] = [np.asarray(scores, dtype=np.float32), seen]
             if features.has_angle:
                 vectors = draws.scattered_vectors(rng, conditions)
                 parts.append(features.unbalance(conditions.spectrum, vectors, speed))

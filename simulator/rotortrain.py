@@ -42,15 +42,19 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers
 def train(
     machine: MachineOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle to write.")],
-    windows: Annotated[int, typer.Option(min=20, help="Training windows per equation.")] = 160,
+    windows: Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")] = 160,
+    draws: Annotated[
+        int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
+    ] = 300_000,
     seed: SeedOption = _SEED,
     processes: ProcessesOption = _CORES,
 ) -> None:
-    """Train the network of every equation and write a bundle.
+    """Train two networks for every equation and write a bundle.
 
-    Each equation is trained on simulated windows in which its own parameters are as in the machine file and everything
-    else is random, and calibrated on half as many further windows. The bundle holds weights, healthy spread, and what
-    is needed to make it again; the monitor refuses it for any other machine.
+    The relation network of an equation is trained on simulated windows in which its own parameters are as in the
+    machine file and everything else is random. The amortised network learns its own parameters from windows drawn as
+    spectra, everything random. Both are calibrated on further simulated windows. The bundle holds weights, calibration,
+    and what is needed to make it again; the monitor refuses it for any other machine.
 
     Example: rotortrain train --machine lab --out lab-bundle
     """
@@ -58,7 +62,7 @@ def train(
     from simulator.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
-        train_bundle(machine, out, windows, seed, processes)
+        train_bundle(machine, out, windows, draws, seed, processes)
     except RotorwatchError as error:
         _fail(error)
 

@@ -4,7 +4,8 @@
 
     lab/
     ├── manifest.json        machine, equations, units, seeds, versions, healthy spread, hash of the weights
-    └── weights.safetensors  input_scale, W1, b1, W2, b2 of every equation, float64
+    └── weights.safetensors  relation networks, float64: 28.input_scale, 28.W1, …
+                             amortised networks, float32: basis.mean, …, amortised.28.W1, …
 
 Loading refuses a bundle that is damaged or was trained for another machine, and says what differs.
 """
@@ -12,6 +13,7 @@ Loading refuses a bundle that is damaged or was trained for another machine, and
 import hashlib
 import json
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,6 +22,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from models.diagnosis.amortised import LAYERS, OWN, AmortisedNetwork, AmortisedNetworks, Calibration
+from models.diagnosis.features import FeatureBasis
 from models.diagnosis.networks import HIDDEN, EquationNetwork, Healthy, Network, equation_by_number
 from models.errors import BundleError
 from models.machine import Machine
@@ -28,8 +32,10 @@ __all__ = ["Bundle", "Manifest", "Training", "load_bundle", "save_bundle"]
 
 _SHIPPED = Path(__file__).parent.parent / "bundles"
 _STRICT = ConfigDict(extra="forbid", frozen=True)
-_FORMAT = 1
+_Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
+_FORMAT = 2
 _PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
+_BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
 _ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
 
 
@@ -58,6 +64,31 @@ class EquationEntry(BaseModel):
     healthy: HealthyEntry
 
 
+class CalibrationEntry(BaseModel):
+    """Calibration of one parameter, see `models.diagnosis.amortised.Calibration`."""
+
+    model_config = _STRICT
+
+    bias: float = Field(allow_inf_nan=False)
+    log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
+    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
+
+
+class AmortisedEntry(BaseModel):
+    """The amortised networks, see `models.diagnosis.amortised.AmortisedNetworks`."""
+
+    model_config = _STRICT
+
+    channels: tuple[str, ...] = Field(min_length=1, description="measured states in order")
+    units: Literal["SI"] = Field(default="SI", description="units of the channels")
+    equations: tuple[Literal["28", "29", "30", "31"], ...]
+    layers: tuple[int, ...]
+    calibration: dict[str, CalibrationEntry]
+    calibration_windows: int = Field(ge=1)
+    novelty_limit: float = Field(gt=0, allow_inf_nan=False)
+    log_range: float = Field(gt=0, allow_inf_nan=False)
+
+
 class Training(BaseModel):
     """How the bundle was made: enough to make it again."""
 
@@ -66,6 +97,7 @@ class Training(BaseModel):
     seed: int
     training_windows: int
     calibration_windows: int
+    drawn_conditions: int = Field(default=0, description="random machines and conditions of the amortised networks")
     versions: dict[str, str]
 
 
@@ -78,6 +110,7 @@ class Manifest(BaseModel):
     machine: str
     physics: dict[str, Any] = Field(description="rotor, operation, condition, rate and window it was trained for")
     equations: tuple[EquationEntry, ...]
+    amortised: AmortisedEntry | None = None
     training: Training
     weights_sha256: str
 
@@ -90,11 +123,13 @@ class Bundle:
     ----------
     manifest : Manifest
     networks : tuple of EquationNetwork
-        In the order of the equation table.
+        Relation networks in the order of the equation table.
+    amortised : AmortisedNetworks or None
     """
 
     manifest: Manifest
     networks: tuple[EquationNetwork, ...]
+    amortised: AmortisedNetworks | None = None
 
     @property
     def identity(self) -> str:
@@ -110,7 +145,13 @@ def _physics(machine: Machine) -> dict[str, Any]:
     return json.loads(json.dumps(machine.model_dump(mode="json", include=set(_PHYSICS))))  # type: ignore[no-any-return]
 
 
-def save_bundle(directory: Path, machine: Machine, networks: tuple[EquationNetwork, ...], training: Training) -> Bundle:
+def save_bundle(
+    directory: Path,
+    machine: Machine,
+    networks: tuple[EquationNetwork, ...],
+    training: Training,
+    amortised: AmortisedNetworks | None = None,
+) -> Bundle:
     """Write a bundle.
 
     Raises
@@ -118,7 +159,7 @@ def save_bundle(directory: Path, machine: Machine, networks: tuple[EquationNetwo
     BundleError
         If a network is not calibrated or the directory cannot be written.
     """
-    arrays: dict[str, np.ndarray[Any, np.dtype[np.float64]]] = {}
+    arrays: _Arrays = {}
     entries = []
     for trained in networks:
         number, healthy = trained.equation.number, trained.healthy
@@ -138,12 +179,19 @@ def save_bundle(directory: Path, machine: Machine, networks: tuple[EquationNetwo
                 ),
             )
         )
+    entry = None
+    if amortised is not None:
+        if set(amortised.calibration) != {name for network in amortised.networks for name in OWN[network.equation]}:
+            raise BundleError(f"{directory}: the amortised networks are not calibrated: calibrate them before saving")
+        arrays |= _amortised_arrays(amortised)
+        entry = _amortised_entry(amortised, training)
     weights = save(arrays)
     manifest = Manifest(
         format=_FORMAT,
         machine=machine.name,
         physics=_physics(machine),
         equations=tuple(entries),
+        amortised=entry,
         training=training,
         weights_sha256=hashlib.sha256(weights).hexdigest(),
     )
@@ -153,7 +201,7 @@ def save_bundle(directory: Path, machine: Machine, networks: tuple[EquationNetwo
         (directory / "manifest.json").write_bytes(_canonical(manifest) + b"\n")
     except OSError as error:
         raise BundleError(f"{directory}: cannot be written ({error.strerror})") from error
-    return Bundle(manifest, networks)
+    return Bundle(manifest, networks, amortised)
 
 
 def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
@@ -201,12 +249,11 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
         arrays = load(weights)
     except SafetensorError as error:
         raise BundleError(f"{directory}/weights.safetensors: {error}") from error
-    return Bundle(manifest, tuple(_network(directory, entry, arrays) for entry in manifest.equations))
+    amortised = None if manifest.amortised is None else _amortised(directory, manifest.amortised, arrays)
+    return Bundle(manifest, tuple(_network(directory, entry, arrays) for entry in manifest.equations), amortised)
 
 
-def _network(
-    directory: Path, entry: EquationEntry, arrays: dict[str, np.ndarray[Any, np.dtype[Any]]]
-) -> EquationNetwork:
+def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> EquationNetwork:
     """One equation's network, checked against this program's equation table."""
     where = f"{directory}: equation {entry.number}"
     try:
@@ -236,6 +283,84 @@ def _network(
         parts.append(array)
     healthy = Healthy(entry.healthy.windows, entry.healthy.msd, entry.healthy.z_scale, entry.healthy.spread)
     return EquationNetwork(equation, Network(*parts), healthy)
+
+
+def _amortised_arrays(amortised: AmortisedNetworks) -> _Arrays:
+    arrays: _Arrays = {f"basis.{name}": np.ascontiguousarray(getattr(amortised.basis, name)) for name in _BASIS}
+    for network in amortised.networks:
+        where = f"amortised.{network.equation}"
+        for number, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
+            arrays[f"{where}.W{number}"], arrays[f"{where}.b{number}"] = weight, bias
+        arrays[f"{where}.direct"] = network.direct
+    return arrays
+
+
+def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> AmortisedEntry:
+    return AmortisedEntry.model_validate(
+        {
+            "channels": amortised.states,
+            "equations": tuple(network.equation for network in amortised.networks),
+            "layers": LAYERS,
+            "calibration": {
+                name: {"bias": one.bias, "log_deviation": one.log_deviation, "z_scale": one.z_scale}
+                for name, one in amortised.calibration.items()
+            },
+            "calibration_windows": training.calibration_windows,
+            "novelty_limit": amortised.novelty_limit,
+            "log_range": amortised.log_range,
+        }
+    )
+
+
+def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> AmortisedNetworks:
+    """The amortised networks, every array checked against what the others say its shape must be."""
+    where = f"{directory}: amortised networks"
+    if entry.layers != LAYERS:
+        raise BundleError(f"{where}: layers are {entry.layers}, this program expects {LAYERS}")
+    parameters = {name for number in entry.equations for name in OWN[number]}
+    if set(entry.calibration) != parameters:
+        raise BundleError(f"{where}: calibrated are {sorted(entry.calibration)}, expected {sorted(parameters)}")
+    for name, one in entry.calibration.items():
+        if len(one.log_deviation) != len(one.z_scale) or list(one.log_deviation) != sorted(one.log_deviation):
+            raise BundleError(f"{where}: calibration of {name}: expected ascending log_deviation, one z_scale for each")
+    n_inputs = arrays.get("basis.centre", np.empty(0)).size
+    n_common = arrays.get("basis.precision_factor", np.empty((0, 0))).shape[0]
+    n_series, n_bins, n_kept = arrays.get("basis.directions", np.empty((0, 0, 0))).shape
+    shapes: dict[str, tuple[int, ...]] = {
+        "basis.mean": (n_series, 1, n_bins),
+        "basis.directions": (n_series, n_bins, n_kept),
+        "basis.centre": (n_inputs,),
+        "basis.scale": (n_inputs,),
+        "basis.precision_factor": (n_common, n_common),
+    }
+    for number in entry.equations:
+        own = len(OWN[number])
+        first = n_inputs if number == "29" else n_common
+        sizes = (first, *LAYERS, 2 * own + own * (own - 1) // 2)
+        for layer, (n_in, n_out) in enumerate(pairwise(sizes), start=1):
+            shapes[f"amortised.{number}.W{layer}"] = (n_in, n_out)
+            shapes[f"amortised.{number}.b{layer}"] = (n_out,)
+        shapes[f"amortised.{number}.direct"] = (first, own)
+    for name, shape in shapes.items():
+        array = arrays.get(name)
+        if array is None or array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
+            state = "missing" if array is None else f"{array.dtype}{array.shape}"
+            raise BundleError(f"{where}: {name} is {state}, expected finite float32{shape}")
+    basis = FeatureBasis(*(arrays[f"basis.{name}"] for name in _BASIS))
+    layers = range(1, len(LAYERS) + 2)
+    networks = tuple(
+        AmortisedNetwork(
+            number,
+            tuple(arrays[f"amortised.{number}.W{layer}"] for layer in layers),
+            tuple(arrays[f"amortised.{number}.b{layer}"] for layer in layers),
+            arrays[f"amortised.{number}.direct"],
+        )
+        for number in entry.equations
+    )
+    calibration = {
+        name: Calibration(one.bias, one.log_deviation, one.z_scale) for name, one in entry.calibration.items()
+    }
+    return AmortisedNetworks(entry.channels, basis, networks, calibration, entry.novelty_limit, entry.log_range)
 
 
 def _lengths(healthy: HealthyEntry) -> tuple[int, int]:

@@ -69,6 +69,11 @@ class ForceFeatures:
         """Number of functions of frequency: force spectra, and real and imaginary parts of their coherences."""
         return len(self._dofs) + 2 * len(self._pairs)
 
+    @property
+    def n_consistency(self) -> int:
+        """Number of features that `consistency` gives."""
+        return 1 + 2 * _BANDS * len(self._twice)
+
     def _motion_weights(self, index: npt.NDArray[np.intp]) -> FloatArray:
         """Corner ω where rates take over from displacements, for each measured degree of freedom, rad/s.
 
@@ -224,8 +229,7 @@ class FeatureBasis:
     def condensed(self, series: Float32Array) -> Float32Array:
         """Scores of the functions of frequency, shape (n_windows, n_series · n_kept)."""
         scores = (series - self.mean) @ self.directions
-        flat: Float32Array = np.ascontiguousarray(scores.transpose(1, 0, 2)).reshape(series.shape[1], -1)
-        return flat
+        return np.asarray(scores.transpose(1, 0, 2).reshape(series.shape[1], -1), dtype=np.float32)
 
     def standardised(self, raw: Float32Array) -> Float32Array:
         """Inputs in units of their usual deviation; `raw` may lack those of equation 29."""

@@ -189,7 +189,8 @@ class RelationDiagnostician:
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
-        equations, parameters = [], []
+        equations: list[EquationReading] = []
+        parameters: list[ParameterReading] = []
         for equation in EQUATIONS:
             trained = self._networks.get(equation.number)
             if trained is None:

@@ -23,7 +23,7 @@ _STEPS_PER_ROUND = 25
 
 _LEVELS = [0.9, 0.95]
 _NORMAL = np.array([[1.644854], [1.959964]])
-"""Quantiles of |z| that calibrate the standard errors, and those of the normal distribution; two scatter less than one."""
+"""Quantiles of |z| that calibrate the standard errors, and the normal distribution's: two scatter less than one."""
 _MAD = 1.4826
 """Median absolute deviation to standard deviation."""
 
