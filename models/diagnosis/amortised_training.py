@@ -30,13 +30,13 @@ from models.signals.block import FloatArray
 __all__ = ["calibrate_networks", "train_networks"]
 
 _BATCH = 512
-_PASSES = 2.0
+_PASSES = 3.0
 """How often a window is seen on average."""
-_BUFFER = 120_000
+_BUFFER = 160_000
 _WARM_UP = 24_000
 """Windows in the buffer before the first step: they standardise the inputs."""
 _RATE, _RATE_RISES_OVER = 2e-3, 100
-_WEIGHT_DECAY = 1e-3
+_WEIGHT_DECAY = 2e-2
 _USUAL = 0.3
 """Standard deviation of the drawn logarithmic ratios, about: the networks work in units of it."""
 _NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
@@ -52,7 +52,7 @@ class _Learner:
         self.n_inputs = n_inputs
         p = len(self.targets)
         sizes = (n_inputs, *LAYERS, 1 + 1 if p == 1 else 5)
-        self.weights = [torch.randn(a, b, generator=generator) * (1.5 / a**0.5) for a, b in pairwise(sizes)]
+        self.weights = [torch.randn(a, b, generator=generator) * (0.5 / a**0.5) for a, b in pairwise(sizes)]
         self.weights[-1] *= 0.1
         self.biases = [torch.zeros(b) for b in sizes[1:]]
         self.direct = torch.zeros(n_inputs, p)

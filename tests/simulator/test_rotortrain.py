@@ -21,7 +21,8 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.slow
 def test_train_writes_a_bundle_that_fits_the_machine_and_evaluate_reads_it(tmp_path: Path) -> None:
     out = tmp_path / "bundle"
-    done = run("train", "--machine", "lab", "--out", str(out), "--windows", "20", "--seed", "4", "--processes", "2")
+    size = ("--windows", "20", "--draws", "2000")
+    done = run("train", "--machine", "lab", "--out", str(out), *size, "--seed", "4", "--processes", "2")
     assert done.returncode == 0, done.stderr
     assert "(28) bearing" in done.stdout
     assert "written to" in done.stdout

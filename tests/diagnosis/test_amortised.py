@@ -1,0 +1,218 @@
+"""Amortised networks: drawn spectra against simulated ones, features, readings, refusals, and training in small."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from models.diagnosis.amortised import OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
+from models.diagnosis.amortised_training import calibrate_networks, train_networks
+from models.diagnosis.bundle import load_bundle
+from models.diagnosis.features import ForceFeatures
+from models.diagnosis.networks import RelationDiagnostician
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import load_machine
+from models.physics.parameters import PARAMETERS
+from simulator.campaign import Draw, Layout, Purpose, simulate_window, with_tilt
+from simulator.feature_draws import FeatureDraws, batches
+from simulator.spectral_draws import LOG_RATIO, SpectralDraws
+
+SEED = 7_700_041
+LAB = load_machine("lab")
+FAULTS: dict[str, float] = {"k_by": -0.05, "c_by": -0.2, "k_bz": -0.05, "c_bz": -0.2, "e": 0.2, "EI": -0.1}
+
+
+@cache
+def window(parameter: str, number: int, layout: Layout = Layout.INDEPENDENT) -> WindowStatistics:
+    faults = {parameter: FAULTS[parameter]} if parameter else {}
+    stream = 400 + (0 if not parameter else 1 + PARAMETERS.index(parameter)) + 10 * layout
+    return simulate_window(Draw(LAB, SEED, Purpose.EVALUATION, stream, faults=faults, layout=layout), number)
+
+
+@cache
+def shipped() -> AmortisedNetworks:
+    amortised = load_bundle("lab", LAB).amortised
+    assert amortised is not None
+    return amortised
+
+
+def test_drawn_spectra_scatter_around_their_expectation_like_averaged_segments() -> None:
+    draws = SpectralDraws(LAB)
+    rng = np.random.default_rng(SEED)
+    conditions = draws.draw(rng, 1)
+    expected, speed = conditions.spectrum, conditions.speed_rad_s
+    made = np.concatenate(list(draws.realisations(rng, expected, speed, 600)))
+    power = np.einsum("bfii->bfi", made).real / np.einsum("bfii->bfi", expected).real
+    assert power.mean() == pytest.approx(1.0, abs=0.01)
+    # Half-overlapped Hann segments: variance 1/60 · (1 + 2/36) in each bin, correlation 4/9 between neighbours.
+    assert power.var(axis=0).mean() == pytest.approx((1 + 2 / 36) / 60, rel=0.12)
+    deviation = power - power.mean(axis=0)
+    neighbours = (deviation[:, 1:] * deviation[:, :-1]).mean() / deviation.var()
+    assert neighbours == pytest.approx(4 / 9, abs=0.04)
+    coherent = np.abs(made[:, :, 0, 1].mean(axis=0) - expected[0, :, 0, 1])
+    assert np.all(coherent < 0.05 * np.sqrt(expected[0, :, 0, 0].real * expected[0, :, 1, 1].real))
+
+
+def test_simulated_windows_look_like_drawn_ones() -> None:
+    reader = NetworkDiagnostician(LAB, shipped())
+    novelty = []
+    for number in range(8):
+        for layout in Layout:
+            inputs = reader.inputs(window("", number, layout))
+            assert inputs is not None
+            novelty.append(float(shipped().basis.novelty(inputs)[0]))
+    # Training windows are one on average; the evaluation's are drawn less broadly.
+    assert 0.2 < np.median(novelty) < 1.5
+    assert max(novelty) < shipped().novelty_limit
+
+
+def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
+    features, draws = ForceFeatures(LAB), SpectralDraws(LAB)
+    rng = np.random.default_rng(SEED + 1)
+    while True:  # a machine that happens to be drawn near nominal, with independent sources
+        one = draws.draw(rng, 1)
+        if np.all(np.abs(one.log_ratio[0, [0, 1, 2, 3, 5]]) < 0.2):
+            break
+    series = features.series(features.force(one.spectrum))
+    assert series.shape == (features.n_series, 1, one.spectrum.shape[1])
+    assert np.all(np.abs(series[4:]) <= 1 + 1e-5)  # coherences
+    louder = features.series(features.force(49.0 * one.spectrum))
+    np.testing.assert_allclose(louder, series, atol=1e-4)  # levels drop out
+
+
+def test_a_batch_depends_on_seed_and_number_alone() -> None:
+    draws = FeatureDraws.for_machine(LAB, SEED, 24)
+    several = list(batches(draws, 2, processes=1))
+    again = draws.batch(1)
+    np.testing.assert_array_equal(several[1][0], again[0])
+    assert several[0][0].shape == (draws.windows, 525)
+    assert not np.array_equal(several[0][1], several[1][1])
+    assert np.abs(again[1]).max() <= LOG_RATIO
+
+
+def small_training(seed: int) -> AmortisedNetworks:
+    draws = FeatureDraws.for_machine(LAB, seed, 120)
+    return train_networks(
+        LAB,
+        ForceFeatures(LAB).states,
+        (draws.mean, draws.directions),
+        draws.n_common,
+        batches(draws, 6, processes=1),
+        6 * draws.windows,
+        LOG_RATIO,
+        seed,
+    )
+
+
+@pytest.mark.slow
+def test_training_is_reproducible_and_learns() -> None:
+    first, second = small_training(SEED), small_training(SEED)
+    for one, other in zip(first.networks, second.networks, strict=True):
+        np.testing.assert_array_equal(one.weights[0], other.weights[0])
+        np.testing.assert_array_equal(one.direct, other.direct)
+    draws = FeatureDraws.for_machine(LAB, SEED, 120)
+    features, log_ratio = draws.batch(1000)
+    inputs = first.basis.standardised(features)[:, : draws.n_common]
+    mean, factor = first.networks[0](np.clip(inputs, -8, 8))
+    assert np.corrcoef(mean[:, 0], log_ratio[:, 0])[0, 1] > 0.8
+    assert np.all(factor[:, [0, 1], [0, 1]] > 0)
+
+
+def test_too_few_windows_are_refused() -> None:
+    draws = FeatureDraws.for_machine(LAB, SEED, 24)
+    with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
+        train_networks(
+            LAB,
+            ForceFeatures(LAB).states,
+            (draws.mean, draws.directions),
+            draws.n_common,
+            [],
+            1000,
+            LOG_RATIO,
+            SEED,
+        )
+
+
+@pytest.mark.slow
+def test_the_shipped_networks_find_and_size_faults_on_new_windows() -> None:
+    reader = NetworkDiagnostician(LAB, shipped())
+    for parameter, change in FAULTS.items():
+        read, z_others = [], []
+        for number in range(10):
+            diagnosis = reader.diagnose(window(parameter, number))
+            by_name = {reading.name: reading for reading in diagnosis.parameters}
+            assert tuple(by_name) == ("k_by", "c_by", "e", "EI", "k_bz", "c_bz")
+            assert diagnosis.covariance is not None
+            np.testing.assert_allclose(
+                np.sqrt(np.diag(diagnosis.covariance)),
+                np.array([one.standard_error for one in diagnosis.evaluable], dtype=np.float64),
+            )
+            assert by_name[parameter].change is not None
+            read.append(by_name[parameter].change)
+            z_others += [abs(one.z or 0.0) for name, one in by_name.items() if name != parameter]
+        assert np.median(np.array(read, dtype=np.float64)) == pytest.approx(change, abs=0.03), parameter
+        assert np.mean(np.array(z_others) > 3.14) < 0.1, parameter
+
+
+def test_what_the_networks_cannot_judge_is_said_to_be_so() -> None:
+    reader = NetworkDiagnostician(LAB, shipped())
+    healthy = window("", 0)
+    assert len(reader.diagnose(healthy).evaluable) == len(PARAMETERS)
+
+    blind = replace(healthy, synchronous=None)
+    reasons = {one.name: one.reason for one in reader.diagnose(blind).parameters}
+    assert reasons["e"] == "no phase reference"
+    assert reasons["k_by"] == ""
+
+    fewer = replace(healthy, states=healthy.states[:-1], spectrum=healthy.spectrum[:, :-1, :-1])
+    assert {one.reason for one in reader.diagnose(fewer).parameters} == {"not measured: z2_dot"}
+
+    dead = healthy.spectrum.copy()
+    dead[:, 0, :] = dead[:, :, 0] = 0.0
+    assert all(
+        "unlike what the networks were trained on" in one.reason
+        for one in reader.diagnose(replace(healthy, spectrum=dead)).parameters
+    )
+
+
+def test_a_gain_error_of_one_sensor_is_not_taken_for_a_fault() -> None:
+    healthy = window("", 1)
+    gain = np.ones(len(healthy.states))
+    gain[healthy.states.index("y1")] = 2.0
+    wrong = replace(healthy, spectrum=healthy.spectrum * np.outer(gain, gain))
+    diagnosis = NetworkDiagnostician(LAB, shipped()).diagnose(wrong)
+    assert not diagnosis.evaluable
+    assert diagnosis.covariance is None or diagnosis.covariance.size == 0
+
+
+def test_tilt_sensors_beside_the_trained_ones_do_no_harm() -> None:
+    rig = with_tilt(LAB)
+    draw = Draw(rig, SEED, Purpose.EVALUATION, 450, layout=Layout.INDEPENDENT)
+    seen = simulate_window(draw, 0)
+    assert len(seen.states) == 12
+    diagnosis = NetworkDiagnostician(rig, shipped()).diagnose(seen)
+    assert len(diagnosis.evaluable) == len(PARAMETERS)
+
+
+def test_calibration_finds_the_true_size_of_the_errors() -> None:
+    held_out = [(window("", number, layout), dict[str, float]()) for number in range(8) for layout in Layout]
+    calibrated = calibrate_networks(LAB, replace(shipped(), calibration={}), held_out)
+    assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
+    assert all(0.3 < scale < 4 for one in calibrated.calibration.values() for scale in one.z_scale)
+    doubled = Calibration(0.0, (-5.0, -3.0), (2.0, 4.0))
+    np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])
+
+
+def test_relations_speak_the_common_language() -> None:
+    bundle = load_bundle("lab", LAB)
+    diagnosis = RelationDiagnostician(LAB, bundle.networks).diagnose(window("", 0))
+    assert diagnosis.by == "relation"
+    assert [one.equation for one in diagnosis.equations] == ["28", "29", "30", "31"]
+    reasons = {one.name: one.reason for one in diagnosis.parameters}
+    assert set(reasons) == set(PARAMETERS)
+    assert reasons["EI"].startswith("not measured: psi")
+    assert all(one.by == "relation" for one in diagnosis.parameters)
+    untrained = RelationDiagnostician(LAB, ()).diagnose(window("", 0))
+    assert {one.reason for one in untrained.parameters} == {"no trained network"}
