@@ -7,63 +7,37 @@ the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import digamma
+import numpy.typing as npt
 
+from models.diagnosis.bins import BinGroups, group_bins
+from models.diagnosis.goodness import goodness_of_fit
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.scoring import FisherScoring, Maximum
-from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel
+from models.diagnosis.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel
+from models.diagnosis.start import starting_point
+from models.diagnosis.unbalance import estimate_unbalance
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
-__all__ = ["LikelihoodEstimate", "LikelihoodFit"]
+__all__ = ["LikelihoodFit"]
 
-_AVERAGES_PER_SEGMENT = 0.53
-"""Independent averages per half-overlapped Hann segment and bin: 1 / Σ of the squared correlations of neighbouring
-segments (|ρ|² = 1/36) and bins (|ρ|² = 4/9, 1/36)."""
-
-_COLD_STEPS, _WARM_STEPS = 200, 20
-_MOST_MISFIT = 10.0
-"""Healthy and changed machines read 0.2 to 5; dead, clipped or doubled channels above 40."""
+_COLD_STEPS, _WARM_STEPS = 40, 15
+_NEAR, _GAIN = 0.15, 3.0
+"""Converged: no diagnosed parameter would move by more than this many standard errors."""
+_COARSE, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN = 3.0, 25, 1.0, 30.0
+"""A cold search finds its region on groups three times as wide."""
+_GROUPS = 150
+"""The band over the widest group."""
 _MOST_LOG_RATIO = float(np.log(5))
 """No stiffness or damping is believed to have changed by more than a factor of five within the model."""
+_MOST_EXCESS = 10.0
+"""Mean squared excess over its expectation, beyond which a window is not evaluated: a dead or clipped channel."""
 _SYNCHRONOUS_BINS = 3
-
-_TIME_OVERLAP = 0.947
-"""Independent averages per half-overlapped Hann segment at one frequency, 1 / (1 + 2/36)."""
-
-_START_NOISE = 0.3
-"""Noise where a cold search starts: with much of it the spectra stay positive definite while the levels are far off."""
-
-
-@dataclass(frozen=True, slots=True)
-class LikelihoodEstimate:
-    """Relative parameter changes of one window.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Parameters estimated: ``k_by, c_by, k_bz, c_bz, EI`` and, with a phase reference, ``e``.
-    change : ndarray, shape (n,)
-        Relative change from nominal.
-    standard_error : ndarray, shape (n,)
-        Standard error of `change`.
-    steps : int
-        Scoring steps taken.
-    misfit : float
-        How much worse the theory fits than sampling alone explains: 0 = as well as it can.
-    """
-
-    names: tuple[str, ...]
-    change: FloatArray
-    standard_error: FloatArray
-    steps: int
-    misfit: float
 
 
 class LikelihoodFit:
@@ -81,37 +55,75 @@ class LikelihoodFit:
         self._machine = machine
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
         self._last: FloatArray | None = None
+        self._groups: dict[bytes, BinGroups] = {}
 
     @property
     def by(self) -> str:
         """Name under which it is reported."""
         return "likelihood"
 
-    def diagnose(self, window: WindowStatistics) -> Diagnosis:
-        """Judge one window; raises EstimationError if nothing can be said."""
-        estimate = self.fit(window)
-        readings = tuple(
-            ParameterReading(name, self.by, float(change), float(error))
-            for name, change, error in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
-        )
-        return Diagnosis(
-            self.by, readings, covariance=np.diag(estimate.standard_error**2), misfit_z=0.0, steps=estimate.steps
-        )
-
     def reset(self) -> None:
         """Start the next window cold."""
         self._last = None
 
-    def fit(self, window: WindowStatistics) -> LikelihoodEstimate:
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
 
         Raises
         ------
         EstimationError
-            If a channel has no power in the band (a dead sensor), or the search finds no maximum.
+            If a channel has no power in the band (a dead sensor), two carry the same signal, the search finds no
+            maximum, or nothing within the model comes near the window.
         """
-        keep = self._usable_bins(window)
-        observed = window.spectrum[keep]
+        speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
+        excluded = _near_rotation(window.frequencies_hz, speed)
+        power = self._checked_power(window, ~excluded)
+        scale = np.sqrt(power)
+        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window"
+        try:
+            # Trial points may lie far out; what comes of them is checked, not warned of.
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                model, search, found = self._maximise(window, excluded, scale, speed)
+            covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
+        except np.linalg.LinAlgError as error:
+            self.reset()
+            raise EstimationError(nowhere) from error
+        theta = found.theta
+        if not (np.all(np.isfinite(theta)) and np.all(np.diag(covariance) > 0)):
+            self.reset()
+            raise EstimationError(nowhere)
+        self._last = theta
+        self._check_explained(model, search, found)
+        n = len(STRUCTURAL)
+        # A search that has not converged adds the step it would still take to the uncertainty.
+        structural = covariance[:n, :n] + np.diag(found.remaining**2)
+        ratio = np.exp(theta[:n])
+        change, spread = ratio - 1, structural * np.outer(ratio, ratio)
+        names: tuple[str, ...] = STRUCTURAL
+        if window.synchronous is not None:
+            e = estimate_unbalance(
+                self._machine, model, theta, structural, window.synchronous, speed, window.duration_s
+            )
+            names, change = (*names, "e"), np.append(change, e.change)
+            cross = (e.covariance * ratio)[:, None]
+            spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
+        goodness = goodness_of_fit(self._machine, model, search, found)
+        readings = tuple(
+            ParameterReading(name, self.by, float(value), float(error))
+            for name, value, error in zip(names, change, np.sqrt(np.diag(spread)), strict=True)
+        )
+        return Diagnosis(
+            self.by,
+            readings,
+            covariance=np.asarray(spread, dtype=np.float64),
+            misfit_z=goodness.misfit_z,
+            suspect=goodness.suspect,
+            steps=found.steps,
+        )
+
+    def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
+        """Mean density of every state; raises EstimationError for dead or doubled channels."""
+        observed = window.spectrum[used]
         power = np.einsum("fii->i", observed).real / observed.shape[0]
         twins = _twins(window.states, observed)
         if twins:
@@ -121,128 +133,80 @@ class LikelihoodFit:
             raise EstimationError(
                 f"{self._machine.name}: no fluctuation in {', '.join(dead)}: nothing to compare with theory"
             )
-        speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
-        model = self._model(window.states, window.frequencies_hz[keep], np.sqrt(power), speed)
-        observed = observed / np.outer(model.scale, model.scale)
-        averages = _AVERAGES_PER_SEGMENT * window.n_segments
-        search = FisherScoring(model, observed, averages, speed, self._usual_cutoff_hz)
-        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window"
-        try:
-            # Trial points may lie far out; what comes of them is checked, not warned of.
-            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                found = self._maximise(model, search)
-            covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
-        except np.linalg.LinAlgError as error:
-            self.reset()
-            raise EstimationError(nowhere) from error
-        theta, steps = found.theta, found.steps
-        if not (np.all(np.isfinite(theta)) and np.all(np.diag(covariance) > 0)):
-            self.reset()
-            raise EstimationError(nowhere)
-        self._last = theta
-        n = len(STRUCTURAL)
-        ratio = np.exp(theta[:n])
-        change = np.asarray(ratio - 1, dtype=np.float64)
-        # A search that has not converged adds the step it would still take to the uncertainty.
-        deviation = np.asarray(ratio * np.sqrt(np.diag(covariance)[:n] + found.remaining**2), dtype=np.float64)
-        names: tuple[str, ...] = STRUCTURAL
-        if window.synchronous is not None:
-            e, e_error = self._eccentricity(model, theta, covariance[:n, :n], window, speed)
-            names, change, deviation = (*names, "e"), np.append(change, e), np.append(deviation, e_error)
-        misfit = _misfit(model.at(theta, speed).S, observed, window)
-        if misfit > _MOST_MISFIT or np.any(np.abs(theta[:n]) > _MOST_LOG_RATIO):
-            self.reset()
-            raise EstimationError(
-                f"{self._machine.name}: the theory does not explain this window (misfit {misfit:.3g}, at most "
-                f"{_MOST_MISFIT:g} is evaluated): a sensor is at fault, or something outside the model has changed"
-            )
-        return LikelihoodEstimate(names, change, deviation, steps, misfit)
+        return np.asarray(power, dtype=np.float64)
 
-    def _usable_bins(self, window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        """All bins but the neighbourhood of the rotation: what is left of its line there is not stochastic."""
-        speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
-        width = _SYNCHRONOUS_BINS * (window.frequencies_hz[1] - window.frequencies_hz[0])
-        return np.asarray(np.abs(window.frequencies_hz - speed / (2 * np.pi)) > width)
-
-    def _model(
-        self, states: tuple[str, ...], frequencies_hz: FloatArray, scale: FloatArray, speed: float
-    ) -> SpectralModel:
-        """Spectral model in this window's own units.
-
-        In these units equal independent sources of level one, through the nominal rotor, explain the mean power. A
-        parameter point therefore stays a good start when the machine merely becomes louder.
-        """
-        model = SpectralModel(self._machine, states, frequencies_hz, scale)
-        theta = self._usual(model)
-        theta[model.noise_at] = -np.inf
-        explained = np.einsum("fii->", model.at(theta, speed).S).real / (model.n * frequencies_hz.size)
-        return SpectralModel(self._machine, states, frequencies_hz, scale, float(explained**-0.5))
-
-    def _usual(self, model: SpectralModel) -> FloatArray:
-        """Where a cold search starts: nominal rotor, mid cutoff, a little noise, equal independent sources."""
-        theta = np.zeros(model.size)
-        theta[model.cutoff_at] = np.log(self._usual_cutoff_hz)
-        theta[model.noise_at] = np.log(_START_NOISE)
-        theta[model.level_at] = np.eye(6)[np.tril_indices(6)]
-        return theta
-
-    def _maximise(self, model: SpectralModel, search: FisherScoring) -> Maximum:
-        """Search from the last window's maximum, or from the usual point.
-
-        Where an excitation of low rank makes the last steps small, a warm search may end before it has converged; the
-        next window carries on from there.
-        """
-        if self._last is not None:
+    def _maximise(
+        self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float
+    ) -> tuple[SpectralModel, FisherScoring, Maximum]:
+        """Search from the last window's maximum, or cold: first on coarse groups with one low-pass for all forces."""
+        groups = self._grouped(window.frequencies_hz, excluded, 1.0)
+        force_scale = self._force_scale(window.states, groups, scale, speed)
+        model = SpectralModel(self._machine, window.states, groups, scale, force_scale)
+        search = self._search(model, window, speed)
+        if self._last is not None and self._last.size == model.size:
             try:
-                return search.maximise(self._last, _WARM_STEPS)
+                return model, search, search.maximise(self._last, _WARM_STEPS, _NEAR, _GAIN)
             except np.linalg.LinAlgError:  # the old point makes no valid spectrum for this window
                 self.reset()
-        return search.maximise(self._usual(model), _COLD_STEPS)
+        wide = self._grouped(window.frequencies_hz, excluded, _COARSE)
+        coarse = SpectralModel(self._machine, window.states, wide, scale, force_scale, shapes=0)
+        first = self._search(coarse, window, speed)
+        start = starting_point(coarse, _observed(coarse, window), first.centre, speed)
+        near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta
+        theta = search.centre.copy()
+        theta[: coarse.colour_at.stop], theta[model.level_at] = near[: coarse.colour_at.stop], near[coarse.level_at]
+        return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN)
 
-    def _eccentricity(
-        self, model: SpectralModel, theta: FloatArray, covariance: FloatArray, window: WindowStatistics, speed: float
-    ) -> tuple[float, float]:
-        """Relative change of e from the synchronous vector: generalised least squares with known phase.
+    def _search(self, model: SpectralModel, window: WindowStatistics, speed: float) -> FisherScoring:
+        return FisherScoring(model, _observed(model, window), window.n_segments, speed, self._usual_cutoff_hz)
 
-        The vector's covariance is the stochastic part's spectrum at Ω over the window length plus what the uncertainty
-        of the structural parameters makes of the predicted response.
+    def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
+        """Groups for a set of excluded bins, remembered while the speed stays in the same bin."""
+        key = excluded.tobytes() + bytes([int(coarser)])
+        if key not in self._groups:
+            if len(self._groups) >= 8:
+                self._groups.clear()
+            low, high = self._machine.window.band_hz
+            widest_hz = coarser * (high - low) / _GROUPS
+            self._groups[key] = group_bins(frequencies_hz, self._machine, excluded, widest_hz)
+        return self._groups[key]
+
+    def _force_scale(self, states: tuple[str, ...], groups: BinGroups, scale: FloatArray, speed: float) -> float:
+        """Unit of forces in which equal independent sources of level one make the mean power of the nominal rotor.
+
+        A parameter point therefore stays a good start when the machine merely becomes louder.
         """
-        if window.synchronous is None:
-            raise EstimationError("no phase reference: the unbalance cannot be evaluated")
-        W = np.array([speed])
-        rotor = self._machine.rotor
-        phase = np.exp(1j * self._machine.operation.unbalance_phase_rad)
-        force = rotor.m2_kg * rotor.e_m * speed**2 * phase * np.array([0, 1, 0, 0, -1j, 0])
+        model = SpectralModel(self._machine, states, groups, scale, shapes=0)
+        theta = np.zeros(model.size)
+        theta[model.cutoff_at] = np.log(self._usual_cutoff_hz)
+        theta[model.order_at] = np.log(2)
+        theta[model.noise_at] = -np.inf
+        theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
+        explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
+        return float(explained**-0.5)
 
-        def response(structural: FloatArray) -> ComplexArray:
-            vectors = model.measured(model.receptance(structural, speed, W) @ force[:, None], W)
-            return np.asarray(vectors[0, :, 0], dtype=np.complex128)
+    def _check_explained(self, model: SpectralModel, search: FisherScoring, found: Maximum) -> None:
+        """Raise EstimationError for windows that nothing within the model comes near."""
+        excess = np.einsum("fij,fij->f", found.whitened.excess, found.whitened.excess.conj()).real
+        times = float(search.averages @ excess) / (model.n**2 * search.averages.size)
+        if times > _MOST_EXCESS or np.any(np.abs(found.theta[: len(STRUCTURAL)]) > _MOST_LOG_RATIO):
+            self.reset()
+            raise EstimationError(
+                f"{self._machine.name}: the theory does not explain this window (it deviates {times:.3g} times as much "
+                f"as sampling does, at most {_MOST_EXCESS:g} is evaluated): a sensor is at fault, or something outside "
+                "the model has changed"
+            )
 
-        n = len(STRUCTURAL)
-        structural = theta[:n]
-        g = response(structural)
-        step = 1e-5
-        slopes = np.stack(
-            [(response(structural + step * unit) - response(structural - step * unit)) for unit in np.eye(n)]
-        )
-        slopes = slopes / (2 * step)
-        at_speed = SpectralModel(self._machine, window.states, W / (2 * np.pi), model.scale, model.force_scale).at(
-            theta, speed
-        )
-        noise = 4 * at_speed.S[0] / window.duration_s
-        # Real representation: the structural uncertainty moves real and imaginary parts together.
-        q = window.synchronous / model.scale
-        stacked = np.concatenate([noise.real, noise.imag], axis=0), np.concatenate([-noise.imag, noise.real], axis=0)
-        total = np.concatenate(stacked, axis=1) / 2
-        e_ratio = float(np.real(np.vdot(g, np.linalg.solve(noise, q))) / np.real(np.vdot(g, np.linalg.solve(noise, g))))
-        J = np.concatenate([slopes.real, slopes.imag], axis=1).T * e_ratio
-        total = total + J @ covariance @ J.T
-        g2, q2 = np.concatenate([g.real, g.imag]), np.concatenate([q.real, q.imag])
-        weight = np.linalg.solve(total, g2)
-        precision = float(weight @ g2)
-        if not precision > 0:
-            raise EstimationError(f"{self._machine.name}: the spectrum at the speed of rotation is not determined")
-        return float(weight @ q2) / precision - 1, precision**-0.5
+
+def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
+    """Estimated spectra in the model's groups and units."""
+    return np.asarray(model.groups.average(window.spectrum) / np.outer(model.scale, model.scale), dtype=np.complex128)
+
+
+def _near_rotation(frequencies_hz: FloatArray, speed_rad_s: float) -> npt.NDArray[np.bool_]:
+    """Bins around the rotation: what is left of its line there is not stochastic."""
+    width_hz = _SYNCHRONOUS_BINS * (frequencies_hz[1] - frequencies_hz[0])
+    return np.asarray(np.abs(frequencies_hz - speed_rad_s / (2 * np.pi)) <= width_hz)
 
 
 def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:
@@ -261,19 +225,3 @@ def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
     rates = np.array([name.endswith("_dot") for name in states])
     largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
     return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]
-
-
-def _misfit(S: ComplexArray, observed: ComplexArray, window: WindowStatistics) -> float:
-    """Deviance of the observed spectra from S over its expectation for complex Wishart matrices, less one.
-
-    With ν averages of n channels, tr W - log det W - n of W = S⁻¹Ŝ has the expectation n ln ν - Σ ψ(ν - i), i < n (and
-    is infinite for ν < n, where nothing can be said).
-    """
-    n = S.shape[1]
-    nu = _TIME_OVERLAP * window.n_segments
-    if nu <= n:
-        return float("nan")
-    W = np.linalg.solve(S, observed)
-    deviance = np.einsum("fii->f", W).real - np.linalg.slogdet(W)[1] - n
-    expected = n * np.log(nu) - float(np.sum(digamma(nu - np.arange(n))))
-    return float(np.mean(deviance) / expected - 1)

@@ -102,6 +102,9 @@ class Diagnosis:
     misfit_z : float or None
         Over-identification: how far the window is from anything the model can explain, standard normal where the model
         holds; None where the diagnostician has no such test.
+    suspect : str
+        What explains the misfit best, if one thing does: a sensor's gain, a mass, a shaft unequal in y and z; empty if
+        nothing stands out or there is no such test.
     steps : int
         Search steps it took (0 where there is no search).
     """
@@ -111,6 +114,7 @@ class Diagnosis:
     equations: tuple[EquationReading, ...] = ()
     covariance: FloatArray | None = None
     misfit_z: float | None = None
+    suspect: str = ""
     steps: int = 0
 
     @property

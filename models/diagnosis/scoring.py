@@ -4,22 +4,41 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from models.diagnosis.bins import AVERAGES_PER_BIN
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.spectral_model import SpectralModel
+from models.diagnosis.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, packed
 from models.signals.block import FloatArray
 
-__all__ = ["LOG_NOISE", "FisherScoring", "Maximum"]
+__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened"]
 
 LOG_NOISE = float(np.log(1e-3))
 """Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
 
-_WEAK, _COLOUR = 0.05, 1.0
-"""Weak pull of levels, noise and its colour towards their usual values: without it the search wanders off where an
-excitation of low rank, or a channel without visible noise, leaves them undetermined."""
+_WEAK = 0.05
+"""Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of
+low rank, or a channel without visible noise, leaves them undetermined."""
+_COLOUR, _SHAPE = 1.0, 1.0
+"""The same for the noise's colour and the forces' colour."""
+_CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
+"""The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
+keeps the order: on coarse groups a filter of order nought would pass for anything."""
 
-_NEAR, _GAIN = 0.05, 1.0
-"""Converged when a full step would move no diagnosed parameter by more than this many standard errors and would gain
-less than this in log-likelihood. Noise levels may swing a little longer; what is diagnosed does not follow them."""
+
+@dataclass(frozen=True, slots=True)
+class Whitened:
+    """Spectra at a point seen through its own Cholesky factors S = L Lᴴ.
+
+    Attributes
+    ----------
+    point : ModelPoint
+    L_inverse : ndarray, shape (n_groups, n, n)
+    excess : ndarray, shape (n_groups, n, n)
+        L⁻¹ Ŝ L⁻ᴴ - I: zero where theory and estimate agree.
+    """
+
+    point: ModelPoint
+    L_inverse: ComplexArray
+    excess: ComplexArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,9 +50,11 @@ class Maximum:
     theta : ndarray, shape (size,)
         The parameter point.
     information : ndarray, shape (size, size)
-        Fisher information there.
-    value : float
-        Log-likelihood there, up to a constant.
+        Fisher information there, on the elements of C (not of T).
+    slopes : ndarray, shape (size, n_groups, n²)
+        Whitened slopes it is made of.
+    whitened : Whitened
+        Theory and estimate there.
     steps : int
         Steps tried.
     remaining : ndarray, shape (n_diagnosed,)
@@ -43,7 +64,8 @@ class Maximum:
 
     theta: FloatArray
     information: FloatArray
-    value: float
+    slopes: FloatArray
+    whitened: Whitened
     steps: int
     remaining: FloatArray
 
@@ -51,13 +73,17 @@ class Maximum:
 class FisherScoring:
     """Fisher scoring with Levenberg-Marquardt damping: a step counts only if the likelihood rises.
 
+    The levels move as T of C = T Tᵀ. Where the data want less of a direction than there is, T's own curvature is added
+    to the information; without it the small columns of an excitation of low rank overshoot, and every other parameter
+    waits for them.
+
     Parameters
     ----------
     model : SpectralModel
-    observed : ndarray, shape (n_bins, n, n)
+    observed : ndarray, shape (n_groups, n, n)
         Estimated cross-spectra in units of the model's scale.
-    averages : float
-        Independent averages in each of them.
+    n_segments : int
+        Segments they are averaged over.
     speed_rad_s : float
     usual_cutoff_hz : float
         Where the cutoff is pulled, weakly, if the band does not show it.
@@ -67,78 +93,121 @@ class FisherScoring:
         self,
         model: SpectralModel,
         observed: ComplexArray,
-        averages: float,
+        n_segments: int,
         speed_rad_s: float,
         usual_cutoff_hz: float,
     ) -> None:
-        self._model, self._observed, self._averages, self._speed_rad_s = model, observed, averages, speed_rad_s
-        self._ridge = np.zeros(model.size)
-        self._ridge[:] = _WEAK
+        self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
+        self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
+        self._ridge = np.full(model.size, _WEAK)
         self._ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
         self._ridge[model.colour_at] = _COLOUR
-        self._centre = np.zeros(model.size)
-        self._centre[model.noise_at] = LOG_NOISE
-        self._centre[model.cutoff_at] = np.log(usual_cutoff_hz)
+        self._ridge[model.shape_at] = _SHAPE
+        self._ridge[model.cutoff_at] = _CUTOFF
+        self._ridge[model.order_at] = _ORDER if model.shapes else _FIXED
+        self.centre = np.zeros(model.size)
+        self.centre[model.noise_at] = LOG_NOISE
+        self.centre[model.cutoff_at] = np.log(usual_cutoff_hz)
+        self.centre[model.order_at] = np.log(2)
 
-    def maximise(self, theta: FloatArray, most_steps: int) -> Maximum:
+    def maximise(self, theta: FloatArray, most_steps: int, near: float, gain: float) -> Maximum:
         """Search from a starting point.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (size,)
+        most_steps : int
+        near, gain : float
+            Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
+            gain less than `gain` in log-likelihood.
 
         Raises
         ------
         numpy.linalg.LinAlgError
             If the information is singular: the window says nothing about a parameter.
         """
-        damping = 1e-3
-        value = self._value(theta)
-        gradient, information = self._scores(theta)
-        steps = 0
+        model = self._model
+        diagnosed, logarithms = slice(model.cutoff_at), slice(model.level_at.start)
+        damping, steps = 1e-3, 0
+        value, whitened = self._value(theta)
+        if whitened is None:
+            raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
+        gradient, information, slopes, on_levels = self._scores(theta, whitened)
         while True:
-            full_step: FloatArray = np.asarray(np.linalg.solve(information, gradient), dtype=np.float64)
-            if steps == most_steps or self._is_near(full_step, gradient, information):
+            covariance = np.linalg.inv(information)
+            full_step = np.asarray(covariance @ gradient, dtype=np.float64)
+            is_near = np.all(full_step[diagnosed] ** 2 < near**2 * np.diag(covariance)[diagnosed])
+            if steps == most_steps or damping > 1e8 or (is_near and gradient @ full_step / 2 < gain):
                 break
             steps += 1
-            damped = information + damping * np.diag(np.diag(information))
-            step = np.linalg.solve(damped, gradient)
-            # Logarithms move by one at most, for far from the data the theory misleads; levels are linear and free.
-            step *= min(1.0, 1.0 / float(np.max(np.abs(step[: self._model.level_at.start]))))
-            trial_value = self._value(theta + step)
-            if trial_value > value:
-                theta, value = theta + step, trial_value
-                gradient, information = self._scores(theta)
-                damping = max(damping / 8, 1e-9)
-            elif damping > 1e8:
-                break
+            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+            trial = theta + step
+            # Logarithms move by one at most, for far from the data the theory misleads. A variance moves as the
+            # scoring step on the variance itself says.
+            trial[logarithms] = theta[logarithms] + np.clip(step[logarithms], -1, 1)
+            trial[model.noise_at] = theta[model.noise_at] + np.log(np.clip(1 + step[model.noise_at], 0.2, 4))
+            trial_value, trial_whitened = self._value(trial)
+            if trial_whitened is not None and trial_value > value:
+                theta, value, whitened = trial, trial_value, trial_whitened
+                gradient, information, slopes, on_levels = self._scores(theta, whitened)
+                damping = max(damping / 8, 1e-7)
             else:
                 damping *= 8
-        return Maximum(theta, information, value, steps, full_step[: self._model.cutoff_at])
+        return Maximum(theta, on_levels, slopes, whitened, steps, full_step[diagnosed])
 
-    def _is_near(self, step: FloatArray, gradient: FloatArray, information: FloatArray) -> bool:
-        diagnosed = slice(self._model.cutoff_at)
-        variance = np.diag(np.linalg.inv(information))[diagnosed]
-        return bool(np.all(step[diagnosed] ** 2 < _NEAR**2 * variance) and gradient @ step / 2 < _GAIN)
-
-    def _value(self, theta: FloatArray) -> float:
+    def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
         """Log-likelihood and the weak pulls, up to a constant."""
+        point = self._model.at(theta, self._speed_rad_s)
         try:
-            L = np.linalg.cholesky(self._model.at(theta, self._speed_rad_s).S)
+            L = np.linalg.cholesky(point.S)
         except np.linalg.LinAlgError:
-            return -np.inf
-        log_determinant = 2 * np.log(np.einsum("fii->fi", L).real).sum()
-        white = np.linalg.solve(L, self._observed)
-        trace = np.einsum("fij,fij->", np.linalg.inv(L).conj(), white).real
-        return float(-self._averages * (log_determinant + trace) - self._ridge @ (theta - self._centre) ** 2 / 2)
+            return -np.inf, None
+        log_determinant = 2 * np.log(np.einsum("fii->fi", L).real).sum(axis=1)
+        L_inverse = np.asarray(np.linalg.inv(L), dtype=np.complex128)
+        excess = L_inverse @ self._observed @ L_inverse.conj().swapaxes(1, 2)
+        trace = np.einsum("fii->f", excess).real
+        diagonal = np.arange(self._model.n)
+        excess[:, diagonal, diagonal] -= 1
+        pull = self._ridge @ (theta - self.centre) ** 2 / 2
+        return float(-self.averages @ (log_determinant + trace) - pull), Whitened(point, L_inverse, excess)
 
-    def _scores(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Fisher information."""
+    def _scores(self, theta: FloatArray, whitened: Whitened) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Gradient, information for the step (both by T), packed slopes, and information by C."""
         model = self._model
-        point = model.at(theta, self._speed_rad_s)
-        L_inverse = np.asarray(np.linalg.inv(np.linalg.cholesky(point.S)), dtype=np.complex128)
-        derivatives = model.whitened_derivatives(point, L_inverse)
-        excess = L_inverse @ self._observed @ L_inverse.conj().swapaxes(1, 2) - np.eye(model.n)
-        flat = derivatives.transpose(1, 0, 2, 3).reshape(model.size, -1)
-        slopes: FloatArray = np.concatenate([flat.real, flat.imag], axis=1)
-        misfit: FloatArray = np.concatenate([excess.real.ravel(), excess.imag.ravel()])
-        gradient = self._averages * (slopes @ misfit) - self._ridge * (theta - self._centre)
-        information = self._averages * (slopes @ slopes.T)
+        slopes = model.slopes(whitened.point, whitened.L_inverse)
+        flat = slopes.reshape(model.size, -1)
+        weighted = (slopes * self.averages[:, None]).reshape(model.size, -1)
+        gradient: FloatArray = weighted @ packed(whitened.excess).ravel()
+        on_levels: FloatArray = weighted @ flat.T
+        levels = model.level_at
+        chain = _levels_by_factor(model.factor(theta))
+        information = on_levels.copy()
+        information[levels] = chain.T @ information[levels]
+        information[:, levels] = information[:, levels] @ chain
+        information[levels, levels] += _curvature(gradient[levels])
+        gradient[levels] = chain.T @ gradient[levels]
+        gradient -= self._ridge * (theta - self.centre)
         information[np.diag_indices(model.size)] += self._ridge
-        return gradient, information
+        # On C itself the pull is next to nothing: it only keeps directions invertible that no sensor sees.
+        pull = self._ridge.copy()
+        pull[levels] = 1e-3
+        on_levels[np.diag_indices(model.size)] += pull
+        return gradient, information, slopes, on_levels
+
+
+def _levels_by_factor(T: FloatArray) -> FloatArray:
+    """∂C/∂T of C = T Tᵀ between the lower triangles, shape (21, 21)."""
+    unit = np.zeros((ROWS.size, 6, 6))
+    unit[np.arange(ROWS.size), ROWS, COLUMNS] = 1
+    change = unit @ T.T
+    change = change + change.swapaxes(1, 2)
+    return np.asarray(change[:, ROWS, COLUMNS].T, dtype=np.float64)
+
+
+def _curvature(gradient: FloatArray) -> FloatArray:
+    """What T's second derivatives add to the information: 2 tr(δTᵀ N δT), N the part of -∂/∂C that is positive."""
+    N = np.zeros((6, 6))
+    N[ROWS, COLUMNS] = N[COLUMNS, ROWS] = -gradient * np.where(ROWS == COLUMNS, 1.0, 0.5)
+    values, vectors = np.linalg.eigh(N)
+    N = (vectors * np.maximum(values, 0)) @ vectors.T
+    return np.asarray(2 * N[np.ix_(ROWS, ROWS)] * (COLUMNS[:, None] == COLUMNS), dtype=np.float64)

@@ -1,14 +1,18 @@
-"""Theory of the cross-spectra for the likelihood: rotor, unknown smooth excitation, sensor noise.
+"""Theoretical cross-spectra for the likelihood: rotor, unknown smooth excitation, sensor noise.
 
 The measured states' cross-spectral matrix at frequency f is
 
-    S(f) = c(f; fc) · G C Gᴴ + diag(d(f)),   G = [H; jωH] at the measured rows,
+    S(f) = c(f; fc) · G D(f) C D(f) Gᴴ + diag(d(f)),   G = [H; jωH] at the measured rows,
 
-with H = (-ω²M + jωP + Q)⁻¹ the receptance of Eq. (1), c the power gain of a second-order low-pass of unknown cutoff,
-and C an unknown full level matrix over all six degrees of freedom: one source of any direction, or many. It enters
-linearly, so the search does not get stuck where a factor of it would lose rank, and standard errors stay honest there.
-The spectra are the Fourier transforms of the correlation functions of Eq. (18), so this is the comparison of
-theoretical and estimated correlations with the right weight on every lag.
+with H = (-ω²M + jωP + Q)⁻¹ the receptance of Eq. (1), c the power gain of a low-pass of unknown cutoff and order, C an
+unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) what every degree of
+freedom's force has of its own colour: b_j are polynomials in log f. So the excitation may be one source of any
+direction or many, of first or fourth order, with a cutoff each, or with a broad hump; all that is assumed of it is that
+its spectrum is smooth. The spectra are the Fourier transforms of the correlation functions of Eq. (18): this is the
+comparison of theoretical and estimated correlations with the right weight on every lag.
+
+C = T Tᵀ with T lower triangular, so that every point the search tries is a possible excitation. Standard errors come
+from the information on C itself, which stays honest where T loses rank (decision 0002).
 
 The sensor noise has a smooth spectrum of its own in every channel, d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of
 the band's end: white for b = 0, first-order low-pass at f_r for b = -1. Taken as white when it is not, it pulled the
@@ -19,35 +23,43 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from models.diagnosis.bins import BinGroups
 from models.diagnosis.moments import ComplexArray
 from models.machine import Machine
-from models.physics.excitation import low_pass, low_pass_slope
+from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.matrices import STATE_INDEX, M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
 
-__all__ = ["STRUCTURAL", "ModelPoint", "SpectralModel"]
+__all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralModel", "packed"]
 
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
 
+SHAPES = 4
+"""Polynomials in log f for the colour of every degree of freedom's force."""
+
+ROWS, COLUMNS = np.tril_indices(6)
+"""Elements of C and T in the order of the parameter vector."""
+
 _BEARING_DOFS = (0, 0, 3, 3)
-_ROWS, _COLUMNS = np.tril_indices(6)
 
 
 @dataclass(frozen=True, slots=True)
 class ModelPoint:
-    """Spectra at one parameter point and what their derivatives are made of, in units of the states' scale.
+    """Expected spectra at one parameter point and what their derivatives are made of, in units of the states' scale.
 
     Attributes
     ----------
     theta : ndarray, shape (size,)
         The parameter point.
-    S : ndarray, shape (n_bins, n, n)
+    S : ndarray, shape (n_groups, n, n)
         Cross-spectral matrices.
-    G : ndarray, shape (n_bins, n, 6)
-        Transfer from forces to measured states.
-    H : ndarray, shape (n_bins, 6, 6)
-        Receptance of all six degrees of freedom, for levels in units of `force_scale`.
+    G : ndarray, shape (n_groups, n_nodes, n, 6)
+        Transfer from forces (in units of C, coloured) to measured states, times the root of the node's weight.
+    H : ndarray, shape (n_groups, n_nodes, 6, 6)
+        Receptance of all six degrees of freedom for the same forces, without that root.
+    colour : ndarray, shape (n_groups, 6)
+        D.
     C : ndarray, shape (6, 6)
         Level matrix.
     """
@@ -56,15 +68,16 @@ class ModelPoint:
     S: ComplexArray
     G: ComplexArray
     H: ComplexArray
+    colour: FloatArray
     C: FloatArray
 
 
 class SpectralModel:
-    """Cross-spectra and their derivatives for one machine, set of measured states, and frequencies.
+    """Expected cross-spectra and their derivatives for one machine, set of measured states, and groups of bins.
 
-    The parameter vector holds the logarithmic ratios of `STRUCTURAL` to nominal, the logarithm of the cutoff (Hz), the
-    logarithms of the noise densities d₀ of the measured states (in units of `scale`² per Hz), their exponents b, and
-    the lower triangle of C.
+    The parameter vector holds the logarithmic ratios of `STRUCTURAL` to nominal, the logarithms of the low-pass's
+    cutoff (Hz) and order, the logarithms of the noise densities d₀ of the measured states (in units of `scale`² per
+    Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
 
     Parameters
     ----------
@@ -72,40 +85,54 @@ class SpectralModel:
         Nominal rotor.
     states : tuple of str
         Measured states.
-    frequencies_hz : ndarray, shape (n_bins,)
+    groups : BinGroups
         Frequencies of the spectra.
     scale : ndarray, shape (n,)
         Unit of each measured state, so that all spectra are of the order of one.
     force_scale : float
         Unit of forces, N/√Hz, so that the elements of C are of the order of one.
+    shapes : int
+        Polynomials of the forces' colour; 0 leaves one low-pass for all.
     """
 
     def __init__(
         self,
         machine: Machine,
         states: tuple[str, ...],
-        frequencies_hz: FloatArray,
+        groups: BinGroups,
         scale: FloatArray,
         force_scale: float = 1.0,
+        shapes: int = SHAPES,
     ) -> None:
         rotor = machine.rotor
         self.n = len(states)
-        self.frequencies_hz = frequencies_hz
+        self.states = states
+        self.groups = groups
         self.scale = scale
-        self.force_scale = force_scale
+        self.shapes = shapes
         index = np.array([STATE_INDEX[name] for name in states])
         self._dofs, self._is_rate = index % 6, index >= 6
         # A moment acts through a lever of a third of the shaft, so that levels of forces and moments share one unit.
         lever = rotor.shaft_length_m / 3
-        self._lever = force_scale * np.array([1.0, 1.0, lever, 1.0, 1.0, lever])
+        self.force_unit = force_scale * np.array([1.0, 1.0, lever, 1.0, 1.0, lever])
         self._rotor = rotor
         self._M, self._Q, self._Q_shaft = M_matrix(rotor), Q_matrix(rotor), Q_shaft(rotor)
         self._bearing = np.array([rotor.k_by_N_per_m, rotor.c_by_N_s_per_m, rotor.k_bz_N_per_m, rotor.c_bz_N_s_per_m])
-        self._noise_shape = np.log1p((frequencies_hz / (2 / 3 * machine.window.band_hz[1])) ** 2)
+        low, high = machine.window.band_hz
+        self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
+        octaves = np.log(groups.centre_hz / np.sqrt(low * high)) / np.log(np.sqrt(high / low))
+        self._b = (
+            np.stack([np.polynomial.legendre.Legendre.basis(j + 1)(octaves) for j in range(shapes)], axis=1)
+            if (shapes)
+            else np.zeros((octaves.size, 0))
+        )
+        self._w = 2 * np.pi * groups.nodes_hz
         self.cutoff_at = len(STRUCTURAL)
-        self.noise_at = slice(self.cutoff_at + 1, self.cutoff_at + 1 + self.n)
+        self.order_at = self.cutoff_at + 1
+        self.noise_at = slice(self.order_at + 1, self.order_at + 1 + self.n)
         self.colour_at = slice(self.noise_at.stop, self.noise_at.stop + self.n)
-        self.level_at = slice(self.colour_at.stop, self.colour_at.stop + _ROWS.size)
+        self.shape_at = slice(self.colour_at.stop, self.colour_at.stop + 6 * shapes)
+        self.level_at = slice(self.shape_at.stop, self.shape_at.stop + ROWS.size)
         self.size = self.level_at.stop
 
     def receptance(self, structural: FloatArray, speed_rad_s: float, w: FloatArray) -> ComplexArray:
@@ -135,60 +162,131 @@ class SpectralModel:
         factor = np.where(self._is_rate, 1j * w[:, None], 1.0) / self.scale
         return np.asarray(response[:, self._dofs] * factor[:, :, None], dtype=np.complex128)
 
-    def at(self, theta: FloatArray, speed_rad_s: float) -> ModelPoint:
-        """Spectra at a parameter point."""
-        w = 2 * np.pi * self.frequencies_hz
-        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, w)
-        C = np.zeros((6, 6))
-        C[_ROWS, _COLUMNS] = C[_COLUMNS, _ROWS] = theta[self.level_at]
-        G = self.measured(H, w) * self._lever
-        colour = low_pass(self.frequencies_hz, float(np.exp(theta[self.cutoff_at])))
-        S = colour[:, None, None] * (G @ C @ _H(G))
-        diagonal = np.arange(self.n)
-        S[:, diagonal, diagonal] += self._noise(theta)
-        return ModelPoint(theta, S, G, H * self._lever, C)
+    def levels(self, theta: FloatArray) -> FloatArray:
+        """C = T Tᵀ, shape (6, 6)."""
+        T = self.factor(theta)
+        return np.asarray(T @ T.T, dtype=np.float64)
 
-    def _noise(self, theta: FloatArray) -> FloatArray:
-        """d(f) of every measured state, shape (n_bins, n)."""
+    def factor(self, theta: FloatArray) -> FloatArray:
+        """T, shape (6, 6)."""
+        T = np.zeros((6, 6))
+        T[ROWS, COLUMNS] = theta[self.level_at]
+        return T
+
+    def at(self, theta: FloatArray, speed_rad_s: float) -> ModelPoint:
+        """Expected spectra at a parameter point."""
+        shape = self._w.shape
+        w = self._w.ravel()
+        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, w)
+        colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
+        unit = self.force_unit * colour[:, None, None, :]
+        gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
+        G = self.measured(H, w).reshape(*shape, self.n, 6) * unit * np.sqrt(gain)[:, :, None, None]
+        C = self.levels(theta)
+        S = _summed(G @ C, G)
+        diagonal = np.arange(self.n)
+        S[:, diagonal, diagonal] += self.noise(theta)
+        return ModelPoint(theta, S, G, H.reshape(*shape, 6, 6) * unit, colour, C)
+
+    def filter(self, theta: FloatArray) -> tuple[float, float]:
+        """Cutoff (Hz) and order of the low-pass."""
+        return float(np.exp(theta[self.cutoff_at])), float(np.exp(theta[self.order_at]))
+
+    def noise(self, theta: FloatArray) -> FloatArray:
+        """d(f) of every measured state, shape (n_groups, n)."""
         exponent = theta[self.noise_at] + self._noise_shape[:, None] * theta[self.colour_at]
         return np.asarray(np.exp(exponent), dtype=np.float64)
 
-    def whitened_derivatives(self, point: ModelPoint, L_inverse: ComplexArray) -> ComplexArray:
-        """L⁻¹ (∂S/∂θ_a) L⁻ᴴ for every parameter a, shape (n_bins, size, n, n), where S = L Lᴴ.
+    def slopes(self, point: ModelPoint, L_inverse: ComplexArray) -> FloatArray:
+        """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed; the last 21 are by the elements of C, not of T.
 
-        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and B plus
-        its conjugate transpose.
+        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of
+        G C Hᴴ plus its conjugate transpose.
+
+        Parameters
+        ----------
+        point : ModelPoint
+        L_inverse : ndarray, shape (n_groups, n, n)
+            Inverse Cholesky factors of the spectra.
+
+        Returns
+        -------
+        ndarray, shape (size, n_groups, n²)
         """
-        w = 2 * np.pi * self.frequencies_hz
         theta = point.theta
-        cutoff_hz = float(np.exp(theta[self.cutoff_at]))
-        colour = low_pass(self.frequencies_hz, cutoff_hz)
-        G = L_inverse @ point.G * np.sqrt(colour)[:, None, None]
-        GC = G @ point.C
-        out = np.empty((w.size, self.size, self.n, self.n), dtype=np.complex128)
+        whitened = L_inverse[:, None] @ point.G
+        response = whitened @ point.C
+        out = np.empty((self.size, self._w.shape[0], self.n * self.n))
         dynamic_change = self._bearing * np.exp(theta[:4])
         for parameter, dof in enumerate(_BEARING_DOFS):
-            u = -dynamic_change[parameter] / self._lever[dof] * G[:, :, dof]
-            if parameter % 2:
-                u = u * (1j * w[:, None])
-            v = (GC @ point.H[:, dof].conj()[:, :, None])[:, :, 0]
-            out[:, parameter] = _plus_transpose(u[:, :, None] * v.conj()[:, None, :])
-        shaft = -((G / self._lever) @ (self._Q_shaft * np.exp(theta[4]))) @ point.H @ _H(GC)
-        out[:, 4] = _plus_transpose(shaft)
-        out[:, self.cutoff_at] = low_pass_slope(self.frequencies_hz, cutoff_hz)[:, None, None] * (GC @ _H(G))
-        columns = L_inverse.transpose(0, 2, 1)
-        noise = self._noise(theta)[:, :, None, None] * (columns[:, :, :, None] * columns.conj()[:, :, None, :])
-        out[:, self.noise_at] = noise
-        out[:, self.colour_at] = noise * self._noise_shape[:, None, None, None]
-        forces = G.transpose(0, 2, 1)
-        pairs = forces[:, _ROWS, :, None] * forces.conj()[:, _COLUMNS, None, :]
-        out[:, self.level_at] = _plus_transpose(pairs) * np.where(_ROWS == _COLUMNS, 0.5, 1.0)[:, None, None]
+            factor = -dynamic_change[parameter] * (1j * self._w if parameter % 2 else np.ones_like(self._w))
+            out[parameter] = self.local_slope(point, whitened, response, dof, dof, factor)
+        unit = self.force_unit * point.colour[:, None, None, :]
+        shaft = -((whitened / unit) @ (self._Q_shaft * np.exp(theta[4]))) @ point.H
+        out[4] = packed(_plus_transpose(_summed(shaft, response)))
+        for at, slope in zip(
+            (self.cutoff_at, self.order_at), low_pass_slopes(self.groups.nodes_hz, *self.filter(theta)), strict=True
+        ):
+            out[at] = packed(_summed(response * slope[:, :, None, None], whitened))
+        columns = L_inverse.transpose(2, 0, 1)
+        densities = packed(columns[:, :, :, None] * columns.conj()[:, :, None, :])
+        out[self.noise_at] = self.noise(theta).T[:, :, None] * densities
+        out[self.colour_at] = out[self.noise_at] * self._noise_shape[:, None]
+        for dof in range(6):
+            force = whitened[..., dof].transpose(0, 2, 1) @ response[..., dof].conj()
+            slope = packed(_plus_transpose(force)) / 2
+            out[self.shape_at][dof::6] = self._b.T[:, :, None] * slope
+        out[self.level_at] = self._level_slopes(whitened)
         return out
 
+    def local_slope(
+        self,
+        point: ModelPoint,
+        whitened: ComplexArray,
+        response: ComplexArray,
+        row: int,
+        column: int,
+        factor: ComplexArray | FloatArray,
+    ) -> FloatArray:
+        """Packed slope of the spectra by a change `factor` of one element of the dynamic matrix, sign reversed.
 
-def _H(matrices: ComplexArray) -> ComplexArray:
-    return matrices.conj().swapaxes(-1, -2)
+        Parameters
+        ----------
+        point : ModelPoint
+        whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
+            L⁻¹G and L⁻¹GC.
+        row, column : int
+            Element of -ω²M + jωP + Q, by degree of freedom.
+        factor : ndarray, shape (n_groups, n_nodes)
+            Minus the derivative of that element.
+        """
+        u = whitened[..., row] / (self.force_unit[row] * point.colour[:, None, None, row]) * factor[..., None]
+        v = (response @ point.H[:, :, column].conj()[..., None])[..., 0]
+        return packed(_plus_transpose(u.transpose(0, 2, 1) @ v.conj()))
+
+    def _level_slopes(self, whitened: ComplexArray) -> FloatArray:
+        """Packed slopes by the 21 elements of C, shape (21, n_groups, n²)."""
+        n_groups, n_nodes = self._w.shape
+        flat = whitened.reshape(n_groups, n_nodes, self.n * 6)
+        products = (flat.transpose(0, 2, 1) @ flat.conj()).reshape(n_groups, self.n, 6, self.n, 6)
+        pairs = products[:, :, ROWS, :, COLUMNS]
+        return packed(_plus_transpose(pairs)) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
+
+
+def packed(matrices: ComplexArray) -> FloatArray:
+    """Hermitian matrices as real vectors with the same inner product tr(A B), shape (…, n²)."""
+    n = matrices.shape[-1]
+    diagonal, (rows, columns) = np.arange(n), np.triu_indices(n, 1)
+    upper = np.sqrt(2) * matrices[..., rows, columns]
+    return np.concatenate([matrices[..., diagonal, diagonal].real, upper.real, upper.imag], axis=-1)
+
+
+def _summed(left: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Σ over nodes of left rightᴴ, shape (n_groups, n, n)."""
+    n_groups, _, n, _ = left.shape
+    A, B = (part.transpose(0, 2, 1, 3).reshape(n_groups, n, -1) for part in (left, right))
+    return np.asarray(A @ B.conj().transpose(0, 2, 1), dtype=np.complex128)
 
 
 def _plus_transpose(matrices: ComplexArray) -> ComplexArray:
-    return matrices + _H(matrices)
+    return matrices + matrices.conj().swapaxes(-1, -2)

@@ -24,7 +24,7 @@ __all__ = [
     "expanded_B",
     "filter_R",
     "low_pass",
-    "low_pass_slope",
+    "low_pass_slopes",
     "source_spectrum",
     "unit_spectrum",
 ]
@@ -155,17 +155,19 @@ def filter_gain(cutoff_hz: float) -> float:
     return 2 * math.sqrt(FILTER_DAMPING * 2 * math.pi * cutoff_hz)
 
 
-def low_pass(frequency_hz: FloatArray, cutoff_hz: float) -> FloatArray:
-    """Power gain of the colouring filter, 1 at zero frequency; same shape as `frequency_hz`."""
-    r2 = (frequency_hz / cutoff_hz) ** 2
-    return np.asarray(1 / ((1 - r2) ** 2 + (2 * FILTER_DAMPING) ** 2 * r2), dtype=np.float64)
+def low_pass(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2.0) -> FloatArray:
+    """Power gain of a Butterworth low-pass, 1 at zero frequency; same shape as `frequency_hz`.
+
+    The filters have orders 1 to 4 (the paper's is of second order); an estimate may lie between them.
+    """
+    return np.asarray(1 / (1 + np.abs(frequency_hz / cutoff_hz) ** (2 * order)), dtype=np.float64)
 
 
-def low_pass_slope(frequency_hz: FloatArray, cutoff_hz: float) -> FloatArray:
-    """Derivative of log `low_pass` by the logarithm of the cutoff; same shape as `frequency_hz`."""
-    r2 = (frequency_hz / cutoff_hz) ** 2
-    q = (2 * FILTER_DAMPING) ** 2
-    return np.asarray(2 * r2 * (q - 2 * (1 - r2)) * low_pass(frequency_hz, cutoff_hz), dtype=np.float64)
+def low_pass_slopes(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2.0) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of log `low_pass` by the logarithms of cutoff and order; each of the shape of `frequency_hz`."""
+    ratio = np.abs(frequency_hz / cutoff_hz)
+    stopped = 2 * order * (1 - low_pass(frequency_hz, cutoff_hz, order))
+    return stopped, -stopped * np.log(np.maximum(ratio, 1e-12))
 
 
 def unit_spectrum(frequency_hz: FloatArray, cutoff_hz: float) -> FloatArray:

@@ -1,0 +1,111 @@
+"""Unbalance from the rotation-synchronous vector: generalised least squares with known phase."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.bins import BinGroups
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel
+from models.errors import EstimationError
+from models.machine import Machine
+from models.signals.block import FloatArray
+
+__all__ = ["Unbalance", "estimate_unbalance"]
+
+
+@dataclass(frozen=True, slots=True)
+class Unbalance:
+    """Relative change of e in one window.
+
+    Attributes
+    ----------
+    change, variance : float
+    covariance : ndarray, shape (5,)
+        With the logarithmic ratios of the structural parameters.
+    """
+
+    change: float
+    variance: float
+    covariance: FloatArray
+
+
+def estimate_unbalance(
+    machine: Machine,
+    model: SpectralModel,
+    theta: FloatArray,
+    covariance: FloatArray,
+    synchronous: ComplexArray,
+    speed_rad_s: float,
+    duration_s: float,
+) -> Unbalance:
+    """Estimate e from q of x_n = Re{q e^{jθ}}.
+
+    The vector's covariance is the stochastic part's spectrum over the window length, averaged around Ω as a window of
+    that length sees it, plus what the uncertainty of the structural parameters makes of the predicted response.
+
+    Parameters
+    ----------
+    machine : Machine
+    model : SpectralModel
+    theta : ndarray, shape (size,)
+        Parameter point of `model`.
+    covariance : ndarray, shape (5, 5)
+        Of the logarithmic ratios of the structural parameters.
+    synchronous : ndarray of complex, shape (n,)
+        q, SI.
+    speed_rad_s, duration_s : float
+
+    Raises
+    ------
+    EstimationError
+        If the vector says nothing about e.
+    """
+    rotor = machine.rotor
+    w = np.array([speed_rad_s])
+    phase = np.exp(1j * machine.operation.unbalance_phase_rad)
+    force = rotor.m2_kg * rotor.e_m * speed_rad_s**2 * phase * np.array([0, 1, 0, 0, -1j, 0])
+
+    def response(ratios: FloatArray) -> ComplexArray:
+        vectors = model.measured(model.receptance(ratios, speed_rad_s, w) @ force[:, None], w)
+        return np.asarray(vectors[0, :, 0], dtype=np.complex128)
+
+    structural = theta[: len(STRUCTURAL)]
+    g = response(structural)
+    step = 1e-5
+    slopes = np.stack(
+        [response(structural + step * unit) - response(structural - step * unit) for unit in np.eye(len(STRUCTURAL))]
+    ) / (2 * step)
+    noise = 4 * _around_rotation(machine, model, theta, speed_rad_s, duration_s) / duration_s
+    q = synchronous / model.scale
+    e_ratio = float(np.real(np.vdot(g, np.linalg.solve(noise, q))) / np.real(np.vdot(g, np.linalg.solve(noise, g))))
+    # Real representation: the structural uncertainty moves real and imaginary parts together.
+    total = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
+    J = np.concatenate([slopes.real, slopes.imag], axis=1).T * e_ratio
+    total = total + J @ covariance @ J.T
+    g2, q2 = np.concatenate([g.real, g.imag]), np.concatenate([q.real, q.imag])
+    weight = np.linalg.solve(total, g2)
+    precision = float(weight @ g2)
+    if not precision > 0:
+        raise EstimationError(f"{machine.name}: the spectrum at the speed of rotation is not determined")
+    return Unbalance(float(weight @ q2) / precision - 1, 1 / precision, -(weight @ J) / precision @ covariance)
+
+
+def _around_rotation(
+    machine: Machine, model: SpectralModel, theta: FloatArray, speed_rad_s: float, duration_s: float
+) -> ComplexArray:
+    """Stochastic cross-spectrum under the kernel of a plain window of the given length, centred on Ω, shape (n, n).
+
+    On the frequencies Ω ± (k + ½)/T the kernel has the weights 1/(π(k + ½))². Its tails are long: with one source, what
+    they let in from a resonance is more than the sensor noise. Far from Ω many k are taken together.
+    """
+    edges = np.unique(np.concatenate([np.arange(8), np.geomspace(8, 10 * duration_s, 24).astype(int)]))
+    cumulated = np.concatenate([[0.0], np.cumsum((np.pi * (np.arange(edges[-1]) + 0.5)) ** -2.0)])
+    weights, offsets = np.diff(cumulated[edges]), np.sqrt((edges[:-1] + 0.5) * (edges[1:] - 0.5)) / duration_s
+    centre_hz = speed_rad_s / (2 * np.pi)
+    nodes_hz = np.concatenate([centre_hz - offsets, centre_hz + offsets])
+    both = np.concatenate([weights, weights])[np.newaxis] / (2 * weights.sum())
+    one = BinGroups(((0, 1),), np.ones(1), np.array([centre_hz]), np.abs(nodes_hz)[np.newaxis], both)
+    force_scale = float(model.force_unit[0])
+    seen = SpectralModel(machine, model.states, one, model.scale, force_scale, model.shapes).at(theta, speed_rad_s)
+    return np.asarray(seen.S[0], dtype=np.complex128)
