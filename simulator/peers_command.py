@@ -87,7 +87,8 @@ def draw_comparison(comparison: Comparison, path: Path) -> Path:
                 axes.set_yticks(range(len(cells)), [_label(cell) for cell in cells])
                 title = "something is said to have changed" if what == "detected" else "exactly the right set is named"
                 axes.set_title(f"{setting}: {title}", loc="left")
-            row[0].invert_yaxis()
+            row[0].tick_params(length=0)
+        panels[0, 0].invert_yaxis()  # shared by all
         for axes in panels[-1]:
             axes.set_xlabel("windows, %")
         handles = [

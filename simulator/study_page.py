@@ -110,7 +110,7 @@ def _conclusions(study: Study) -> list[str]:
             "ones:",
             f"{_compared(shared, independent)}. On independent data they name {_text(found)} of the changed",
             "equations, and",
-            f"in {_text(wrong)} of the windows an unchanged one: {_locating(found, wrong)}.",
+            f"in {_text(wrong)} of the windows an unchanged one: {_locating(independent, found)}.",
             indent="  ",
         ),
         *_by_equation(study),
@@ -223,9 +223,9 @@ def _conditions(study: Study) -> list[str]:
             f"alike: S = ({', '.join(f'{value:.3g}' for value in study.direction)}) on (y1, y2, ψ, z1, z2, φ), the",
             "tilts",
             "through a lever arm of a third of the shaft. Equation 30 was given tilt probes; the likelihood and the",
-            "amortised networks see only the machine's own channels. Only the noise realisation varies here. What",
-            "happens",
-            "when direction, level, cutoff and speed vary too stands in [results.md](results.md).",
+            "amortised networks see only the machine's own channels. Only the noise realisation varies here, at known",
+            "cutoffs; what the diagnosticians do when direction, level, cutoff and speed vary too stands in",
+            "[results.md](results.md), and `rotortrain peers` puts the printed networks into that setting as well.",
         ),
         "",
     ]
@@ -244,7 +244,7 @@ def _compared(shared: Rate, independent: Rate) -> str:
     return "no difference beyond chance"
 
 
-def _locating(found: Rate, wrong: Rate) -> str:
-    if wrong.low > 0.5:
-        return "a fault is noticed, but not located" if found.low > 0.5 else "neither noticed reliably nor located"
-    return "a fault is noticed and located" if found.low > 0.5 else "most faults go unnoticed"
+def _locating(exact: Rate, found: Rate) -> str:
+    if exact.low > 0.5:
+        return "faults are noticed and located"
+    return "faults are noticed, but seldom located" if found.low > 0.5 else "most faults go unnoticed"

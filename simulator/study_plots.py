@@ -113,12 +113,12 @@ def _deviations(study: Study, realisation: Realisation) -> Figure:
         for n, equation in enumerate(EQUATIONS)
     ]
     handles.append(axes.plot([], [], "k--", linewidth=0.9, label="healthy limit")[0])
-    figure.legend(handles=handles, loc="outside upper center", ncols=5)
-    figure.suptitle(
-        f"Networks as printed, {REALISATION_TEXT[realisation]}: median and 5-95 % of {study.windows} windows; "
+    figure.legend(
+        handles=handles,
+        loc="outside upper center",
+        ncols=5,
+        title=f"Networks as printed, {REALISATION_TEXT[realisation]}: median and 5-95 % of {study.windows} windows; "
         "filled: contains a changed parameter",
-        y=1.04,
-        fontsize=10,
     )
     return figure
 

@@ -32,6 +32,7 @@ __all__ = [
 ]
 
 _PHASE = "n"
+_SCALE_QUANTILE = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,9 +201,10 @@ def calibrate_paper(
 ) -> PaperHealthy:
     """Set every equation's limit from healthy windows.
 
-    The logarithms of the MSDs are brought to a common scale by median and median absolute deviation; the largest over
-    the equations is the window's score, and the ⌈(n+1)(1-α)⌉-th smallest score is the limit. A further healthy window
-    exceeds it with probability α at most, whatever the distribution.
+    Every MSD is divided by its equation's 90 % quantile; the largest of these ratios is the window's score, and the
+    ⌈(n+1)(1-α)⌉-th smallest score is the limit. A further healthy window exceeds it with probability α, whatever the
+    distribution. An upper quantile as the scale, not a median: operating conditions make some of the MSDs many times
+    larger than the rest, and one equation's conditions must not decide the limits of the others.
 
     Parameters
     ----------
@@ -220,18 +222,16 @@ def calibrate_paper(
     """
     n = len(windows)
     rank = int(np.ceil((n + 1) * (1 - false_alarm_rate) - 1e-9))
-    if rank > n or n < 4:
-        needed = max(4, int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1)
+    if rank > n:
+        needed = int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1
         raise EstimationError(
             f"{machine.name}: {n} healthy windows for a false-alarm rate of {false_alarm_rate:g}, expected at least "
             f"{needed}"
         )
     msd = np.array([[mean_squared_deviation(network, window, machine) for network in networks] for window in windows])
-    log = np.log(np.maximum(msd, np.finfo(float).tiny))
-    middle = np.median(log, axis=0)
-    spread = np.maximum(1.4826 * np.median(np.abs(log - middle), axis=0), 1e-6)
-    limit = float(np.sort(((log - middle) / spread).max(axis=1))[rank - 1])
-    threshold = np.exp(middle + limit * spread + 1e-12)  # the window that sets the limit does not exceed it by rounding
+    scale = np.maximum(np.quantile(msd, _SCALE_QUANTILE, axis=0), np.finfo(float).tiny)
+    limit = float(np.sort((msd / scale).max(axis=1))[rank - 1])
+    threshold = scale * limit * (1 + 1e-12)  # the window that sets the limit does not exceed it by rounding
     return PaperHealthy(
         n,
         false_alarm_rate,
