@@ -13,7 +13,7 @@ import scipy.stats
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.scoring import FisherScoring, Maximum
-from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel, packed
+from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel, packed, twice_packed
 from models.machine import Machine
 from models.physics.matrices import Q_shaft
 from models.signals.block import FloatArray
@@ -119,7 +119,7 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     for number, state in enumerate(model.states):
         outer = L_inverse[:, :, number, None] * coloured[:, None, number, :]
         names.append(f"gain of {state}")
-        slopes.append(packed(outer + outer.conj().swapaxes(1, 2)))
+        slopes.append(twice_packed(outer))
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
     rotor = machine.rotor
     for (name, dofs), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):

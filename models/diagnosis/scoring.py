@@ -175,10 +175,10 @@ class FisherScoring:
         """Gradient, information for the step (both by T), packed slopes, and information by C."""
         model = self._model
         slopes = model.slopes(whitened.point, whitened.L_inverse)
-        flat = slopes.reshape(model.size, -1)
-        weighted = (slopes * self.averages[:, None]).reshape(model.size, -1)
-        gradient: FloatArray = weighted @ packed(whitened.excess).ravel()
-        on_levels: FloatArray = weighted @ flat.T
+        root = np.sqrt(self.averages)[:, None]
+        weighted = (slopes * root).reshape(model.size, -1)
+        gradient: FloatArray = weighted @ (packed(whitened.excess) * root).ravel()
+        on_levels: FloatArray = weighted @ weighted.T
         levels = model.level_at
         chain = _levels_by_factor(model.factor(theta))
         information = on_levels.copy()

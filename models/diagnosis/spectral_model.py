@@ -30,7 +30,7 @@ from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.matrices import STATE_INDEX, M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
 
-__all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralModel", "packed"]
+__all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralModel", "packed", "twice_packed"]
 
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
@@ -223,7 +223,7 @@ class SpectralModel:
             out[parameter] = self.local_slope(point, whitened, response, dof, dof, factor)
         unit = self.force_unit * point.colour[:, None, None, :]
         shaft = -((whitened / unit) @ (self._Q_shaft * np.exp(theta[4]))) @ point.H
-        out[4] = packed(_plus_transpose(_summed(shaft, response)))
+        out[4] = twice_packed(_summed(shaft, response))
         for at, slope in zip(
             (self.cutoff_at, self.order_at), low_pass_slopes(self.groups.nodes_hz, *self.filter(theta)), strict=True
         ):
@@ -234,7 +234,7 @@ class SpectralModel:
         out[self.colour_at] = out[self.noise_at] * self._noise_shape[:, None]
         for dof in range(6):
             force = whitened[..., dof].transpose(0, 2, 1) @ response[..., dof].conj()
-            slope = packed(_plus_transpose(force)) / 2
+            slope = twice_packed(force) / 2
             out[self.shape_at][dof::6] = self._b.T[:, :, None] * slope
         out[self.level_at] = self._level_slopes(whitened)
         return out
@@ -262,7 +262,7 @@ class SpectralModel:
         """
         u = whitened[..., row] / (self.force_unit[row] * point.colour[:, None, None, row]) * factor[..., None]
         v = (response @ point.H[:, :, column].conj()[..., None])[..., 0]
-        return packed(_plus_transpose(u.transpose(0, 2, 1) @ v.conj()))
+        return twice_packed(u.transpose(0, 2, 1) @ v.conj())
 
     def _level_slopes(self, whitened: ComplexArray) -> FloatArray:
         """Packed slopes by the 21 elements of C, shape (21, n_groups, n²)."""
@@ -270,7 +270,7 @@ class SpectralModel:
         flat = whitened.reshape(n_groups, n_nodes, self.n * 6)
         products = (flat.transpose(0, 2, 1) @ flat.conj()).reshape(n_groups, self.n, 6, self.n, 6)
         pairs = products[:, :, ROWS, :, COLUMNS]
-        return packed(_plus_transpose(pairs)) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
+        return twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
 
 
 def packed(matrices: ComplexArray) -> FloatArray:
@@ -281,12 +281,16 @@ def packed(matrices: ComplexArray) -> FloatArray:
     return np.concatenate([matrices[..., diagonal, diagonal].real, upper.real, upper.imag], axis=-1)
 
 
+def twice_packed(matrices: ComplexArray) -> FloatArray:
+    """X + Xᴴ of square matrices X, packed."""
+    n = matrices.shape[-1]
+    diagonal, (rows, columns) = np.arange(n), np.triu_indices(n, 1)
+    upper = np.sqrt(2) * (matrices[..., rows, columns] + matrices[..., columns, rows].conj())
+    return np.concatenate([2 * matrices[..., diagonal, diagonal].real, upper.real, upper.imag], axis=-1)
+
+
 def _summed(left: ComplexArray, right: ComplexArray) -> ComplexArray:
     """Σ over nodes of left rightᴴ, shape (n_groups, n, n)."""
     n_groups, _, n, _ = left.shape
     A, B = (part.transpose(0, 2, 1, 3).reshape(n_groups, n, -1) for part in (left, right))
     return np.asarray(A @ B.conj().transpose(0, 2, 1), dtype=np.complex128)
-
-
-def _plus_transpose(matrices: ComplexArray) -> ComplexArray:
-    return matrices + matrices.conj().swapaxes(-1, -2)
