@@ -253,7 +253,7 @@ class MachineMonitor:
             report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
             self._latest = report
             return report, ()
-        short = {hops: self._window.statistics(hops) for hops in self._test.settings.short_hops}
+        short = {hops: self._window.statistics(hops) for hops in self._test.wanted()}
         present = {hops: latest for hops, latest in short.items() if latest is not None}
         try:
             evaluation = self._evaluator.evaluate(statistics, present)

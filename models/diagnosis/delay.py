@@ -116,7 +116,8 @@ def detection_delays(
             looks = hops.looks(weight * step)
             if not looks:
                 continue
-            verdict = test.update(looks)
+            wanted = (*test.wanted(), settings.window_hops)
+            verdict = test.update({hops: look for hops, look in looks.items() if hops in wanted})
             delay_s = (number - before_hops + share) * settings.hop_s
             if number < before_hops:
                 false = false or verdict.detected

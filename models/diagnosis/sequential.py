@@ -130,6 +130,8 @@ class SequentialState:
     ----------
     sums : dict of int to list of Stretch
         Latest stretches of one window (key 1) and of the sums of 2, 4, … windows, oldest first.
+    looks : int
+        Hops judged so far.
     change_ns : int or None
         Data before this belongs to another condition of the machine.
     before : tuple of float
@@ -139,6 +141,7 @@ class SequentialState:
     """
 
     sums: dict[int, list[Stretch]] = field(default_factory=dict)
+    looks: int = 0
     change_ns: int | None = None
     before: tuple[float, ...] = (0.0,) * len(PARAMETERS)
     findings: tuple[Finding, ...] = ()
@@ -148,6 +151,7 @@ class SequentialState:
         found: dict[str, np.ndarray] = {
             "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
             "before": np.array(self.before),
+            "looks": np.array(self.looks),
             "findings": np.array([(PARAMETERS.index(f.name), f.since_ns, f.found_ns) for f in self.findings], np.int64),
             "finding_stretch_s": np.array([f.stretch_s for f in self.findings]),
         }
@@ -162,7 +166,7 @@ class SequentialState:
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "SequentialState":
         """State from what `checkpoint` gave."""
-        state = cls(before=tuple(arrays["before"].tolist()))
+        state = cls(looks=int(arrays["looks"]), before=tuple(arrays["before"].tolist()))
         if arrays["change_ns"].size:
             state.change_ns = int(arrays["change_ns"][0])
         state.findings = tuple(
@@ -219,20 +223,38 @@ class SequentialTest:
         """Forget everything: the data's clock was set, or another machine is watched."""
         self.state = SequentialState()
 
+    def wanted(self) -> tuple[int, ...]:
+        """Short stretches worth evaluating at the next hop, by their hops; every one costs as much as a window.
+
+        On an unchanged machine the lengths take turns. After a change the longest clean one is wanted, or, before there
+        is one, the shortest.
+        """
+        short, state = self.settings.short_hops, self.state
+        if not short:
+            return ()
+        windows = state.sums.get(1)
+        if state.change_ns is not None and windows:
+            hop_ns = self.settings.hop_s * 1e9
+            next_hops = (windows[-1].end_ns - state.change_ns + self._slack_ns + hop_ns) // hop_ns
+            if next_hops < self.settings.window_hops:
+                return (max((hops for hops in short if hops <= next_hops), default=short[0]),)
+        return (short[state.looks % len(short)],)
+
     def update(self, looks: Mapping[int, Stretch]) -> SequentialVerdict:
         """Judge one hop.
 
         Parameters
         ----------
         looks : mapping of int to Stretch
-            Stretches that end with this hop, by their hops: the full window, and the short ones as far as they could be
-            evaluated.
+            Stretches that end with this hop, by their hops: the full window, and those of the short ones that are
+            there. `wanted` says which suffice.
 
         Raises
         ------
         KeyError
             If the full window is not among them.
         """
+        self.state.looks += 1
         window_hops = self.settings.window_hops
         window = looks[window_hops]
         every = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}

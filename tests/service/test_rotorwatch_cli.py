@@ -229,11 +229,21 @@ def test_router_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
 
 def test_lines_for_terminals() -> None:
     report = Report.model_validate(example(Report))
-    assert report_line(report) == "00:03:25  lab  alert          k_by −24.7±1.4 %"
+    start, tail = "00:03:25  lab  alert          ", "  |  changed: k_by  |  relation agrees"
+    assert report_line(report) == f"{start}k_by −24.7±1.4 %{tail}"
+    assert report.verdict is not None
+    settled = report.model_copy(update={"verdict": report.verdict.model_copy(update={"settled": True})})
     small = report.parameters[0].model_copy(update={"relative_change": 0.005})
-    assert report_line(report.model_copy(update={"parameters": (small,)})).endswith("k_by  +0.5±1.4 %")
+    assert report_line(settled.model_copy(update={"parameters": (small,)})) == f"{start}k_by  +0.5±1.4 %{tail}"
     blind = report.parameters[0].model_copy(update={"relative_change": None})
-    assert report_line(report.model_copy(update={"parameters": (blind,)})).endswith("k_by n/a")
+    assert report_line(settled.model_copy(update={"parameters": (blind,)})) == f"{start}k_by n/a{tail}"
+    just = report.model_copy(update={"verdict": report.verdict.model_copy(update={"current": (), "changed": ()})})
+    assert "too little data since the change  |  changed: ?" in report_line(just)
+    calm = report.verdict.model_copy(update={"changed": (), "detected": False, "outside_model": True})
+    (opinion,) = report.opinions
+    apart = opinion.model_copy(update={"agreement": (opinion.agreement[0].model_copy(update={"verdict": "disagree"}),)})
+    shown = report_line(report.model_copy(update={"verdict": calm, "opinions": (apart,)}))
+    assert shown.endswith("no change, outside the model  |  relation disagrees on k_by")
     early = report.model_copy(update={"parameters": (), "filled": 0.25, "state": "warming"})
     assert report_line(early) == "00:03:25  lab  warming        window 25% full"
     assert report_line(early.model_copy(update={"reason": "too fast"})).endswith("too fast")
