@@ -84,7 +84,9 @@ def _excitation(study: Study) -> Figure:
         density = force**2 * 2 * unit_spectrum(frequency, float(cutoff))
         axes.semilogy(frequency, density, color=COLOURS[n], label=f"cutoff {cutoff} Hz, {force:.3g} N rms")
     axes.axvline(study.speed_rpm / 60, color="#888888", linewidth=0.8, linestyle=":")
-    axes.text(study.speed_rpm / 60 + 3, axes.get_ylim()[0] * 2, "1×", color="#555555")
+    axes.annotate(
+        "1×", (study.speed_rpm / 60, 1), xycoords=("data", "axes fraction"), ha="center", va="bottom", color="#555555"
+    )
     axes.set_xlabel("frequency, Hz")
     axes.set_ylabel("force density, N²/Hz")
     axes.legend(fontsize=8)
