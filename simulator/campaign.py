@@ -34,6 +34,7 @@ __all__ = [
     "Layout",
     "Purpose",
     "draw_condition",
+    "simulate_scenario",
     "simulate_window",
     "windows",
     "with_tilt",
@@ -308,10 +309,14 @@ def _scaled(
 
 def simulate_window(draw: Draw, number: int) -> WindowStatistics:
     """Simulate one window and return its statistics."""
-    machine = draw.machine
+    return simulate_scenario(draw_condition(draw, number), draw.machine)
+
+
+def simulate_scenario(scenario: Scenario, machine: Machine) -> WindowStatistics:
+    """Simulate a scenario that lasts one window and return its statistics."""
     plan = plan_for(machine)
     window = SlidingWindow(plan)
-    for block, _ in blocks(draw_condition(draw, number), machine, block_s=_BLOCK_S):
+    for block, _ in blocks(scenario, machine, block_s=_BLOCK_S):
         for _ in window.feed(plan.to_si(block.samples), block.start_ns):
             pass
     statistics = window.statistics()

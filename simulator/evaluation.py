@@ -1,172 +1,271 @@
 """Evaluation of the diagnosticians on windows that neither training nor calibration saw.
 
-Every cell is one true change in one layout of the excitation, on independent realisations in conditions drawn at
-random. A reading counts as detected when it lies more than a threshold of standard errors from nominal; the threshold
-follows from the declared false-alarm rate per window over all parameters together.
+Every window becomes a record: what was true of it, what each diagnostician read, and how well anybody could have read
+it. Records are kept one per line, so that a long evaluation can be stopped and carried on, and every figure on the
+results page can be traced to its windows.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from pathlib import Path
+from time import process_time
 
 import numpy as np
-import scipy.stats
 from pydantic import BaseModel, ConfigDict
 
+from models.diagnosis.bound import TrueCondition, cramer_rao
 from models.diagnosis.bundle import Bundle
+from models.diagnosis.calibration import window_thresholds
+from models.diagnosis.detectable import detectable_changes
+from models.diagnosis.isolation import isolate_window
 from models.diagnosis.likelihood import LikelihoodFit
-from models.diagnosis.networks import read_equation
-from models.diagnosis.readings import ParameterReading
-from models.diagnosis.spectral_model import STRUCTURAL
+from models.diagnosis.moments import plan_for
+from models.diagnosis.readings import Diagnosis, Diagnostician
+from models.diagnosis.stretch import stretch_of
+from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.parameters import PARAMETERS
-from simulator.campaign import Draw, Layout, Purpose, simulate_window
+from models.physics.excitation import source_spectrum
+from models.physics.matrices import STATE_INDEX
+from simulator.campaign import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
+from simulator.evaluation_cells import EvaluationCell, Topic
+from simulator.integrator import theoretical_rms
+from simulator.opinions import diagnosticians
+from simulator.scenario import Scenario
+from simulator.timeline import Condition
 
-__all__ = ["Cell", "Rate", "Reading", "cells", "evaluate_cell", "threshold_for"]
+__all__ = ["RATES", "Opinion", "WindowRecord", "evaluate_cells", "read_records", "true_condition"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
+RATES = (0.01, 0.001)
+"""Declared false-alarm rates per window at which every opinion is judged."""
 
-class Rate(BaseModel):
-    """A rate with its 95 % Clopper-Pearson interval."""
-
-    model_config = _STRICT
-
-    count: int
-    of: int
-    rate: float
-    low: float
-    high: float
-
-    @classmethod
-    def of_counts(cls, count: int, of: int) -> "Rate":
-        """Rate of `count` in `of` independent windows."""
-        low = 0.0 if count == 0 else float(scipy.stats.beta.ppf(0.025, count, of - count + 1))
-        high = 1.0 if count == of else float(scipy.stats.beta.ppf(0.975, count + 1, of - count))
-        return cls(count=count, of=of, rate=count / of, low=low, high=high)
+_OTHER_REALISATION = 7919
 
 
-class Reading(BaseModel):
-    """How one diagnostician read one parameter in a cell: relative changes, spread as a robust standard deviation."""
+class Opinion(BaseModel):
+    """What one diagnostician said of one window; empty readings where it refused.
 
-    model_config = _STRICT
-
-    by: str
-    parameter: str
-    not_evaluable: int
-    truth: float
-    median: float
-    spread: float
-    standard_error: float
-    covered: Rate
-    detected: Rate
-
-
-class Cell(BaseModel):
-    """One true change in one layout."""
+    Attributes
+    ----------
+    change, error : dict of str to float
+        Relative changes and standard errors.
+    named : tuple of tuple of str
+        Parameters it says have changed, at each of `RATES`.
+    outside : tuple of bool
+        Whether it says that the window is outside the model, at each of `RATES`.
+    misfit_z : float or None
+    suspect : str
+    seconds : float
+        Processor time.
+    refused : str
+        Why the window was not evaluated.
+    """
 
     model_config = _STRICT
 
-    faults: dict[str, float]
-    layout: str
-    windows: int
-    readings: tuple[Reading, ...]
+    change: dict[str, float] = {}
+    error: dict[str, float] = {}
+    named: tuple[tuple[str, ...], ...] = ()
+    outside: tuple[bool, ...] = ()
+    misfit_z: float | None = None
+    suspect: str = ""
+    seconds: float = 0.0
+    refused: str = ""
 
 
-def threshold_for(false_alarm_rate: float) -> float:
-    """Standard errors that a healthy window exceeds in any parameter with the given probability (Bonferroni)."""
-    return float(scipy.stats.norm.isf(false_alarm_rate / 2 / len(PARAMETERS)))
+class WindowRecord(BaseModel):
+    """One evaluated window."""
+
+    model_config = _STRICT
+
+    cell: int
+    topic: Topic
+    number: int
+    layout: Layout
+    excitation: Excitation
+    anomaly: Anomaly
+    length_s: float
+    truth: dict[str, float]
+    cutoff_hz: float
+    noise_relative: float
+    bound: dict[str, float] = {}
+    opinions: dict[str, Opinion]
 
 
-def cells(fault_size: float) -> Iterator[tuple[dict[str, float], Layout]]:
-    """Return the standard cells: healthy, and each parameter changed (e up, the rest down), in both layouts."""
-    for layout in Layout:
-        yield {}, layout
-        for name in PARAMETERS:
-            yield {name: fault_size if name == "e" else -fault_size}, layout
+def true_condition(scenario: Scenario, machine: Machine) -> TrueCondition:
+    """What the scenario makes of the machine from its first sample on, as the bound needs it."""
+    changes = {event.parameter: event.relative_change for event in scenario.events if event.parameter}
+    speeds = [event.speed_rpm for event in scenario.events if event.speed_rpm is not None]
+    truth = {name: float(change) for name, change in changes.items() if change is not None}
+    rms = theoretical_rms(machine, Condition(truth, speeds[-1], scenario.sources))
+    states = [STATE_INDEX[name] for name in plan_for(machine).states]
+    low_hz, high_hz = machine.window.band_hz
+    frequencies_hz = np.linspace(low_hz, high_hz, 64)
+    corner_hz = scenario.sensors.noise_corner_hz
+    memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / machine.rate_hz))
+    density = (1 - memory**2) / np.abs(1 - memory * np.exp(-2j * np.pi * frequencies_hz / machine.rate_hz)) ** 2
+    colour = np.stack([np.ones(64), np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)], axis=1)
+    (level, exponent), *_ = np.linalg.lstsq(colour, np.log(density / machine.rate_hz), rcond=None)
+    variance = (scenario.sensors.noise_relative * rms[states]) ** 2
+    levels = np.zeros((6, 6))
+    for source in scenario.sources:
+        force = np.array(source.direction) * source.force_rms_N
+        levels += np.outer(force, force) * float(source_spectrum(np.array([1e-6]), source)[0])
+    return TrueCondition(
+        changes=truth,
+        speed_rad_s=speeds[-1] * 2 * np.pi / 60,
+        cutoff_hz=scenario.sources[0].cutoff_hz,
+        levels=levels,
+        noise=np.asarray(np.exp(level) * variance, dtype=np.float64),
+        noise_colour=np.full(len(states), float(exponent)),
+    )
 
 
-def evaluate_cell(
+def evaluate_cells(
     machine: Machine,
-    bundle: Bundle,
-    faults: dict[str, float],
-    layout: Layout,
+    bundle: Bundle | None,
+    cells: Iterable[EvaluationCell],
     *,
-    stream: int,
     n_windows: int,
     seed: int,
-    false_alarm_rate: float,
     processes: int,
-    progress: Callable[[int], None] = lambda _: None,
-) -> Cell:
-    """Evaluate one cell.
+    kept: Path,
+    progress: Callable[[EvaluationCell, int, int], None],
+) -> None:
+    """Evaluate cell after cell, appending to a file of records; what is there already is not done again.
 
     Parameters
     ----------
     machine : Machine
-    bundle : Bundle
-    faults : dict of str to float
-        True relative changes.
-    layout : Layout
-    stream : int
-        Number of the cell; part of every window's seed.
-    n_windows, seed : int
-    false_alarm_rate : float
-        Per window, over all parameters together.
+    bundle : Bundle or None
+        Without it only the likelihood is evaluated.
+    cells : iterable of EvaluationCell
+    n_windows : int
+        Windows of a cell of weight one.
+    seed : int
     processes : int
+    kept : Path
+        JSON lines.
     progress : callable
-        Called with 1 for each finished window.
+        Called with the cell, its windows done and its windows in all.
     """
-    draw = Draw(machine, seed, Purpose.EVALUATION, stream, faults=faults, layout=layout)
-    read = partial(_read_window, draw, bundle)
-    results = []
-    with ProcessPoolExecutor(processes) as pool:
-        for readings in pool.map(read, range(n_windows), chunksize=2):
-            results.append(readings)
-            progress(1)
-    threshold = threshold_for(false_alarm_rate)
-    summaries = [
-        _summary([readings[position] for readings in results], faults, threshold) for position in range(len(results[0]))
-    ]
-    return Cell(faults=faults, layout=layout.name.lower(), windows=n_windows, readings=tuple(summaries))
+    done = {(record.cell, record.number) for record in read_records(kept)} if kept.exists() else set()
+    with ProcessPoolExecutor(processes) as pool, kept.open("a", encoding="utf-8") as out:
+        for index, cell in enumerate(cells):
+            count = max(2, round(n_windows * cell.windows))
+            missing = [number for number in range(count) if (index, number) not in done]
+            finished = count - len(missing)
+            progress(cell, finished, count)
+            work = partial(_record, machine, bundle, cell, index, seed)
+            for record in pool.map(work, missing, chunksize=4):
+                out.write(record.model_dump_json(exclude_defaults=True) + "\n")
+                out.flush()
+                finished += 1
+                progress(cell, finished, count)
 
 
-def _read_window(draw: Draw, bundle: Bundle, number: int) -> tuple[ParameterReading, ...]:
-    window = simulate_window(draw, number)
-    try:
-        estimate = LikelihoodFit(draw.machine).fit(window)
-    except EstimationError as error:  # a refused window is a result: it is counted
-        readings = [ParameterReading(name, "likelihood", reason=str(error)) for name in (*STRUCTURAL, "e")]
-    else:
-        readings = [
-            ParameterReading(name, "likelihood", float(change), float(deviation))
-            for name, change, deviation in zip(estimate.names, estimate.change, estimate.standard_error, strict=True)
-        ]
-    for network in bundle.networks:
-        readings += read_equation(network, window, draw.machine).parameters
-    return tuple(readings)
+def read_records(path: Path) -> Iterator[WindowRecord]:
+    """Read records back; a last line cut short by an interruption is left out."""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.endswith("}"):
+            yield WindowRecord.model_validate_json(line)
 
 
-def _summary(readings: list[ParameterReading], faults: dict[str, float], threshold: float) -> Reading:
-    """Summarise one parameter over the evaluated windows; rates are of those."""
-    truth = faults.get(readings[0].name, 0.0)
-    refused = sum(reading.change is None for reading in readings)
-    if refused == len(readings):
-        raise EstimationError(f"no window of a cell could be evaluated: {readings[0].reason}")
-    readings = [reading for reading in readings if reading.change is not None]
-    change = np.array([reading.change for reading in readings], dtype=np.float64)
-    error = np.array([reading.standard_error for reading in readings], dtype=np.float64)
-    median = float(np.median(change))
-    n = len(readings)
-    return Reading(
-        by=readings[0].by,
-        parameter=readings[0].name,
-        not_evaluable=refused,
-        truth=truth,
-        median=median,
-        spread=float(1.4826 * np.median(np.abs(change - median))),
-        standard_error=float(np.median(error)),
-        covered=Rate.of_counts(int(np.sum(np.abs(change - truth) <= 1.96 * error)), n),
-        detected=Rate.of_counts(int(np.sum(np.abs(change) > threshold * error)), n),
+def _record(
+    machine: Machine, bundle: Bundle | None, cell: EvaluationCell, index: int, seed: int, number: int
+) -> WindowRecord:
+    """Simulate one window and ask everybody."""
+    if cell.length_s is not None:
+        machine = _with_length(machine, cell.length_s)
+    draw = Draw(
+        machine,
+        seed,
+        Purpose.EVALUATION,
+        index,
+        faults=cell.faults,
+        layout=cell.layout,
+        excitation=cell.excitation,
+        anomaly=cell.anomaly,
     )
+    faults = dict(cell.faults)
+    if cell.topic is Topic.DETECTABLE:
+        faults = _quoted(draw, number)
+        draw = Draw(machine, seed, Purpose.EVALUATION, index, faults=faults)
+    scenario = draw_condition(draw, number)
+    if cell.topic is Topic.DETECTABLE:
+        scenario = scenario.model_copy(update={"seed": scenario.seed ^ _OTHER_REALISATION})
+    window = simulate_scenario(scenario, machine)
+    opinions: dict[str, Opinion] = {}
+    everybody: tuple[Diagnostician, ...] = (LikelihoodFit(machine),)
+    if bundle is not None and cell.length_s is None:
+        everybody = diagnosticians(machine, bundle)
+    for one in everybody:
+        opinions[one.by] = _opinion(one, window)
+    layout = Layout.INDEPENDENT if len(scenario.sources) > 1 else Layout.ONE_SOURCE
+    bounded = cell.topic in {Topic.HEALTHY, Topic.LENGTH}
+    states = window.states
+    return WindowRecord(
+        cell=index,
+        topic=cell.topic,
+        number=number,
+        layout=layout,
+        excitation=cell.excitation,
+        anomaly=cell.anomaly,
+        length_s=window.duration_s,
+        truth=faults,
+        cutoff_hz=scenario.sources[0].cutoff_hz,
+        noise_relative=scenario.sensors.noise_relative,
+        bound=cramer_rao(machine, states, true_condition(scenario, machine), window.duration_s) if bounded else {},
+        opinions=opinions,
+    )
+
+
+def _opinion(one: Diagnostician, window: WindowStatistics) -> Opinion:
+    started = process_time()
+    try:
+        diagnosis = one.diagnose(window)
+    except EstimationError as error:  # a refused window is a result: it is counted
+        return Opinion(refused=str(error), seconds=process_time() - started)
+    seconds = process_time() - started
+    if not diagnosis.evaluable:
+        reasons = {reading.reason for reading in diagnosis.parameters}
+        return Opinion(refused="; ".join(sorted(reasons)), seconds=seconds)
+    verdicts = [isolate_window(diagnosis, rate) for rate in RATES]
+    return Opinion(
+        change={reading.name: _rounded(reading.change) for reading in diagnosis.evaluable},
+        error={reading.name: _rounded(reading.standard_error) for reading in diagnosis.evaluable},
+        named=tuple(verdict.changed for verdict in verdicts),
+        outside=tuple(verdict.outside for verdict in verdicts),
+        misfit_z=None if diagnosis.misfit_z is None else round(diagnosis.misfit_z, 3),
+        suspect=diagnosis.suspect,
+        seconds=round(seconds, 5),
+    )
+
+
+def _rounded(value: float | None) -> float:
+    return float(f"{value:.6g}")
+
+
+def _quoted(draw: Draw, number: int) -> dict[str, float]:
+    """Change of one parameter, drawn at random, that the likelihood quotes as just detectable in this condition."""
+    diagnosis: Diagnosis = LikelihoodFit(draw.machine).diagnose(
+        simulate_scenario(draw_condition(draw, number), draw.machine)
+    )
+    rng = np.random.default_rng([draw.seed, _OTHER_REALISATION, number])
+    stretch = stretch_of(diagnosis, 0, 0)
+    quoted = detectable_changes(stretch, window_thresholds(RATES[0], len(stretch.known)), draw.machine.window.length_s)
+    one = quoted[int(rng.integers(len(quoted)))]
+    return {one.name: one.gain if rng.random() < 0.5 else one.loss}
+
+
+def _with_length(machine: Machine, length_s: float) -> Machine:
+    """The machine with another window length; the hop gives way where the window would hold fewer than four."""
+    window = machine.window
+    hop_s = window.hop_s if length_s >= 4 * window.hop_s else window.segment_s
+    changed = window.model_copy(
+        update={"length_s": round(length_s / hop_s) * hop_s, "hop_s": hop_s, "max_span_s": 2 * length_s}
+    )
+    return machine.model_copy(update={"window": changed})

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from models.diagnosis.paper import PAPER_EQUATIONS, PaperHealthy, calibrate_paper
 from models.diagnosis.paper_training import train_paper_network
 from simulator.campaign import Purpose, with_tilt
-from simulator.evaluation import Rate
+from simulator.rates import Rate
 from simulator.study_windows import (
     CONDITIONS,
     EQUATIONS,

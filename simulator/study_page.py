@@ -3,7 +3,7 @@
 import textwrap
 
 from models.diagnosis.paper import PAPER_EQUATIONS
-from simulator.evaluation import Rate
+from simulator.rates import Rate
 from simulator.study import REALISATIONS, Study
 from simulator.study_windows import CONDITIONS, EQUATIONS, own_equations
 
