@@ -100,7 +100,8 @@ def _comparison(study: Study) -> list[str]:
 
 def _conclusions(study: Study) -> list[str]:
     shared, independent = (study.exact(realisation, "paper") for realisation in REALISATIONS)
-    found, wrong = study.found("independent", "paper"), study.wrong("independent", "paper")
+    seen, found = (study.found(realisation, "paper") for realisation in REALISATIONS)
+    wrong = study.wrong("independent", "paper")
     lines = [
         "## What the numbers say",
         "",
@@ -108,9 +109,9 @@ def _conclusions(study: Study) -> list[str]:
             "- **As printed**, the networks name exactly the changed equations in",
             f"{_text(shared)} of the windows with shared realisations and in {_text(independent)} with independent",
             "ones:",
-            f"{_compared(shared, independent)}. On independent data they name {_text(found)} of the changed",
-            "equations, and",
-            f"in {_text(wrong)} of the windows an unchanged one: {_locating(independent, found)}.",
+            f"{_compared(shared, independent)}. Of the changed equations they name {_text(seen)} with shared and",
+            f"{_text(found)} with independent realisations: {_compared(seen, found)}. On independent data they name an",
+            f"unchanged equation in {_text(wrong)} of the windows: {_locating(independent, found)}.",
             indent="  ",
         ),
         *_by_equation(study),
