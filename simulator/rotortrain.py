@@ -45,7 +45,7 @@ def train(
     windows: Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")] = 160,
     draws: Annotated[
         int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
-    ] = 300_000,
+    ] = 150_000,
     seed: SeedOption = _SEED,
     processes: ProcessesOption = _CORES,
 ) -> None:
@@ -258,6 +258,49 @@ def peers(
             out,
             windows=windows,
             healthy=healthy,
+            false_alarm_rate=false_alarms,
+            seed=seed,
+            processes=processes,
+        )
+    except RotorwatchError as error:
+        _fail(error)
+
+
+@app.command()
+def ablate(
+    machine: MachineOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="JSON file for the numbers; the tables go beside it.")],
+    bundle: Annotated[
+        str | None,
+        typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
+    ] = None,
+    windows: Annotated[int, typer.Option(min=2, help="Evaluation windows per true change.")] = 100,
+    training: Annotated[int, typer.Option(min=4, help="Training windows of each equation.")] = 60,
+    calibration: Annotated[int, typer.Option(min=9, help="Healthy windows that set every variant's limit.")] = 199,
+    false_alarms: Annotated[
+        float, typer.Option(min=1e-6, max=0.5, help="Declared false-alarm rate per window and equation.")
+    ] = 0.01,
+    seed: SeedOption = _SEED,
+    processes: ProcessesOption = _CORES,
+) -> None:
+    """Show what each ingredient of the relation networks buys, on the same windows.
+
+    From the networks as printed to the present ones, one ingredient after the other; each one left out in turn; and a
+    linear fit, the amortised networks and the likelihood in their place.
+
+    Example: rotortrain ablate --machine lab --out ablation.json --windows 100
+    """
+    _one_thread_per_process()
+    from simulator.ablation_command import ablate_networks  # noqa: PLC0415  # start-up stays free of numpy and torch
+
+    try:
+        ablate_networks(
+            machine,
+            machine if bundle is None else bundle,
+            out,
+            windows=windows,
+            training=training,
+            calibration=calibration,
             false_alarm_rate=false_alarms,
             seed=seed,
             processes=processes,

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,21 @@ def test_round_trip(trained: EquationNetwork, tmp_path: Path) -> None:
     assert loaded.networks[0].healthy == trained.healthy
 
 
+def test_amortised_networks_survive_the_round_trip(tmp_path: Path) -> None:
+    shipped = load_bundle("lab", LAB)
+    assert shipped.amortised is not None
+    save_bundle(tmp_path / "bundle", LAB, shipped.networks, MADE, shipped.amortised)
+    loaded = load_bundle(tmp_path / "bundle", LAB).amortised
+    assert loaded is not None
+    assert loaded.calibration == shipped.amortised.calibration
+    x = np.random.default_rng(SEED).standard_normal((3, loaded.networks[0].direct.shape[0])).astype(np.float32)
+    for part, expected in zip(loaded.networks[0](x), shipped.amortised.networks[0](x), strict=True):
+        np.testing.assert_array_equal(part, expected)
+    uncalibrated = replace(shipped.amortised, calibration={})
+    with pytest.raises(BundleError, match="the amortised networks are not calibrated"):
+        save_bundle(tmp_path / "other", LAB, shipped.networks, MADE, uncalibrated)
+
+
 def test_an_uncalibrated_network_is_not_saved(trained: EquationNetwork, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="equation 28 has no healthy spread"):
         save_bundle(tmp_path, LAB, (EquationNetwork(trained.equation, trained.network, None),), MADE)
@@ -106,7 +122,7 @@ def flip_a_byte(directory: Path) -> None:
         (flip_a_byte, "sha256 is .* the manifest says"),
         (lambda d: (d / "weights.safetensors").unlink(), "not a bundle: weights.safetensors"),
         (lambda d: (d / "manifest.json").write_text("{"), "manifest.json: .*Invalid JSON"),
-        (edit_manifest(lambda m: m.update(format=2)), "format is 2, this program reads 1"),
+        (edit_manifest(lambda m: m.update(format=3)), "format is 3, this program reads 2"),
         (edit_manifest(lambda m: m.update(code="import os")), "code.*Extra inputs"),
         (edit_manifest(lambda m: m["physics"]["rotor"].update(m1_kg=0.6)), "rotor.m1_kg is 0.5, trained for 0.6"),
         (edit_manifest(lambda m: m["physics"].update(rate_hz=4000.0)), "rate_hz is 2000.0, trained for 4000.0"),
@@ -122,6 +138,15 @@ def flip_a_byte(directory: Path) -> None:
         (edit_weights(lambda a: a.update({"28.W1": np.zeros((3, 15))})), r"28: weight W1 is float64\(3, 15\)"),
         (edit_weights(lambda a: a.update({"28.b2": np.array([np.nan])})), "28: weight b2 .* expected finite"),
         (edit_weights(lambda a: a.pop("31.W2")), "31: weight W2 is missing"),
+        (edit_weights(lambda a: a.pop("amortised.29.W1")), "amortised networks: amortised.29.W1 is missing"),
+        (edit_weights(lambda a: a.pop("basis.centre")), "basis.centre is missing, expected finite float32"),
+        (edit_weights(lambda a: a.update({"basis.scale": np.ones(3)})), r"basis.scale is float64\(3,\), expected"),
+        (edit_manifest(lambda m: m["amortised"].update(layers=[8])), r"layers are \(8,\), this program expects"),
+        (edit_manifest(lambda m: m["amortised"]["calibration"].pop("e")), "calibrated are .* expected .*'e'"),
+        (
+            edit_manifest(lambda m: m["amortised"]["calibration"]["e"].update(log_deviation=[-1.0, -2.0, -3.0])),
+            "calibration of e: expected ascending log_deviation",
+        ),
     ],
 )
 def test_a_damaged_or_foreign_bundle_is_refused_and_told_why(
@@ -140,6 +165,8 @@ def test_the_shipped_bundle_is_the_documented_training_and_refuses_another_machi
     bundle = load_bundle("lab", LAB)
     assert [network.equation.number for network in bundle.networks] == ["28", "29", "30", "31"]
     assert bundle.manifest.training.seed not in {SEED}
+    assert bundle.amortised is not None
+    assert [network.equation for network in bundle.amortised.networks] == ["28", "29", "30", "31"]
     with pytest.raises(BundleError, match=r"trained for another machine than demo/heavy: .*rotor\.m1_kg is 5\.0"):
         load_bundle("lab", load_machine("heavy"))
 
