@@ -15,7 +15,7 @@ h2 { margin: 2rem 0 .3rem } h2 span { font-size: 1rem; padding: .1rem .6rem; bor
 .danger { background: #b3261e } .outside-model { background: #8a5a00 } .no-data { background: #7a3e9d }
 table { border-collapse: collapse; margin: .6rem 0 }
 td, th { padding: .2rem 1rem .2rem 0; text-align: left; border-bottom: 1px solid #dde2e7 }
-td.number { text-align: right; font-variant-numeric: tabular-nums } .raised { font-weight: bold }
+td.number { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums } .raised { font-weight: bold }
 .disagree { color: #b3261e } .note { color: #66727f }
 """
 _ROUTES = ("health", "reports", "alarms", "alarms/events", "detectable")
@@ -67,10 +67,10 @@ def _table(health: Health, raised: dict[str, Severity]) -> str:
             f"<tr{marked}><td>{html.escape(stated.text)} ({html.escape(stated.name)}){_reading(parameter, verdict)}"
             f'{others}<td class="number">{least}<td>{alarm}</tr>'
         )
-    whole = "" if verdict.settled else " since the last change"
+    since = "" if verdict.settled else " While the window straddles a change, only the data since then are read."
     return (
-        f"<table><tr><th>parameter<th>relative change{whole}<th>95 % interval{heads}<th>noticed from<th>alarm</tr>"
-        f'{rows}</table><p class="note">Decided on the likelihood; the others read the whole window beside it. '
+        f"<table><tr><th>parameter<th>relative change<th>95 % interval{heads}<th>noticed from<th>alarm</tr>{rows}"
+        f'</table><p class="note">Decided on the likelihood; the others read the whole window beside it.{since} '
         "Noticed from: smallest loss and gain that one window shows with 95 % probability.</p>"
     )
 

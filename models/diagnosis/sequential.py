@@ -30,7 +30,7 @@ from models.signals.block import FloatArray
 __all__ = ["Finding", "SequentialSettings", "SequentialState", "SequentialTest", "SequentialVerdict"]
 
 _DOUBLINGS = 6
-_CONTRADICTION_RATE = 1e-5
+_CONTRADICTION_RATE = 1e-7
 """Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data."""
 
 
@@ -48,6 +48,9 @@ class SequentialSettings:
         Hops of the short stretches, shortest first.
     false_alarms_per_month : float
         Over all parameters and lengths together.
+    short_widening : float
+        Factor on the standard errors of the short stretches: with little more than as many segments as channels the
+        stated ones are too small.
     systematic : float
         Standard error that more windows do not remove, of every parameter: an estimate on nominal values is not true to
         the last digit however long it is averaged.
@@ -57,6 +60,7 @@ class SequentialSettings:
     window_hops: int
     short_hops: tuple[int, ...] = (2, 4)
     false_alarms_per_month: float = 1.0
+    short_widening: float = 1.0
     systematic: float = 0.002
 
     @property
@@ -257,7 +261,8 @@ class SequentialTest:
         self.state.looks += 1
         window_hops = self.settings.window_hops
         window = looks[window_hops]
-        every = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}
+        widening = self.settings.short_widening
+        every = {hops: looks[hops].widened(widening) for hops in self.settings.short_hops if hops in looks}
         every[window_hops] = window
         for windows, total in self._accumulate(window).items():
             every[windows * window_hops] = total if windows == 1 else total.blurred(self.settings.systematic)
