@@ -17,7 +17,7 @@ LOG_NOISE = float(np.log(1e-3))
 _WEAK = 0.05
 """Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of
 low rank, or a channel without visible noise, leaves them undetermined."""
-_COLOUR, _SHAPE = 1.0, 1.0
+_COLOUR, _SHAPE = 1.0, 0.5
 """The same for the noise's colour and the forces' colour."""
 _CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
 """The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own

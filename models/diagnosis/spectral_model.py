@@ -6,7 +6,7 @@ The measured states' cross-spectral matrix at frequency f is
 
 with H = (-ω²M + jωP + Q)⁻¹ the receptance of Eq. (1), c the power gain of a low-pass of unknown cutoff and order, C an
 unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) what every degree of
-freedom's force has of its own colour: b_j are polynomials in log f. So the excitation may be one source of any
+freedom's force has of its own colour: b_j are polynomials in √f. So the excitation may be one source of any
 direction or many, of first or fourth order, with a cutoff each, or with a broad hump; all that is assumed of it is that
 its spectrum is smooth. The spectra are the Fourier transforms of the correlation functions of Eq. (18): this is the
 comparison of theoretical and estimated correlations with the right weight on every lag.
@@ -35,8 +35,8 @@ __all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralMod
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
 
-SHAPES = 4
-"""Polynomials in log f for the colour of every degree of freedom's force."""
+SHAPES = 5
+"""Polynomials in √f for the colour of every degree of freedom's force."""
 
 ROWS, COLUMNS = np.tril_indices(6)
 """Elements of C and T in the order of the parameter vector."""
@@ -120,12 +120,10 @@ class SpectralModel:
         self._bearing = np.array([rotor.k_by_N_per_m, rotor.c_by_N_s_per_m, rotor.k_bz_N_per_m, rotor.c_bz_N_s_per_m])
         low, high = machine.window.band_hz
         self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
-        octaves = np.log(groups.centre_hz / np.sqrt(low * high)) / np.log(np.sqrt(high / low))
-        self._b = (
-            np.stack([np.polynomial.legendre.Legendre.basis(j + 1)(octaves) for j in range(shapes)], axis=1)
-            if (shapes)
-            else np.zeros((octaves.size, 0))
-        )
+        # Over the root of frequency the polynomials resolve a low-pass at the lower and a hump at the upper end alike.
+        x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
+        polynomials = [np.polynomial.legendre.Legendre.basis(j + 1)(x) for j in range(shapes)]
+        self._b = np.reshape(polynomials, (shapes, x.size)).T
         self._w = 2 * np.pi * groups.nodes_hz
         self.cutoff_at = len(STRUCTURAL)
         self.order_at = self.cutoff_at + 1

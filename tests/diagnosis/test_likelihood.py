@@ -1,70 +1,159 @@
-"""The likelihood: derivatives, and readings of independent windows against the truth."""
+"""The likelihood: derivatives, readings of independent windows against the truth, the bound, and what is outside."""
 
 import numpy as np
 import pytest
 
+from models.diagnosis.bins import AVERAGES_PER_BIN, BinGroups, group_bins
+from models.diagnosis.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood import LikelihoodFit
 from models.diagnosis.moments import plan_for
-from models.diagnosis.spectral_model import SpectralModel
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.scoring import FisherScoring
+from models.diagnosis.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
-from models.machine import load_machine
-from simulator.campaign import Draw, Layout, Purpose, simulate_window
+from models.machine import Machine, load_machine
+from simulator.campaign import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
 
 SEED = 7_700_001
 """Of this file's windows alone: neither training, calibration nor the shipped scenarios use it."""
+
+
+def groups_of(machine: Machine, widest_hz: float = 1.0) -> BinGroups:
+    frequencies_hz = plan_for(machine).frequencies_hz
+    return group_bins(frequencies_hz, machine, np.abs(frequencies_hz - 22) < 1.6, widest_hz)
+
+
+def test_groups_hold_every_bin_once_and_average_like_their_kernel() -> None:
+    machine = load_machine("lab")
+    frequencies_hz = plan_for(machine).frequencies_hz
+    groups = groups_of(machine)
+    held = [k for first, end in groups.edges for k in range(first, end)]
+    assert held == [k for k, f in enumerate(frequencies_hz) if abs(f - 22) >= 1.6]
+    np.testing.assert_allclose(groups.weights.sum(axis=1), 1, rtol=1e-12)
+    np.testing.assert_allclose((groups.weights * groups.nodes_hz).sum(axis=1), groups.centre_hz, rtol=1e-12)
+
+
+def test_expected_segment_spectrum_of_a_line_in_noise() -> None:
+    """The kernel and the averages per bin against Hann segments of simulated white noise.
+
+    800 realisations of 59 segments: the mean over bins of the averaged periodogram's variance is known within 3 %.
+    """
+    rng = np.random.default_rng(3)
+    taper = np.hanning(65)[:-1]
+    averages = []
+    for _ in range(800):
+        x = rng.standard_normal(32 * 60)
+        pieces = np.stack([x[start : start + 64] * taper for start in range(0, x.size - 63, 32)])
+        averages.append((np.abs(np.fft.rfft(pieces, axis=1)[:, 4:28]) ** 2).mean(axis=0) / np.sum(taper**2))
+    band = np.mean(averages, axis=1)
+    count = len(range(0, 32 * 60 - 63, 32)) * 24
+    assert np.mean(averages) == pytest.approx(1, rel=0.01)
+    assert 1 / np.var(band) == pytest.approx(AVERAGES_PER_BIN * count, rel=0.15)
 
 
 def test_derivatives_of_the_spectra() -> None:
     machine, rng = load_machine("lab"), np.random.default_rng(0)
     states = plan_for(machine).states
     scale = np.where([name.endswith("dot") for name in states], 0.04, 2e-4)
-    model = SpectralModel(machine, states, np.arange(4.0, 150.0, 7.0), scale, 2.0)
+    model = SpectralModel(machine, states, groups_of(machine, 8.0), scale, 2.0)
     theta = rng.normal(0, 0.2, model.size)
-    theta[model.cutoff_at] = np.log(80)
+    theta[model.cutoff_at], theta[model.order_at] = np.log(80), np.log(2.5)
     theta[model.noise_at] -= 5
+    theta[model.level_at] += np.eye(6)[ROWS, COLUMNS]
     point = model.at(theta, 140.0)
     mixing = rng.normal(size=point.S.shape) + 1j * rng.normal(size=point.S.shape)
-    derivatives = model.whitened_derivatives(point, mixing)
-    for parameter in range(model.size):
+    slopes = model.slopes(point, mixing)
+    for parameter in range(model.level_at.start):
         step = np.zeros(model.size)
         step[parameter] = 1e-5
         difference = (model.at(theta + step, 140.0).S - model.at(theta - step, 140.0).S) / 2e-5
-        expected = mixing @ difference @ mixing.conj().swapaxes(1, 2)
-        np.testing.assert_allclose(derivatives[:, parameter], expected, atol=1e-6 * np.abs(expected).max())
+        expected = packed(mixing @ difference @ mixing.conj().swapaxes(1, 2))
+        np.testing.assert_allclose(slopes[parameter], expected, atol=1e-6 * np.abs(expected).max())
+    C = model.levels(theta)
+    for number, (row, column) in enumerate(zip(ROWS, COLUMNS, strict=True)):
+        change = np.zeros((6, 6))
+        change[row, column] = change[column, row] = 1e-5
+        T = np.linalg.cholesky(C + change)[ROWS, COLUMNS], np.linalg.cholesky(C - change)[ROWS, COLUMNS]
+        S = [model.at(np.concatenate([theta[: model.level_at.start], part]), 140.0).S for part in T]
+        expected = packed(mixing @ (S[0] - S[1]) @ mixing.conj().swapaxes(1, 2)) / 2e-5
+        np.testing.assert_allclose(slopes[model.level_at.start + number], expected, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["lab", "heavy"])
-@pytest.mark.parametrize("faults", [{}, {"k_by": -0.2}, {"c_bz": -0.3, "e": 0.2}], ids=str)
-def test_independent_sources_are_read_without_bias_and_with_honest_errors(name: str, faults: dict[str, float]) -> None:
-    """Sixteen independent windows in random conditions.
+def test_the_score_is_the_slope_of_the_likelihood() -> None:
+    """Steps follow the gradient by T, with the pulls: the value must rise along it as much as it says."""
+    machine = load_machine("lab")
+    window = simulate_window(Draw(machine, SEED, Purpose.EVALUATION, 30, layout=Layout.ONE_SOURCE), 0)
+    groups = groups_of(machine, 4.0)
+    power = np.einsum("fii->i", window.spectrum).real / window.spectrum.shape[0]
+    model = SpectralModel(machine, window.states, groups, np.sqrt(power), 1.0)
+    observed = groups.average(window.spectrum) / np.sqrt(np.outer(power, power))
+    search = FisherScoring(model, observed, window.n_segments, window.speed_rad_s, 80.0)
+    rng = np.random.default_rng(1)
+    theta = search.centre + rng.normal(0, 0.1, model.size)
+    theta[model.level_at] += np.eye(6)[ROWS, COLUMNS]
+    _, whitened = search._value(theta)
+    assert whitened is not None
+    gradient = search._scores(theta, whitened)[0]
+    for parameter in range(model.size):
+        step = np.zeros(model.size)
+        step[parameter] = 1e-5
+        slope = (search._value(theta + step)[0] - search._value(theta - step)[0]) / 2e-5
+        assert gradient[parameter] == pytest.approx(slope, rel=1e-4, abs=1e-3 * np.abs(gradient).max())
 
-    With standard errors right within 25 %, the mean of 16 z values stays within 4·1.25/√16 = 1.25 and their rms within
-    1.25·(1 + 4/√32) = 2.1, except once in ten thousand; a wrong sign or unit is tens of standard errors.
+
+def read(draw: Draw, numbers: range, faults: dict[str, float]) -> tuple[np.ndarray, list[Diagnosis]]:
+    """Errors of the readings in their own standard errors, shape (n_windows, 6)."""
+    diagnoses = [LikelihoodFit(draw.machine).diagnose(simulate_window(draw, number)) for number in numbers]
+    z = [
+        [((one.change or 0) - faults.get(one.name, 0.0)) / (one.standard_error or 1) for one in diagnosis.parameters]
+        for diagnosis in diagnoses
+    ]
+    return np.array(z), diagnoses
+
+
+def assert_honest(z: np.ndarray) -> None:
+    """Sixteen windows with right standard errors.
+
+    The mean of 16 z values stays within 4/√16 = 1 and their rms within 1 + 4/√32 = 1.7 except a few times in ten
+    thousand (and the errors may be 10 % off); a wrong sign or unit is tens of standard errors.
     """
-    draw = Draw(load_machine(name), SEED, Purpose.EVALUATION, len(faults), faults=faults, layout=Layout.INDEPENDENT)
-    z = []
-    for number in range(16):
-        estimate = LikelihoodFit(draw.machine).fit(simulate_window(draw, number))
-        truth = np.array([faults.get(parameter, 0.0) for parameter in estimate.names])
-        z.append((estimate.change - truth) / estimate.standard_error)
-        assert np.all(estimate.standard_error < 0.15)
-    assert np.all(np.abs(np.mean(z, axis=0)) < 1.25)
-    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 2.1)
+    assert np.all(np.abs(z.mean(axis=0)) < 1.1)
+    assert np.all(np.sqrt(np.mean(z**2, axis=0)) < 1.9)
 
 
 @pytest.mark.slow
-def test_one_source_of_any_direction_is_read_within_one_percent() -> None:
-    """The bound is sensor noise here, a tenth of a percent; what is left is a bias of one standard error in c."""
-    faults = {"c_by": -0.2}
-    draw = Draw(load_machine("lab"), SEED, Purpose.EVALUATION, 9, faults=faults, layout=Layout.ONE_SOURCE)
-    errors = []
-    for number in range(12):
-        estimate = LikelihoodFit(draw.machine).fit(simulate_window(draw, number))
-        errors.append(estimate.change - np.array([faults.get(parameter, 0.0) for parameter in estimate.names]))
-    assert np.all(np.median(np.abs(errors), axis=0) < 0.005)
-    assert np.max(np.abs(errors)) < 0.05  # below the level at which a parameter is called changed
+@pytest.mark.parametrize("name", ["lab", "heavy", "light"])
+@pytest.mark.parametrize("layout", Layout)
+def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: Layout) -> None:
+    faults = {"k_by": -0.2, "c_bz": -0.3, "e": 0.2}
+    draw = Draw(load_machine(name), SEED, Purpose.EVALUATION, int(layout), faults=faults, layout=layout)
+    z, diagnoses = read(draw, range(16), faults)
+    assert_honest(z)
+    assert all((diagnosis.misfit_z or 0) < 4 for diagnosis in diagnoses)
+    if layout is Layout.ONE_SOURCE:  # the bound is sensor noise here: hundredths of a percent
+        assert np.median([[one.standard_error for one in diagnosis.parameters[:2]] for diagnosis in diagnoses]) < 0.003
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("excitation", [Excitation.FOURTH_ORDER, Excitation.HUMP])
+def test_excitation_the_model_was_not_told_about(excitation: Excitation) -> None:
+    draw = Draw(load_machine("lab"), SEED, Purpose.EVALUATION, 2, layout=Layout.INDEPENDENT, excitation=excitation)
+    z, diagnoses = read(draw, range(16), {})
+    assert_honest(z)
+    assert all((diagnosis.misfit_z or 0) < 4.5 for diagnosis in diagnoses)
+
+
+@pytest.mark.slow
+def test_a_wrong_gain_and_an_added_mass_are_outside_the_model() -> None:
+    machine = load_machine("lab")
+    for number in range(4):
+        gain = Draw(machine, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
+        diagnosis = LikelihoodFit(machine).diagnose(simulate_window(gain, number))
+        assert (diagnosis.misfit_z or 0) > 5
+        assert diagnosis.suspect.startswith("gain of ")
+        mass = Draw(machine, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
+        assert (LikelihoodFit(machine).diagnose(simulate_window(mass, number)).misfit_z or 0) > 3
 
 
 def test_a_warm_start_ends_where_a_cold_one_does() -> None:
@@ -72,10 +161,11 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
     draw = Draw(machine, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT)
     first, second = simulate_window(draw, 0), simulate_window(draw, 1)
     warm = LikelihoodFit(machine)
-    warm.fit(first)
-    from_first, cold = warm.fit(second), LikelihoodFit(machine).fit(second)
-    assert from_first.steps < 20
-    assert np.all(np.abs(from_first.change - cold.change) < 0.1 * cold.standard_error)
+    warm.diagnose(first)
+    from_first, cold = warm.diagnose(second), LikelihoodFit(machine).diagnose(second)
+    assert from_first.steps <= 15
+    for one, other in zip(from_first.parameters, cold.parameters, strict=True):
+        assert abs((one.change or 0) - (other.change or 0)) < 0.4 * (other.standard_error or 0)
 
 
 def test_a_dead_channel_is_named() -> None:
@@ -88,4 +178,52 @@ def test_a_dead_channel_is_named() -> None:
     statistics = window.statistics()
     assert statistics is not None
     with pytest.raises(EstimationError, match="lab: no fluctuation in z2"):
-        LikelihoodFit(machine).fit(statistics)
+        LikelihoodFit(machine).diagnose(statistics)
+
+
+def test_the_bound_of_a_single_mass_on_a_spring() -> None:
+    """With a rigid shaft and no disc inertia the rotor is one mass per plane, and the bound has a closed form.
+
+    For a lightly damped oscillator under white force, seen without noise over a wide band, damping ratio and natural
+    frequency have relative variances 1/(2πζfT) and ζ/(2πfT) (S.-K. Au, Mech. Syst. Signal Process. 48 (2014)); with
+    c = 2ζ√(km) and k = (2πf)²m, those of k and c are 2ζ/(πfT) and, to first order in ζ, 1/(2πζfT). A finite band of
+    ±20 bandwidths costs a few percent.
+    """
+    machine = load_machine("lab")
+    mass, f_hz, damping, length_s = 1.0, 50.0, 0.01, 600.0
+    k = (2 * np.pi * f_hz) ** 2 * mass
+    c = 2 * damping * np.sqrt(k * mass)
+    rotor = machine.rotor.model_copy(
+        update={
+            "m1_kg": mass - 1e-6,
+            "m2_kg": 1e-6,
+            "I2_kg_m2": 1e-9,
+            "I2p_kg_m2": 1e-12,
+            "k_by_N_per_m": k,
+            "k_bz_N_per_m": k,
+            "c_by_N_s_per_m": c,
+            "c_bz_N_s_per_m": c,
+        }
+    )
+    window = machine.window.model_copy(update={"segment_s": 20.0, "hop_s": 10.0, "band_hz": (20.0, 80.0)})
+    sensors = tuple(one for one in machine.sensors if one.name in {"y1", "z1", "theta"})
+    single = machine.model_copy(update={"rotor": rotor, "window": window, "sensors": sensors})
+    levels = np.diag([1.0, 0, 0, 1.0, 0, 0])
+    true = TrueCondition({}, 2 * np.pi * 22, 1e5, levels, np.full(2, 1e-24), np.zeros(2))
+    bound = cramer_rao(single, ("y1", "z1"), true, length_s)
+    for plane in "yz":
+        assert bound[f"k_b{plane}"] == pytest.approx(np.sqrt(2 * damping / (np.pi * f_hz * length_s)), rel=0.06)
+        assert bound[f"c_b{plane}"] == pytest.approx(np.sqrt(1 / (2 * np.pi * damping * f_hz * length_s)), rel=0.06)
+
+
+def test_the_bound_falls_with_the_root_of_time_and_rises_with_what_is_unknown() -> None:
+    machine = load_machine("lab")
+    states = plan_for(machine).states
+    levels = np.diag([1.0, 1.0, 0, 1.0, 1.0, 0]) * 1e-4
+    noise = np.where([name.endswith("dot") for name in states], 1e-10, 1e-15)
+    true = TrueCondition({}, 138.0, 80.0, levels, noise, np.zeros(len(states)))
+    short, long = (cramer_rao(machine, states, true, length_s) for length_s in (60.0, 240.0))
+    unknown = cramer_rao(machine, states, true, 60.0, shape_known=False)
+    for name in (*STRUCTURAL, "e"):
+        assert short[name] == pytest.approx(2 * long[name], rel=1e-3)
+        assert short[name] * 0.999 < unknown[name] < 2 * short[name]
