@@ -74,27 +74,43 @@ def cells_for(fault: float, *, full: bool) -> list[EvaluationCell]:
     fault : float
         Size of the large changes: e up, everything else down.
     full : bool
-        Everything; otherwise what calibration needs: healthy windows, small changes, and each parameter alone.
+        Everything; otherwise what calibration needs: healthy windows and small changes.
     """
     large = {name: fault if name == "e" else -fault for name in PARAMETERS}
-    cells = [EvaluationCell(Topic.HEALTHY, layout=layout, windows=2.0 if full else 1.0) for layout in Layout]
-    cells += [EvaluationCell(Topic.SMALL, faults=faults, layout=layout) for faults in _SMALL for layout in Layout]
-    if not full:
-        cells += [EvaluationCell(Topic.PAPER, faults={name: large[name]}) for name in PARAMETERS]
-        return cells
-    cells += [EvaluationCell(Topic.PAPER, faults={name: large[name] for name in names}) for names in PAPER_CONDITIONS]
+    share = 1.0 if full else 0.5
+    cells = [EvaluationCell(Topic.HEALTHY, layout=layout, windows=1.6 if full else 1.0) for layout in Layout]
     cells += [
-        EvaluationCell(Topic.EXCITATION, layout=layout, excitation=excitation)
-        for excitation in Excitation
+        EvaluationCell(Topic.SMALL, faults=faults, layout=layout, windows=share)
+        for faults in _SMALL
         for layout in Layout
+    ]
+    if not full:
+        return cells
+    cells += [
+        EvaluationCell(Topic.PAPER, faults={name: large[name] for name in names}, windows=0.5)
+        for names in PAPER_CONDITIONS
+    ]
+    cells += [
+        EvaluationCell(
+            Topic.EXCITATION,
+            layout=layout,
+            excitation=excitation,
+            windows=0.6 if layout is Layout.INDEPENDENT else 0.3,
+        )
+        for layout in (Layout.INDEPENDENT, Layout.ONE_SOURCE)
+        for excitation in Excitation
         if excitation is not Excitation.SECOND_ORDER
         and not (excitation is Excitation.OWN_CUTOFFS and layout is Layout.ONE_SOURCE)
     ]
     cells += [EvaluationCell(Topic.DETECTABLE)]
-    cells += [EvaluationCell(Topic.OUTSIDE, anomaly=anomaly) for anomaly in Anomaly if anomaly is not Anomaly.NONE]
     cells += [
-        EvaluationCell(Topic.LENGTH, layout=layout, length_s=length_s, windows=share)
-        for length_s, share in _LENGTHS_S.items()
+        EvaluationCell(Topic.OUTSIDE, anomaly=anomaly, windows=0.5)
+        for anomaly in Anomaly
+        if anomaly is not Anomaly.NONE
+    ]
+    cells += [
+        EvaluationCell(Topic.LENGTH, layout=layout, length_s=length_s, windows=windows)
+        for length_s, windows in _LENGTHS_S.items()
         for layout in Layout
     ]
     return cells
