@@ -28,6 +28,10 @@ LAYERS = (256, 128, 64)
 LIMIT = 8.0
 """Inputs are clipped here, in units of their usual deviation."""
 
+_MOST_APART = 0.05
+"""Displacement and rate of one place may differ by this in the band where they agree best: one gain is wrong beyond it.
+Of 1400 simulated windows with 1 to 5 % sensor noise 99 % stay below 0.2 %; the largest is 3.2 %."""
+
 _VAGUE = 0.25
 """A parameter less certain than this is not determined by the sensors or the window."""
 
@@ -165,6 +169,9 @@ class NetworkDiagnostician:
         if inputs is None:
             absent = ", ".join(name for name in amortised.states if name not in window.states)
             return self._refused(f"not measured: {absent}")
+        apart = self._disagreement(inputs)
+        if apart:
+            return self._refused(f"displacement and rate disagree: {apart}; at most {_MOST_APART:.0%} is evaluated")
         novelty = float(amortised.basis.novelty(inputs)[0]) if np.all(np.isfinite(inputs)) else np.inf
         if not novelty <= amortised.novelty_limit:
             return self._refused(
@@ -185,6 +192,14 @@ class NetworkDiagnostician:
             readings += read
             blocks.append(covariance)
         return Diagnosis(self.by, tuple(readings), covariance=_block_diagonal(blocks))
+
+    def _disagreement(self, inputs: Float32Array) -> str:
+        """Degrees of freedom of which two sensors tell different things; empty if none."""
+        basis, n = self._amortised.basis, self._features.n_consistency
+        own = slice(basis.n_common - n, basis.n_common)
+        raw = inputs[:, own] * basis.scale[own] + basis.centre[own]
+        apart = {name: float(value[0]) for name, value in self._features.disagreement(raw).items()}
+        return ", ".join(f"{name} by {value:.0%}" for name, value in apart.items() if value > _MOST_APART)
 
     def _read(self, equation: str, mean: FloatArray, factor: FloatArray) -> tuple[list[ParameterReading], FloatArray]:
         """Readings of one equation and the covariance of those that could be made."""

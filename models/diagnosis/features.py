@@ -169,6 +169,21 @@ class ForceFeatures:
             ]
         return np.asarray(np.concatenate(parts, axis=1).reshape(n_windows, -1), dtype=np.float32)
 
+    def disagreement(self, consistency: Float32Array) -> dict[str, FloatArray]:
+        """Relative disagreement in amplitude of displacement and rate, each of shape (n_windows,), by displacement.
+
+        Of the band in which they agree best: sensor noise sets them apart in some bands, a wrong gain in all of them.
+
+        Parameters
+        ----------
+        consistency : ndarray, shape (n_windows, n)
+            From `consistency`.
+        """
+        n = len(self._twice)
+        ratio = consistency[:, 1 : 1 + _BANDS * n].reshape(-1, _BANDS, n)
+        best = np.abs(np.expm1(ratio / 2)).min(axis=1)
+        return {self.states[x]: best[:, k].astype(np.float64) for k, (x, _) in enumerate(self._twice)}
+
     def unbalance(
         self,
         spectrum: npt.NDArray[np.complexfloating],

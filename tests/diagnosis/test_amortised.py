@@ -172,8 +172,15 @@ def test_what_the_networks_cannot_judge_is_said_to_be_so() -> None:
     dead = healthy.spectrum.copy()
     dead[:, 0, :] = dead[:, :, 0] = 0.0
     assert all(
-        "unlike what the networks were trained on" in one.reason
+        one.reason.startswith("displacement and rate disagree: y1 by 100%")
         for one in reader.diagnose(replace(healthy, spectrum=dead)).parameters
+    )
+
+    strange = healthy.spectrum.copy()
+    strange[100:140] *= 1e4  # a tone as of a passing gear, in all channels
+    assert all(
+        "unlike what the networks were trained on" in one.reason
+        for one in reader.diagnose(replace(healthy, spectrum=strange)).parameters
     )
 
 
@@ -184,6 +191,7 @@ def test_a_gain_error_of_one_sensor_is_not_taken_for_a_fault() -> None:
     wrong = replace(healthy, spectrum=healthy.spectrum * np.outer(gain, gain))
     diagnosis = NetworkDiagnostician(LAB, shipped()).diagnose(wrong)
     assert not diagnosis.evaluable
+    assert "disagree: y1 by" in diagnosis.parameters[0].reason
     assert diagnosis.covariance is None or diagnosis.covariance.size == 0
 
 
