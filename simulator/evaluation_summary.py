@@ -36,6 +36,7 @@ _STRICT = ConfigDict(extra="forbid", frozen=True)
 _Z95 = 1.959964
 _RESAMPLINGS = 400
 _RESAMPLING_SEED = 20261
+_SHAFT = "EI"
 _FEWEST = 4
 """A spread of fewer windows says nothing."""
 
@@ -74,8 +75,8 @@ class ParameterSummary(BaseModel):
         Mean of reading minus truth.
     bias_in_errors : Interval
         Mean of (reading - truth) / standard error.
-    spread : float
-        Robust standard deviation of reading minus truth.
+    spread : Interval or None
+        Robust standard deviation of reading minus truth; None with too few windows.
     rms : float
         Root of the mean squared deviation from the truth.
     standard_error : float
@@ -102,7 +103,7 @@ class ParameterSummary(BaseModel):
     median: float
     bias: float
     bias_in_errors: Interval
-    spread: float
+    spread: Interval | None = None
     rms: float
     standard_error: float
     spread_in_errors: Interval | None = None
@@ -134,7 +135,10 @@ class OpinionSummary(BaseModel):
     noticed : tuple of Rate
         Declared outside the model, or a suspect named.
     claimed : tuple of Rate
-        A parameter named and the window not declared outside: in cells outside the model a confident wrong claim.
+        A bearing parameter or the unbalance named and the window not declared outside: in cells outside the model a
+        wrong claim made without reserve.
+    claimed_shaft : tuple of Rate
+        The same of the shaft alone.
     suspects : dict of str to int
         What was suspected (its size left out), most frequent first.
     misfit_z : tuple of float
@@ -155,6 +159,7 @@ class OpinionSummary(BaseModel):
     outside: tuple[Rate, ...]
     noticed: tuple[Rate, ...]
     claimed: tuple[Rate, ...]
+    claimed_shaft: tuple[Rate, ...]
     suspects: dict[str, int] = {}
     misfit_z: tuple[float, ...] = ()
     milliseconds: float
@@ -321,7 +326,8 @@ def _opinion(records: list[WindowRecord], by: str) -> OpinionSummary:
         wrong=rates(lambda record, opinion, at: bool(set(_named(opinion, at)) - set(record.truth))),
         outside=rates(lambda _, opinion, at: _outside(opinion, at)),
         noticed=rates(lambda _, opinion, at: _outside(opinion, at) or bool(opinion.suspect)),
-        claimed=rates(lambda _, opinion, at: bool(_named(opinion, at)) and not _outside(opinion, at)),
+        claimed=rates(lambda _, opinion, at: bool({*_named(opinion, at)} - {_SHAFT}) and not _outside(opinion, at)),
+        claimed_shaft=rates(lambda _, opinion, at: _named(opinion, at) == (_SHAFT,) and not _outside(opinion, at)),
         suspects=_most_frequent(opinion.suspect.split(" (")[0] for opinion in said),
         misfit_z=tuple(np.quantile(misfits, (0.05, 0.25, 0.5, 0.75, 0.95)).tolist()) if misfits else (),
         milliseconds=float(np.median([1000 * opinion.seconds for opinion in said])),
@@ -359,7 +365,7 @@ def _parameter(name: str, asked: Sequence[tuple[WindowRecord, Opinion]]) -> Para
         median=float(np.median(change)),
         bias=float(np.mean(deviation)),
         bias_in_errors=_mean(deviation / error),
-        spread=float(_robust(deviation)),
+        spread=_spread(deviation),
         rms=float(np.sqrt(np.mean(deviation**2))),
         standard_error=float(np.median(error)),
         spread_in_errors=_spread(deviation / error),
