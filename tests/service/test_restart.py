@@ -11,7 +11,7 @@ from service.api import ReportList
 from service.schemas import Health
 from tests.service.live import Program, endpoint, program, until
 
-PACE = "20"
+PACE = "8"
 
 
 def monitor(address: str, http_port: str = "0") -> tuple[str, ...]:
