@@ -15,7 +15,7 @@ from models.diagnosis.bins import BinGroups, group_bins
 from models.diagnosis.goodness import goodness_of_fit
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, ParameterReading
-from models.diagnosis.scoring import FisherScoring, Maximum
+from models.diagnosis.scoring import FisherScoring, Maximum, Workspace
 from models.diagnosis.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel
 from models.diagnosis.start import starting_point
 from models.diagnosis.unbalance import estimate_unbalance
@@ -56,6 +56,7 @@ class LikelihoodFit:
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
         self._last: FloatArray | None = None
         self._groups: dict[bytes, BinGroups] = {}
+        self._workspace = Workspace()
 
     @property
     def by(self) -> str:
@@ -158,7 +159,9 @@ class LikelihoodFit:
         return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN)
 
     def _search(self, model: SpectralModel, window: WindowStatistics, speed: float) -> FisherScoring:
-        return FisherScoring(model, _observed(model, window), window.n_segments, speed, self._usual_cutoff_hz)
+        return FisherScoring(
+            model, _observed(model, window), window.n_segments, speed, self._usual_cutoff_hz, self._workspace
+        )
 
     def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
         """Groups for a set of excluded bins, remembered while the speed stays in the same bin."""

@@ -9,7 +9,7 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, packed
 from models.signals.block import FloatArray
 
-__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened"]
+__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened", "Workspace"]
 
 LOG_NOISE = float(np.log(1e-3))
 """Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
@@ -70,6 +70,21 @@ class Maximum:
     remaining: FloatArray
 
 
+class Workspace:
+    """Large arrays that one search after the other uses: allocating them takes longer than filling them."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
+
+    def arrays(self, shape: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return two arrays of this shape with arbitrary contents."""
+        if shape not in self._arrays:
+            if len(self._arrays) >= 4:
+                self._arrays.clear()
+            self._arrays[shape] = np.empty(shape), np.empty(shape)
+        return self._arrays[shape]
+
+
 class FisherScoring:
     """Fisher scoring with Levenberg-Marquardt damping: a step counts only if the likelihood rises.
 
@@ -87,6 +102,8 @@ class FisherScoring:
     speed_rad_s : float
     usual_cutoff_hz : float
         Where the cutoff is pulled, weakly, if the band does not show it.
+    workspace : Workspace, optional
+        Shared by searches that follow each other; the slopes of a `Maximum` are valid until the next one.
     """
 
     def __init__(
@@ -96,9 +113,12 @@ class FisherScoring:
         n_segments: int,
         speed_rad_s: float,
         usual_cutoff_hz: float,
+        workspace: "Workspace | None" = None,
     ) -> None:
+        workspace = Workspace() if workspace is None else workspace
         self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
         self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
+        self._slopes, self._weighted = workspace.arrays((model.size, self.averages.size, model.n * model.n))
         self._ridge = np.full(model.size, _WEAK)
         self._ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
         self._ridge[model.colour_at] = _COLOUR
@@ -174,9 +194,9 @@ class FisherScoring:
     def _scores(self, theta: FloatArray, whitened: Whitened) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Gradient, information for the step (both by T), packed slopes, and information by C."""
         model = self._model
-        slopes = model.slopes(whitened.point, whitened.L_inverse)
+        slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
         root = np.sqrt(self.averages)[:, None]
-        weighted = (slopes * root).reshape(model.size, -1)
+        weighted = np.multiply(slopes, root, out=self._weighted).reshape(model.size, -1)
         gradient: FloatArray = weighted @ (packed(whitened.excess) * root).ravel()
         on_levels: FloatArray = weighted @ weighted.T
         levels = model.level_at

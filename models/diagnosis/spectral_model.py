@@ -195,7 +195,7 @@ class SpectralModel:
         exponent = theta[self.noise_at] + self._noise_shape[:, None] * theta[self.colour_at]
         return np.asarray(np.exp(exponent), dtype=np.float64)
 
-    def slopes(self, point: ModelPoint, L_inverse: ComplexArray) -> FloatArray:
+    def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
         """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed; the last 21 are by the elements of C, not of T.
 
         With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of
@@ -206,6 +206,8 @@ class SpectralModel:
         point : ModelPoint
         L_inverse : ndarray, shape (n_groups, n, n)
             Inverse Cholesky factors of the spectra.
+        out : ndarray, shape (size, n_groups, n²), optional
+            Where to put them: megabytes, better not allocated at every step.
 
         Returns
         -------
@@ -214,7 +216,8 @@ class SpectralModel:
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G
         response = whitened @ point.C
-        out = np.empty((self.size, self._w.shape[0], self.n * self.n))
+        if out is None:
+            out = np.empty((self.size, self._w.shape[0], self.n * self.n))
         dynamic_change = self._bearing * np.exp(theta[:4])
         for parameter, dof in enumerate(_BEARING_DOFS):
             factor = -dynamic_change[parameter] * (1j * self._w if parameter % 2 else np.ones_like(self._w))
@@ -234,7 +237,9 @@ class SpectralModel:
             force = whitened[..., dof].transpose(0, 2, 1) @ response[..., dof].conj()
             slope = twice_packed(force) / 2
             out[self.shape_at][dof::6] = self._b.T[:, :, None] * slope
-        out[self.level_at] = self._level_slopes(whitened)
+        for number, (row, column) in enumerate(zip(ROWS, COLUMNS, strict=True)):
+            pair = whitened[..., row].transpose(0, 2, 1) @ whitened[..., column].conj()
+            out[self.level_at.start + number] = twice_packed(pair) * (0.5 if row == column else 1.0)
         return out
 
     def local_slope(
@@ -261,14 +266,6 @@ class SpectralModel:
         u = whitened[..., row] / (self.force_unit[row] * point.colour[:, None, None, row]) * factor[..., None]
         v = (response @ point.H[:, :, column].conj()[..., None])[..., 0]
         return twice_packed(u.transpose(0, 2, 1) @ v.conj())
-
-    def _level_slopes(self, whitened: ComplexArray) -> FloatArray:
-        """Packed slopes by the 21 elements of C, shape (21, n_groups, n²)."""
-        n_groups, n_nodes = self._w.shape
-        flat = whitened.reshape(n_groups, n_nodes, self.n * 6)
-        products = (flat.transpose(0, 2, 1) @ flat.conj()).reshape(n_groups, self.n, 6, self.n, 6)
-        pairs = products[:, :, ROWS, :, COLUMNS]
-        return twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
 
 
 def packed(matrices: ComplexArray) -> FloatArray:
