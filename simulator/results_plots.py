@@ -26,6 +26,8 @@ _LOOK = {
 }
 _OF_LAYOUT = {Layout.ONE_SOURCE: (COLOURS[1], "s"), Layout.INDEPENDENT: (COLOURS[0], "o")}
 _KINDS = {"bearing stiffness": ("k_by", "k_bz"), "bearing damping": ("c_by", "c_bz"), "unbalance": ("e",)}
+_FEWEST = 50
+"""Cells of fewer windows have no coverage worth a point."""
 _CHANGED = (Topic.HEALTHY, Topic.SMALL, Topic.PAPER)
 
 
@@ -103,7 +105,7 @@ def _detection(summary: Summary) -> Figure:
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
     figure.supxlabel("true change, % (stiffness and damping down, unbalance up)", fontsize=9)
-    figure.supylabel(f"windows in which it is named at {RATES[0]:.0%} false alarms, %", fontsize=9)
+    figure.supylabel(f"windows in which it is named at {100 * RATES[0]:g} % false alarms, %", fontsize=9)
     _legend(figure, summary)
     return figure
 
@@ -122,9 +124,10 @@ def _coverage(summary: Summary) -> Figure:
                 if every is None:
                     continue
                 at = _offset(x, n, summary)
+                large = [100 * one.covered.rate for one in read if one.n >= _FEWEST]
                 axes.plot(
-                    np.linspace(at - 0.05, at + 0.05, len(read)),
-                    [100 * one.covered.rate for one in read],
+                    np.linspace(at - 0.05, at + 0.05, len(large)),
+                    large,
                     linestyle="",
                     marker=".",
                     markersize=3,
@@ -135,7 +138,7 @@ def _coverage(summary: Summary) -> Figure:
         axes.set_xticks(range(len(PARAMETERS)), PARAMETERS)
         axes.set_title(f"{LAYOUT_TEXT[layout]}, {_count(cells)} windows", loc="left")
     figure.axes[0].set_ylabel("windows whose 95 % interval holds the truth, %")
-    _legend(figure, summary, ("stated; grey 93–97 %", "--"))
+    _legend(figure, summary, ("stated; grey: 93–97 %", "--"))
     return figure
 
 
@@ -193,9 +196,9 @@ def _false_alarms(summary: Summary) -> Figure:
             [f"{LAYOUT_TEXT[one]}\n{_count(cells[one])} windows" for one in Layout] if at == 0 else [],
         )
         axes.set_ylim(-0.5, len(Layout) - 0.5)
-        axes.set_xlim(left=0)
+        axes.set_xlim(left=-0.02 * axes.get_xlim()[1])
         axes.set_xlabel("healthy windows with a parameter named, %")
-        axes.set_title(f"{RATES[at]:.1%} declared", loc="left")
+        axes.set_title(f"{100 * RATES[at]:g} % declared", loc="left")
     _legend(figure, summary, ("declared", "--"))
     return figure
 
@@ -245,7 +248,7 @@ def _outside(summary: Summary) -> Figure:
         ("flagged outside the model", COLOURS[0]),
         ("not evaluable", "#bbbbbb"),
         ("nothing said", "#eeeeee"),
-        ("shaft claimed", COLOURS[4]),
+        ("shaft claimed", COLOURS[3]),
         ("bearing or unbalance claimed", COLOURS[1]),
     )
     for y, cell in enumerate(cells):
@@ -263,13 +266,16 @@ def _outside(summary: Summary) -> Figure:
             right.barh(y, share, left=start, color=colour, height=0.75, edgecolor="#888888", linewidth=0.4)
             start += share
     left.set_xscale("symlog", linthresh=4)
-    left.set_xticks([-2, 0, 2, 4, 10, 30, 100], ["−2", "0", "2", "4", "10", "30", "100"])
+    left.set_xticks([-2, 0, 2, 4, 10, 30, 100, 300], ["−2", "0", "2", "4", "10", "30", "100", "300"])
+    left.minorticks_off()
+    right.set_axisbelow(True)
+    right.grid(visible=False)
     left.axvline(2.326, color="black", linewidth=0.9, linestyle="--")
     left.annotate("1 %", (2.326, 1), xycoords=("data", "axes fraction"), ha="center", va="bottom", fontsize=8)
     left.set_yticks(range(len(cells)), [f"{_kind(cell)}, {LAYOUT_TEXT[cell.layout]}" for cell in cells])
     left.set_ylim(len(cells) - 0.5, -0.5)
     left.set_xlabel("misfit, standard normal in the model (5–95 %, quartiles, median)")
-    right.set_xlabel(f"windows, % (at {RATES[0]:.0%} false alarms)")
+    right.set_xlabel(f"windows, % (at {100 * RATES[0]:g} % false alarms)")
     right.tick_params(labelleft=False)
     handles = [right.barh([0], [0], color=colour, edgecolor="#888888", label=text) for text, colour in verdicts]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8)
