@@ -309,6 +309,33 @@ def ablate(
         _fail(error)
 
 
+@app.command()
+def delay(
+    machine: MachineOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="JSON file for the numbers; table and figure go beside it.")],
+    trials: Annotated[
+        int, typer.Option(min=2, help="Streams per change with independent sources, at the machine's own hop.")
+    ] = 60,
+    others: Annotated[
+        int, typer.Option(min=2, help="Streams per change with one source, and with independent ones at a hop of 2 s.")
+    ] = 20,
+    seed: SeedOption = _SEED,
+    processes: ProcessesOption = _CORES,
+    redraw: Annotated[bool, typer.Option("--redraw", help="Table and figure again from the numbers in --out.")] = False,
+) -> None:
+    """Measure how long after a step change the monitor's test finds it, beside the time the Cramér-Rao bound allows.
+
+    Example: rotortrain delay --machine lab --out delay.json
+    """
+    _one_thread_per_process()
+    from simulator.delay_command import time_detection  # noqa: PLC0415  # start-up stays free of numpy and torch
+
+    try:
+        time_detection(machine, out, trials=trials, others=others, seed=seed, processes=processes, redraw=redraw)
+    except RotorwatchError as error:
+        _fail(error)
+
+
 def _one_thread_per_process() -> None:
     """Keep the linear algebra to one thread: the workers are processes. Takes effect before numpy is first imported."""
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
