@@ -105,7 +105,7 @@ def cramer_rao(
     ratio = np.exp(theta[: len(STRUCTURAL)])
     bound = dict(zip(STRUCTURAL, (ratio * np.sqrt(np.diag(covariance))).tolist(), strict=True))
     synchronous = np.zeros(len(states), dtype=np.complex128)
-    e = estimate_unbalance(machine, model, theta, covariance, synchronous, true.speed_rad_s, duration_s)
+    e = estimate_unbalance(machine, model, point, covariance, synchronous, true.speed_rad_s, duration_s)
     return bound | {"e": float(np.sqrt(e.variance))}
 
 

@@ -103,7 +103,13 @@ class LikelihoodFit:
         names: tuple[str, ...] = STRUCTURAL
         if window.synchronous is not None:
             e = estimate_unbalance(
-                self._machine, model, theta, structural, window.synchronous, speed, window.duration_s
+                self._machine,
+                model,
+                found.whitened.point,
+                structural,
+                window.synchronous,
+                speed,
+                window.duration_s,
             )
             names, change = (*names, "e"), np.append(change, e.change)
             cross = (e.covariance * ratio)[:, None]

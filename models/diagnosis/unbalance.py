@@ -6,7 +6,7 @@ import numpy as np
 
 from models.diagnosis.bins import BinGroups
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.spectral_model import STRUCTURAL, SpectralModel
+from models.diagnosis.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
@@ -33,7 +33,7 @@ class Unbalance:
 def estimate_unbalance(
     machine: Machine,
     model: SpectralModel,
-    theta: FloatArray,
+    point: ModelPoint,
     covariance: FloatArray,
     synchronous: ComplexArray,
     speed_rad_s: float,
@@ -48,8 +48,8 @@ def estimate_unbalance(
     ----------
     machine : Machine
     model : SpectralModel
-    theta : ndarray, shape (size,)
-        Parameter point of `model`.
+    point : ModelPoint
+        The model's spectra at the estimate.
     covariance : ndarray, shape (5, 5)
         Of the logarithmic ratios of the structural parameters.
     synchronous : ndarray of complex, shape (n,)
@@ -70,13 +70,13 @@ def estimate_unbalance(
         vectors = model.measured(model.receptance(ratios, speed_rad_s, w) @ force[:, None], w)
         return np.asarray(vectors[0, :, 0], dtype=np.complex128)
 
-    structural = theta[: len(STRUCTURAL)]
+    structural = point.theta[: len(STRUCTURAL)]
     g = response(structural)
     step = 1e-5
     slopes = np.stack(
         [response(structural + step * unit) - response(structural - step * unit) for unit in np.eye(len(STRUCTURAL))]
     ) / (2 * step)
-    noise = 4 * _around_rotation(machine, model, theta, speed_rad_s, duration_s) / duration_s
+    noise = 4 * _around_rotation(machine, model, point, speed_rad_s, duration_s) / duration_s
     q = synchronous / model.scale
     e_ratio = float(np.real(np.vdot(g, np.linalg.solve(noise, q))) / np.real(np.vdot(g, np.linalg.solve(noise, g))))
     # Real representation: the structural uncertainty moves real and imaginary parts together.
@@ -92,20 +92,25 @@ def estimate_unbalance(
 
 
 def _around_rotation(
-    machine: Machine, model: SpectralModel, theta: FloatArray, speed_rad_s: float, duration_s: float
+    machine: Machine, model: SpectralModel, point: ModelPoint, speed_rad_s: float, duration_s: float
 ) -> ComplexArray:
     """Stochastic cross-spectrum under the kernel of a plain window of the given length, centred on Ω, shape (n, n).
 
     On the frequencies Ω ± (k + ½)/T the kernel has the weights 1/(π(k + ½))². Its tails are long: with one source, what
-    they let in from a resonance is more than the sensor noise. Far from Ω many k are taken together.
+    they let in from a resonance is more than the sensor noise. Beyond the excluded neighbourhood the mean kernel
+    1/(2π²T (f - Ω)²) is applied to the groups' own spectra.
     """
-    edges = np.unique(np.concatenate([np.arange(8), np.geomspace(8, 10 * duration_s, 24).astype(int)]))
-    cumulated = np.concatenate([[0.0], np.cumsum((np.pi * (np.arange(edges[-1]) + 0.5)) ** -2.0)])
-    weights, offsets = np.diff(cumulated[edges]), np.sqrt((edges[:-1] + 0.5) * (edges[1:] - 0.5)) / duration_s
+    groups = model.groups
     centre_hz = speed_rad_s / (2 * np.pi)
-    nodes_hz = np.concatenate([centre_hz - offsets, centre_hz + offsets])
-    both = np.concatenate([weights, weights])[np.newaxis] / (2 * weights.sum())
-    one = BinGroups(((0, 1),), np.ones(1), np.array([centre_hz]), np.abs(nodes_hz)[np.newaxis], both)
+    distance_hz = np.abs(groups.centre_hz - centre_hz)
+    spacing_hz = 1 / machine.window.segment_s
+    edge_hz = max(float(np.min(distance_hz - groups.bins * spacing_hz / 2)), spacing_hz)
+    k = np.arange(max(1, round(edge_hz * duration_s))) + 0.5
+    weights = np.concatenate([np.ones(2)[:, None] * (np.pi * k) ** -2.0]).ravel()
+    nodes_hz = np.abs(np.concatenate([centre_hz - k / duration_s, centre_hz + k / duration_s]))
+    near = BinGroups(((0, 1),), np.ones(1), np.array([centre_hz]), nodes_hz[np.newaxis], weights[np.newaxis])
     force_scale = float(model.force_unit[0])
-    seen = SpectralModel(machine, model.states, one, model.scale, force_scale, model.shapes).at(theta, speed_rad_s)
-    return np.asarray(seen.S[0], dtype=np.complex128)
+    at_speed = SpectralModel(machine, model.states, near, model.scale, force_scale, model.shapes)
+    far = groups.bins * spacing_hz / (2 * np.pi**2 * duration_s * np.maximum(distance_hz, edge_hz) ** 2)
+    seen = at_speed.at(point.theta, speed_rad_s).S[0] + np.tensordot(far, point.S, axes=1)
+    return np.asarray(seen, dtype=np.complex128)
