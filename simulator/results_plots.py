@@ -257,7 +257,7 @@ def _outside(summary: Summary) -> Figure:
             low, quarter, median, three, high = one.misfit_z
             left.plot([low, high], [y, y], color=COLOURS[0], linewidth=1.2)
             left.plot([quarter, three], [y, y], color=COLOURS[0], linewidth=5, solid_capstyle="butt")
-            left.plot([median], [y], color="white", marker="|", markersize=7)
+            left.plot([median], [y], "o", color=COLOURS[0], markeredgecolor="white", markersize=6)
         counts = [one.outside[0].count, one.refused, 0, one.claimed_shaft[0].count, one.claimed[0].count]
         counts[2] = one.n - sum(counts)
         start = 0.0
