@@ -9,7 +9,6 @@ the same calibration windows.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import partial
 from typing import TypeVar
 
@@ -18,9 +17,9 @@ from pydantic import BaseModel, ConfigDict
 
 from models.diagnosis.amortised import NetworkDiagnostician
 from models.diagnosis.bundle import Bundle
-from models.diagnosis.equations import EQUATIONS, Equation, EquationRows, StatisticsView, SynchronousEquation
+from models.diagnosis.equations import EQUATIONS
 from models.diagnosis.likelihood import LikelihoodFit
-from models.diagnosis.networks import EquationNetwork, Network, read_equation, window_view
+from models.diagnosis.networks import EquationNetwork, read_equation, window_view
 from models.diagnosis.paper import PAPER_EQUATIONS, PaperEquation, PaperNetwork, mean_squared_deviation
 from models.diagnosis.paper_training import train_paper_network
 from models.diagnosis.readings import Diagnostician
@@ -28,23 +27,22 @@ from models.diagnosis.training import train_network
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.signals.block import FloatArray
+from simulator.ablation_variants import (
+    VARIANTS,
+    Measure,
+    Reader,
+    Variant,
+    VariantEquation,
+    as_seen,
+    equation_numbered,
+    linear_fit,
+    variant_equation,
+)
 from simulator.campaign import Draw, Layout, Purpose, simulate_window
 from simulator.opinions import opinion_of
 from simulator.rates import Rate
 
-__all__ = [
-    "FAULTS",
-    "VARIANTS",
-    "Ablation",
-    "AblationPlan",
-    "AblationRow",
-    "LinearRelation",
-    "Measure",
-    "Variant",
-    "VariantEquation",
-    "run_ablation",
-]
+__all__ = ["FAULTS", "Ablation", "AblationPlan", "AblationRow", "run_ablation"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 _S = TypeVar("_S")
@@ -69,202 +67,6 @@ _SCALE_QUANTILE = 0.9
 _MAD = 1.4826
 _EVERY_LAG = 3
 """Training takes every third lag: neighbours 1 ms apart are nearly the same numbers, up to 150 Hz."""
-
-
-class Measure(StrEnum):
-    """What is made of the residual."""
-
-    MSD = "mean squared deviation"
-    PROJECTION = "projection on the signatures"
-    OWN_ERROR = "projection in block standard errors"
-
-
-class Reader(StrEnum):
-    """Who reads the window."""
-
-    PAPER = "paper"
-    NETWORK = "network"
-    LINEAR = "linear fit"
-    SHIPPED = "shipped network"
-    AMORTISED = "amortised network"
-    LIKELIHOOD = "likelihood"
-
-
-@dataclass(frozen=True, slots=True)
-class Variant:
-    """One row of the table, and what of it is switched on.
-
-    Attributes
-    ----------
-    group, label : str
-        Part of the table, and what distinguishes the row.
-    equations : tuple of str
-        Equations it exists for.
-    reader : Reader
-    synchronous_out : bool
-        Rotation-synchronous part removed.
-    long_lags : bool
-        Lags from ``lag_from_s`` on, not from zero.
-    normalised : bool
-        Every window divided by the rms of its target.
-    every_reference : bool
-        All measured displacements as references, not y1 alone.
-    tilt_out : bool
-        The disc's acceleration among the inputs.
-    speed_powers : bool
-        Powers of Ω among the inputs of equation 29.
-    varied : bool
-        Trained on windows in which everything else varies, not on one condition.
-    measure : Measure
-    """
-
-    group: str
-    label: str
-    equations: tuple[str, ...] = ("28", "31")
-    reader: Reader = Reader.NETWORK
-    synchronous_out: bool = True
-    long_lags: bool = True
-    normalised: bool = True
-    every_reference: bool = True
-    tilt_out: bool = True
-    speed_powers: bool = True
-    varied: bool = True
-    measure: Measure = Measure.OWN_ERROR
-
-    @property
-    def network_key(self) -> "Variant":
-        """The same for all variants that share a trained network."""
-        return replace(self, group="", label="", equations=(), measure=Measure.MSD)
-
-
-_PRINTED = Variant(
-    "one after the other",
-    "as printed",
-    equations=("28", "29", "31"),
-    reader=Reader.PAPER,
-    synchronous_out=False,
-    long_lags=False,
-    normalised=False,
-    every_reference=False,
-    tilt_out=False,
-    varied=False,
-    measure=Measure.MSD,
-)
-_OUT = replace(_PRINTED, label="+ synchronous part removed", equations=("28", "31"), reader=Reader.NETWORK)
-_OUT = replace(_OUT, synchronous_out=True)
-_LAGS = replace(_OUT, label="+ lags beyond the excitation's memory", long_lags=True)
-_NORMALISED = replace(_LAGS, label="+ every window normalised", normalised=True)
-_REFERENCES = replace(_NORMALISED, label="+ all measured references", every_reference=True)
-_TILT = replace(_REFERENCES, label="+ tilt eliminated", tilt_out=True)
-_VARIED = replace(_TILT, label="+ trained while everything else varies", varied=True)
-_PROJECTED = replace(_VARIED, label="+ projection on the signatures", measure=Measure.PROJECTION)
-_PRESENT = replace(_PROJECTED, label="+ block standard error (the present one)", measure=Measure.OWN_ERROR)
-
-_ALL = ("28", "29", "31")
-_29 = replace(_VARIED, equations=("29",))
-_WITHOUT = replace(_PRESENT, group="the present one without")
-_BESIDE = replace(_PRESENT, group="in its place", equations=_ALL)
-
-VARIANTS: tuple[Variant, ...] = (
-    _PRINTED,
-    _OUT,
-    _LAGS,
-    _NORMALISED,
-    _REFERENCES,
-    _TILT,
-    replace(_29, label="+ phase reference as the reference", varied=False, speed_powers=False),
-    replace(_29, label="+ powers of Ω among the inputs", varied=False),
-    replace(_VARIED, equations=_ALL),
-    replace(_PROJECTED, equations=_ALL),
-    replace(_PRESENT, equations=_ALL),
-    replace(_WITHOUT, label="synchronous part removed", synchronous_out=False),
-    replace(_WITHOUT, label="lags beyond the excitation's memory", long_lags=False),
-    replace(_WITHOUT, label="normalisation", normalised=False),
-    replace(_WITHOUT, label="all references (y1 alone)", every_reference=False),
-    replace(_WITHOUT, label="tilt eliminated", tilt_out=False),
-    replace(_WITHOUT, label="powers of Ω among the inputs", equations=("29",), speed_powers=False),
-    replace(_WITHOUT, label="varied training (one condition)", equations=_ALL, varied=False),
-    replace(_WITHOUT, label="projection (MSD)", equations=_ALL, measure=Measure.MSD),
-    replace(_WITHOUT, label="block standard error", equations=_ALL, measure=Measure.PROJECTION),
-    replace(_BESIDE, label="as printed, trained while everything else varies", reader=Reader.PAPER, varied=True),
-    replace(_BESIDE, label="linear fit", reader=Reader.LINEAR),
-    replace(_BESIDE, label="linear fit, one condition", reader=Reader.LINEAR, varied=False),
-    replace(_BESIDE, label="shipped relation network", reader=Reader.SHIPPED),
-    replace(_BESIDE, label="amortised network", reader=Reader.AMORTISED),
-    replace(_BESIDE, label="likelihood", reader=Reader.LIKELIHOOD),
-)
-"""The rows of the table."""
-
-
-class _LevelRows(EquationRows):
-    """Rows that are not divided by their own target."""
-
-    __slots__ = ()
-
-    @property
-    def norm(self) -> float:
-        """The rows come in units of the training windows' target."""
-        return 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class VariantEquation(Equation):
-    """Equation 28 or 31 with some of its references, and in fixed units if it is not normalised.
-
-    Attributes
-    ----------
-    references : int
-        How many of y1, y2, z1, z2.
-    unit : float or None
-        Unit of target, inputs and signatures; None divides every window by its own target.
-    """
-
-    references: int = 4
-    unit: float | None = None
-
-    def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
-        """Rows of one view, one per lag and reference kept."""
-        rows = Equation.rows(self, view, machine)
-        kept = np.arange(rows.target.size).reshape(-1, 4)[:, : self.references].ravel()
-        parts = (rows.inputs[kept], rows.target[kept], rows.signatures[kept])
-        if self.unit is None:
-            return EquationRows(*parts)
-        return _LevelRows(*(part / self.unit for part in parts))
-
-
-@dataclass(frozen=True, slots=True)
-class _FixedSpeedEquation(SynchronousEquation):
-    """Equation 29 without powers of Ω among its inputs."""
-
-    def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
-        """Rows of one view."""
-        rows = SynchronousEquation.rows(self, view, machine)
-        speed2 = (view.speed_rad_s / machine.operation.speed_rad_s) ** 2
-        inputs = rows.inputs[:, (0, 3, 4)] / np.array([1.0, speed2, speed2])
-        return EquationRows(inputs, rows.target, rows.signatures)
-
-
-@dataclass(frozen=True, slots=True)
-class LinearRelation(Network):
-    """A linear map in the network's place; `W2` and `b2` alone are used."""
-
-    def __call__(self, inputs: FloatArray) -> FloatArray:
-        """Output for each row of inputs, shape (n_rows,)."""
-        return np.asarray(inputs / self.input_scale @ self.W2 + self.b2[0], dtype=np.float64)
-
-
-def _linear_fit(
-    equation: Equation | SynchronousEquation, windows: Sequence[WindowStatistics], machine: Machine
-) -> Network:
-    """Least squares on the rows that a network would be trained on."""
-    rows = [equation.rows(window_view(window, machine), machine) for window in windows]
-    inputs = np.concatenate([row.inputs / row.norm for row in rows])
-    target = np.concatenate([row.target / row.norm for row in rows])
-    scale = np.sqrt(np.mean(inputs**2, axis=0))
-    design = np.column_stack([inputs / scale, np.ones(target.size)])
-    weights = np.linalg.lstsq(design, target, rcond=None)[0]
-    none = np.zeros(0)
-    return LinearRelation(scale, none, none, weights[:-1], weights[-1:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,7 +197,7 @@ def run_ablation(plan: AblationPlan, processes: int, progress: Callable[[str, in
     numbers = sorted({number for variant in plan.variants for number in variant.equations})
     draws = {
         number: Draw(
-            plan.machine, plan.seed, Purpose.TRAINING, int(number), kept_nominal=_equation(number).kept_nominal
+            plan.machine, plan.seed, Purpose.TRAINING, int(number), kept_nominal=equation_numbered(number).kept_nominal
         )
         for number in numbers
     }
@@ -462,10 +264,6 @@ def run_ablation(plan: AblationPlan, processes: int, progress: Callable[[str, in
     )
 
 
-def _equation(number: str) -> Equation | SynchronousEquation:
-    return next(equation for equation in EQUATIONS if equation.number == number)
-
-
 def _training_window(job: tuple[Draw, int]) -> WindowStatistics:
     """Simulate one window and keep what training looks at."""
     window = simulate_window(*job)
@@ -478,38 +276,6 @@ def _training_window(job: tuple[Draw, int]) -> WindowStatistics:
     )
 
 
-def _first(function: Callable[..., tuple[float, ...]], count: int, rotor: object) -> tuple[float, ...]:
-    return function(rotor)[:count]
-
-
-def _build(variant: Variant, number: str) -> Equation | SynchronousEquation:
-    """The variant's equation, still without a unit."""
-    equation = _equation(number)
-    if isinstance(equation, SynchronousEquation):
-        kind = SynchronousEquation if variant.speed_powers else _FixedSpeedEquation
-        return kind(equation.number, equation.title)
-    count = len(equation.inputs) if variant.tilt_out else len(equation.inputs) - 1
-    return VariantEquation(
-        number=equation.number,
-        title=equation.title,
-        target=equation.target,
-        inputs=equation.inputs[:count],
-        signatures={name: partial(_first, function, count) for name, function in equation.signatures.items()},
-        references=4 if variant.every_reference else 1,
-    )
-
-
-def _seen(variant: Variant, window: WindowStatistics) -> WindowStatistics:
-    """The window with the rotation-synchronous part put back where the variant does not remove it (Eqs. 17-18)."""
-    if variant.synchronous_out or window.synchronous is None:
-        return window
-    q = window.synchronous
-    turn = np.exp(1j * window.speed_rad_s * window.lags_s)
-    part = 0.5 * np.real(np.conj(q)[None, :, None] * q[None, None, :] * turn[:, None, None])
-    hops = window.hop_correlation
-    return replace(window, correlation=window.correlation + part, hop_correlation=hops + part if hops.size else hops)
-
-
 def _train(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) -> _Trained:
     """Fit one variant of one equation."""
     variant, number, windows, machine, seed = task
@@ -518,13 +284,13 @@ def _train(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) 
     if not variant.long_lags:
         settings = machine.window.model_copy(update={"lag_from_s": 0.0})
         machine = machine.model_copy(update={"window": settings})
-    windows = [_seen(variant, window) for window in windows]
-    equation = _build(variant, number)
+    windows = [as_seen(variant, window) for window in windows]
+    equation = variant_equation(variant, number)
     if isinstance(equation, VariantEquation) and not variant.normalised:
         norms = [equation.rows(window_view(window, machine), machine).norm for window in windows]
         equation = replace(equation, unit=float(np.sqrt(np.mean(np.square(norms)))))
     if variant.reader is Reader.LINEAR:
-        relation = EquationNetwork(equation, _linear_fit(equation, windows, machine), None)
+        relation = EquationNetwork(equation, linear_fit(equation, windows, machine), None)
     else:
         relation = train_network(equation, windows, machine, seed)
     return _Trained(variant, machine, relation, None)
@@ -560,7 +326,7 @@ def _readings(one: _Trained, window: WindowStatistics) -> dict[Measure, _Reading
     if one.paper is not None:
         return {Measure.MSD: _Reading({"msd": mean_squared_deviation(one.paper, window, one.machine)}, {})}
     assert one.relation is not None  # noqa: S101  # one of the two is there by construction
-    window = _seen(one.variant, window)
+    window = as_seen(one.variant, window)
     reading = read_equation(one.relation, window, one.machine)
     rows = one.relation.equation.rows(window_view(window, one.machine), one.machine)
     power = float(np.mean((rows.target / rows.norm) ** 2))  # 1 where the window is normalised
@@ -619,7 +385,7 @@ def _row(
 
     rank = int(np.ceil((len(healthy) + 1) * (1 - plan.false_alarm_rate) - 1e-9))
     limit = float(np.sort([leading(one[key])[1] for one in healthy])[rank - 1]) * (1 + 1e-12)
-    own = _equation(number).parameters
+    own = equation_numbered(number).parameters
     detected, named, reads = {}, {}, {}
     spread: dict[str, float] = {}
     false_alarms, elsewhere = Rate.of_counts(0, plan.windows), [0, 0]

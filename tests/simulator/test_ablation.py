@@ -1,0 +1,116 @@
+"""The ablation: variants are what they say, and a tiny table comes out as it must."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.diagnosis.bundle import load_bundle
+from models.diagnosis.equations import EQUATIONS
+from models.diagnosis.networks import window_view
+from models.diagnosis.paper import full_correlation
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import load_machine
+from simulator.ablation import AblationPlan, run_ablation
+from simulator.ablation_command import ablation_tables
+from simulator.ablation_variants import (
+    VARIANTS,
+    Measure,
+    Reader,
+    Variant,
+    as_seen,
+    linear_fit,
+    variant_equation,
+)
+from simulator.campaign import Draw, Purpose, simulate_window
+
+LAB = load_machine("lab")
+BUNDLE = load_bundle("lab", LAB)
+SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
+PRESENT = next(variant for variant in VARIANTS if variant.label.endswith("(the present one)"))
+
+
+@pytest.fixture(scope="module")
+def window() -> WindowStatistics:
+    return simulate_window(Draw(SHORT, 41, Purpose.EVALUATION), 0)
+
+
+@pytest.mark.parametrize("number", ["28", "29", "31"])
+def test_the_variant_with_everything_on_is_the_equation_of_the_table(window: WindowStatistics, number: str) -> None:
+    equation = next(one for one in EQUATIONS if one.number == number)
+    rows = variant_equation(PRESENT, number).rows(window_view(window, SHORT), SHORT)
+    expected = equation.rows(window_view(window, SHORT), SHORT)
+    for name in ("inputs", "target", "signatures"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(expected, name))
+
+
+def test_y1_alone_without_tilt_is_the_printed_equation_28(window: WindowStatistics) -> None:
+    variant = replace(PRESENT, every_reference=False, tilt_out=False)
+    view = window_view(window, SHORT)
+    rows = variant_equation(variant, "28").rows(view, SHORT)
+    R, at = view.correlation, view.states.index
+    printed = np.stack([R[:, at("y1"), at(name)] for name in ("y1", "y2", "y1_dot")], axis=1)
+    np.testing.assert_array_equal(rows.inputs, printed)
+    np.testing.assert_array_equal(rows.target, R[:, at("y1_dot"), at("y1_dot")])
+    k_over_m = LAB.rotor.k_by_N_per_m / LAB.rotor.m1_kg
+    np.testing.assert_allclose(rows.signatures[:, 0], k_over_m * printed[:, 0])
+
+
+def test_a_unit_takes_the_place_of_the_norm(window: WindowStatistics) -> None:
+    view = window_view(window, SHORT)
+    equation = variant_equation(PRESENT, "28")
+    rows = equation.rows(view, SHORT)
+    in_unit = replace(equation, unit=2 * rows.norm).rows(view, SHORT)  # type: ignore[call-arg]  # 28 has a unit
+    assert in_unit.norm == 1
+    np.testing.assert_allclose(in_unit.target, rows.target / (2 * rows.norm))
+
+
+def test_the_synchronous_part_is_put_back_as_the_paper_has_it(window: WindowStatistics) -> None:
+    seen = as_seen(replace(PRESENT, synchronous_out=False), window)
+    i, j = window.states.index("y1"), window.states.index("z2")
+    np.testing.assert_allclose(seen.correlation[:, i, j], full_correlation(window, "y1", "z2"))
+    assert as_seen(PRESENT, window) is window
+
+
+def test_the_linear_fit_leaves_nothing_that_its_inputs_explain(window: WindowStatistics) -> None:
+    equation = variant_equation(PRESENT, "31")
+    rows = equation.rows(window_view(window, SHORT), SHORT)
+    fit = linear_fit(equation, [window], SHORT)
+    residual = rows.target / rows.norm - fit(rows.inputs / rows.norm)
+    projected = (rows.inputs / np.linalg.norm(rows.inputs, axis=0)).T @ residual
+    assert np.abs(projected).max() < 1e-8
+    assert 0 < np.mean(residual**2) < 0.2
+
+
+def _plan(variants: tuple[Variant, ...], calibration: int = 9) -> AblationPlan:
+    faults: tuple[dict[str, float], ...] = ({}, {"k_by": -0.4}, {"k_bz": -0.4})
+    return AblationPlan(SHORT, BUNDLE, 42, 2, 8, calibration, 0.1, variants, faults)
+
+
+def test_a_halved_stiffness_is_found_where_it_is_and_not_elsewhere() -> None:
+    linear = Variant("table", "linear", reader=Reader.LINEAR)
+    blind = replace(linear, label="MSD", measure=Measure.MSD)
+    ablation = run_ablation(_plan((linear, blind)), 1, lambda *_: None)
+    assert [(row.label, row.equation) for row in ablation.rows] == [
+        ("linear", "28"),
+        ("MSD", "28"),
+        ("linear", "31"),
+        ("MSD", "31"),
+    ]
+    for row, parameter in zip(ablation.rows[::2], ("k_by", "k_bz"), strict=True):
+        (label,) = row.detected
+        assert label == f"{parameter} -40%"
+        assert row.detected[label].count == row.named[label].count == 2
+        assert -0.5 < row.reads[label] < -0.2  # eight training windows of 20 s
+        assert row.elsewhere.of == 2
+        assert row.elsewhere.count < 2
+    assert not ablation.rows[1].named  # the MSD names no parameter
+    assert "| linear |" in ablation_tables(ablation)
+
+
+def test_too_few_calibration_windows_are_refused() -> None:
+    with pytest.raises(
+        EstimationError, match=r"8 calibration windows for a false-alarm rate of 0\.1, expected at least 9"
+    ):
+        run_ablation(_plan((PRESENT,), calibration=8), 1, lambda *_: None)
