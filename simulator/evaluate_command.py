@@ -1,5 +1,6 @@
 """What ``rotortrain evaluate`` does: evaluate the cells, keep every window, sum up, and write the results page."""
 
+import hashlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,6 +75,7 @@ def evaluate(
     """
     machine = load_machine(name)
     bundle = None if bundle_name is None else load_bundle(bundle_name, machine)
+    plan = cells_for(fault, full=full)
     campaign = Campaign(
         machine=machine.name,
         physics=machine.physics_hash,
@@ -83,8 +85,8 @@ def evaluate(
         windows=min(windows, _QUICK) if quick else windows,
         fault=fault,
         full=full,
+        plan=_digest(plan),
     )
-    plan = cells_for(fault, full=full)
     records = out / f"{machine.name}.jsonl"
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -165,7 +167,7 @@ def _same_campaign(path: Path, campaign: Campaign, records: Path) -> None:
             kept = Campaign.model_validate_json(path.read_text(encoding="utf-8"))
         except ValidationError as error:
             raise RecordingError(validation_text(path, error)) from error
-        for field in ("physics", "bundle", "seed", "fault", "full"):
+        for field in ("physics", "bundle", "seed", "fault", "full", "plan"):
             before, now = getattr(kept, field), getattr(campaign, field)
             if before != now:
                 raise RecordingError(
@@ -173,6 +175,12 @@ def _same_campaign(path: Path, campaign: Campaign, records: Path) -> None:
                     "choose another --out or remove the file"
                 )
     _write(path, campaign)
+
+
+def _digest(plan: list[EvaluationCell]) -> str:
+    """What the cells are, apart from their numbers of windows: records know their cell by its place in the plan."""
+    cells = [(c.topic, sorted(c.faults.items()), c.layout, c.excitation, c.anomaly, c.length_s) for c in plan]
+    return hashlib.sha256(repr(cells).encode()).hexdigest()[:12]
 
 
 def _write(path: Path, model: BaseModel) -> None:

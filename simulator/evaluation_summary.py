@@ -210,6 +210,8 @@ class Campaign(BaseModel):
         Of a cell of weight one.
     fault : float
     full : bool
+    plan : str
+        Digest of the cells.
     """
 
     model_config = _STRICT
@@ -222,6 +224,7 @@ class Campaign(BaseModel):
     windows: int
     fault: float
     full: bool
+    plan: str = ""
 
 
 class Summary(BaseModel):

@@ -34,7 +34,7 @@ def test_train_writes_a_bundle_that_fits_the_machine_and_evaluate_reads_it(tmp_p
     assert done.returncode == 0, done.stderr
     (summary,) = read_summaries(results)
     assert summary.campaign.bundle == bundle.identity
-    assert summary.windows == 24
+    assert {cell.topic for cell in summary.cells} == {Topic.HEALTHY, Topic.SMALL}
     independent = summary.of(Topic.SMALL, layout=Layout.INDEPENDENT)[0].opinions["likelihood"]
     one = independent.parameter("k_by")
     assert one is not None
