@@ -97,6 +97,8 @@ class AblationPlan:
         Per window and equation.
     variants : tuple of Variant
     faults : tuple of dict of str to float
+    layout : Layout or None
+        Of calibration and evaluation windows; None mixes them. Training always mixes them.
     """
 
     machine: Machine
@@ -108,6 +110,7 @@ class AblationPlan:
     false_alarm_rate: float = 0.01
     variants: tuple[Variant, ...] = VARIANTS
     faults: tuple[dict[str, float], ...] = FAULTS
+    layout: Layout | None = None
 
 
 class AblationRow(BaseModel):
@@ -154,6 +157,7 @@ class Ablation(BaseModel):
     machine: str
     bundle: str
     seed: int
+    layout: str
     windows: int
     training_windows: int
     calibration_windows: int
@@ -236,11 +240,11 @@ def run_ablation(plan: AblationPlan, processes: int, progress: Callable[[str, in
         }
         judge = partial(_judge, plan, trained)
         calibration = [
-            (Draw(plan.machine, plan.seed, Purpose.CALIBRATION, _FIXED_STREAM), k)
+            (Draw(plan.machine, plan.seed, Purpose.CALIBRATION, _FIXED_STREAM, layout=plan.layout), k)
             for k in range(plan.calibration_windows)
         ]
         evaluation = [
-            (Draw(plan.machine, plan.seed, Purpose.EVALUATION, cell, faults=dict(faults)), k)
+            (Draw(plan.machine, plan.seed, Purpose.EVALUATION, cell, faults=dict(faults), layout=plan.layout), k)
             for cell, faults in enumerate(plan.faults)
             for k in range(plan.windows)
         ]
@@ -256,6 +260,7 @@ def run_ablation(plan: AblationPlan, processes: int, progress: Callable[[str, in
         machine=plan.machine.name,
         bundle=plan.bundle.identity,
         seed=plan.seed,
+        layout="both" if plan.layout is None else plan.layout.name.lower(),
         windows=plan.windows,
         training_windows=plan.training_windows,
         calibration_windows=n,

@@ -7,9 +7,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from models.diagnosis.bundle import load_bundle
-from models.errors import RecordingError
+from models.errors import EstimationError, RecordingError
 from models.machine import load_machine
 from simulator.ablation import Ablation, AblationPlan, AblationRow, run_ablation
+from simulator.campaign import Layout
 from simulator.rates import Rate
 
 __all__ = ["ablate_networks", "ablation_tables"]
@@ -23,6 +24,7 @@ def ablate_networks(
     windows: int,
     training: int,
     calibration: int,
+    layout: str,
     false_alarm_rate: float,
     seed: int,
     processes: int,
@@ -36,7 +38,14 @@ def ablate_networks(
     """
     machine = load_machine(name)
     plan = AblationPlan(
-        machine, load_bundle(bundle_name, machine), seed, windows, training, calibration, false_alarm_rate
+        machine,
+        load_bundle(bundle_name, machine),
+        seed,
+        windows,
+        training,
+        calibration,
+        false_alarm_rate,
+        layout=_layout(layout),
     )
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True)) as bar:
@@ -56,6 +65,13 @@ def ablate_networks(
     except OSError as error:
         raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
     typer.echo(f"written: {out}, {out.with_suffix('.md')}")
+
+
+def _layout(name: str) -> Layout | None:
+    known = {one.name.lower(): one for one in Layout}
+    if name != "both" and name not in known:
+        raise EstimationError(f"ablation: layout is {name!r}, expected both or one of {', '.join(known)}")
+    return known.get(name)
 
 
 def ablation_tables(ablation: Ablation) -> str:

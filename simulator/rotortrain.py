@@ -215,6 +215,9 @@ def ablate(
     windows: Annotated[int, typer.Option(min=2, help="Evaluation windows per true change.")] = 100,
     training: Annotated[int, typer.Option(min=4, help="Training windows of each equation.")] = 60,
     calibration: Annotated[int, typer.Option(min=9, help="Healthy windows that set every variant's limit.")] = 199,
+    layout: Annotated[
+        str, typer.Option(help='Excitation of all windows but the training: "both", "independent", "one_source".')
+    ] = "both",
     false_alarms: Annotated[
         float, typer.Option(min=1e-6, max=0.5, help="Declared false-alarm rate per window and equation.")
     ] = 0.01,
@@ -239,6 +242,7 @@ def ablate(
             windows=windows,
             training=training,
             calibration=calibration,
+            layout=layout,
             false_alarm_rate=false_alarms,
             seed=seed,
             processes=processes,
