@@ -190,13 +190,9 @@ def _write(path: Path, model: BaseModel) -> None:
     os.replace(part, path)
 
 
-def _count(cell: EvaluationCell, windows: int) -> int:
-    return max(2, round(windows * cell.windows))
-
-
 def _asked_for(records: Iterator[WindowRecord], plan: list[EvaluationCell], windows: int) -> Iterator[WindowRecord]:
     """Leave out what an earlier, longer evaluation of the same campaign has beyond this one."""
-    return (record for record in records if record.number < _count(plan[record.cell], windows))
+    return (record for record in records if record.number < plan[record.cell].count(windows))
 
 
 def _cell_text(cell: EvaluationCell) -> str:
@@ -220,7 +216,7 @@ class _Lines:
     def __init__(self, plan: list[EvaluationCell], windows: int) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         self._bar = Progress(*columns, console=Console(stderr=True))
-        self._all = self._bar.add_task("all windows", total=sum(_count(cell, windows) for cell in plan))
+        self._all = self._bar.add_task("all windows", total=sum(cell.count(windows) for cell in plan))
         self._running: tuple[EvaluationCell, TaskID] | None = None
         self._before = 0
 

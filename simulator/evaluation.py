@@ -43,6 +43,7 @@ RATES = (0.01, 0.001)
 """Declared false-alarm rates per window at which every opinion is judged."""
 
 _OTHER_REALISATION = 7919
+_LARGEST_LOSS = -0.9
 
 
 class Opinion(BaseModel):
@@ -56,6 +57,8 @@ class Opinion(BaseModel):
         Parameters it says have changed, at each of `RATES`.
     outside : tuple of bool
         Whether it says that the window is outside the model, at each of `RATES`.
+    low_confidence : bool
+        Whether it says, at the first of `RATES`, that what it names should be believed with reserve.
     misfit_z : float or None
     suspect : str
     seconds : float
@@ -70,6 +73,7 @@ class Opinion(BaseModel):
     error: dict[str, float] = {}
     named: tuple[tuple[str, ...], ...] = ()
     outside: tuple[bool, ...] = ()
+    low_confidence: bool = False
     misfit_z: float | None = None
     suspect: str = ""
     seconds: float = 0.0
@@ -112,8 +116,8 @@ def true_condition(scenario: Scenario, machine: Machine) -> TrueCondition:
     variance = (scenario.sensors.noise_relative * rms[states]) ** 2
     levels = np.zeros((6, 6))
     for source in scenario.sources:
-        force = np.array(source.direction) * source.force_rms_N
-        levels += np.outer(force, force) * float(source_spectrum(np.array([1e-6]), source)[0])
+        density = float(source_spectrum(np.array([1e-6]), source)[0])
+        levels += np.outer(source.direction, source.direction) * density
     return TrueCondition(
         changes=truth,
         speed_rad_s=speeds[-1] * 2 * np.pi / 60,
@@ -155,7 +159,7 @@ def evaluate_cells(
     done = {(record.cell, record.number) for record in read_records(kept)} if kept.exists() else set()
     with ProcessPoolExecutor(processes) as pool, kept.open("a", encoding="utf-8") as out:
         for index, cell in enumerate(cells):
-            count = max(2, round(n_windows * cell.windows))
+            count = cell.count(n_windows)
             missing = [number for number in range(count) if (index, number) not in done]
             finished = count - len(missing)
             progress(cell, finished, count)
@@ -239,6 +243,7 @@ def _opinion(one: Diagnostician, window: WindowStatistics) -> Opinion:
         error={reading.name: _rounded(reading.standard_error) for reading in diagnosis.evaluable},
         named=tuple(verdict.changed for verdict in verdicts),
         outside=tuple(verdict.outside for verdict in verdicts),
+        low_confidence=verdicts[0].low_confidence,
         misfit_z=None if diagnosis.misfit_z is None else round(diagnosis.misfit_z, 3),
         suspect=diagnosis.suspect,
         seconds=round(seconds, 5),
@@ -258,7 +263,8 @@ def _quoted(draw: Draw, number: int) -> dict[str, float]:
     stretch = stretch_of(diagnosis, 0, 0)
     quoted = detectable_changes(stretch, window_thresholds(RATES[0], len(stretch.known)), draw.machine.window.length_s)
     one = quoted[int(rng.integers(len(quoted)))]
-    return {one.name: one.gain if rng.random() < 0.5 else one.loss}
+    # A loss of everything, quoted where not even that would be found for certain, cannot be simulated.
+    return {one.name: one.gain if rng.random() < 0.5 or one.loss < _LARGEST_LOSS else one.loss}
 
 
 def _with_length(machine: Machine, length_s: float) -> Machine:

@@ -60,6 +60,10 @@ class EvaluationCell:
     length_s: float | None = None
     windows: float = 1.0
 
+    def count(self, n_windows: int) -> int:
+        """Windows of this cell where a cell of weight one has `n_windows`."""
+        return max(2, round(n_windows * self.windows))
+
 
 _SMALL = ({"k_by": -0.02, "c_bz": -0.10, "e": 0.10}, {"k_bz": -0.05, "c_by": -0.05, "e": 0.05})
 _LENGTHS_S = {15.0: 0.4, 30.0: 0.4, 120.0: 0.2, 300.0: 0.12, 600.0: 0.08}

@@ -21,9 +21,9 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 from simulator.campaign import Draw, Layout, Purpose, draw_condition
-from simulator.rates import Rate
 from simulator.opinions import diagnosticians, named_parameters, opinion_of
 from simulator.peers import FeatureVector, Peer, SubspaceModes, score_limit
+from simulator.rates import Rate
 from simulator.scenario import Event
 from simulator.stream import blocks
 

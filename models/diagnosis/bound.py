@@ -18,6 +18,9 @@ from models.diagnosis.bins import BinGroups
 from models.diagnosis.spectral_model import COLUMNS, ROWS, SHAPES, STRUCTURAL, SpectralModel
 from models.diagnosis.unbalance import estimate_unbalance
 from models.machine import Machine
+from models.physics.lyapunov import synchronous_response
+from models.physics.matrices import STATE_INDEX
+from models.physics.parameters import changed
 from models.signals.block import FloatArray
 
 __all__ = ["TrueCondition", "cramer_rao"]
@@ -104,7 +107,13 @@ def cramer_rao(
     covariance = everything[: len(STRUCTURAL), : len(STRUCTURAL)]
     ratio = np.exp(theta[: len(STRUCTURAL)])
     bound = dict(zip(STRUCTURAL, (ratio * np.sqrt(np.diag(covariance))).tolist(), strict=True))
-    synchronous = np.zeros(len(states), dtype=np.complex128)
+    # The exact 1x vector, x = q1 cos(θ + φ) + q2 sin(θ + φ): how much of the structure's uncertainty e inherits depends
+    # on it.
+    q1, q2 = synchronous_response(changed(machine.rotor, true.changes), true.speed_rad_s)
+    order = [STATE_INDEX[name] for name in states]
+    synchronous = np.asarray(
+        (q1 - 1j * q2)[order] * np.exp(1j * machine.operation.unbalance_phase_rad), dtype=np.complex128
+    )
     e = estimate_unbalance(machine, model, point, covariance, synchronous, true.speed_rad_s, duration_s)
     return bound | {"e": float(np.sqrt(e.variance))}
 
