@@ -14,10 +14,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from models.diagnosis.amortised import NetworkDiagnostician
 from models.diagnosis.bundle import load_bundle
 from models.diagnosis.likelihood import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for
-from models.diagnosis.networks import read_equation
+from models.diagnosis.networks import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from service.monitor import MachineMonitor
 from simulator.scenario import load_scenario
@@ -52,8 +53,11 @@ def main() -> None:
             windows.append(full)
     piece = samples[: plan.preamble + plan.hop]
     level = piece[:, : len(plan.states)].mean(axis=0)
-    fit = LikelihoodFit(machine)
-    fit.fit(windows[0])
+    fit, relation = LikelihoodFit(machine), RelationDiagnostician(machine, bundle.networks)
+    if bundle.amortised is None:
+        raise SystemExit("the shipped bundle has no amortised networks: train it again")
+    amortised = NetworkDiagnostician(machine, bundle.amortised)
+    fit.diagnose(windows[0])
 
     def yardstick() -> None:
         half = plan.segment // 2
@@ -70,10 +74,9 @@ def main() -> None:
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
         "statistics of a window": median_s(window.statistics, 1),
-        "likelihood, warm": median_s(lambda: [fit.fit(one) for one in windows], len(windows)),
-        "networks 28, 29, 31": median_s(
-            lambda: [read_equation(network, windows[0], machine) for network in bundle.networks], 1
-        ),
+        "likelihood, warm": median_s(lambda: [fit.diagnose(one) for one in windows], len(windows)),
+        "amortised networks, all four": median_s(lambda: [amortised.diagnose(one) for one in windows], len(windows)),
+        "relation networks 28, 29, 31": median_s(lambda: [relation.diagnose(one) for one in windows], len(windows)),
         "whole data path, per hop": median_s(whole, hops),
     }
     base = costs["Fourier transforms alone (yardstick)"]
