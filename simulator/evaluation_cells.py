@@ -67,7 +67,7 @@ class EvaluationCell:
 
 _TOGETHER = ({"k_by": -0.02, "c_bz": -0.10, "e": 0.10}, {"k_bz": -0.05, "c_by": -0.05, "e": 0.05})
 _ALONE = ({"k_by": -0.02}, {"c_bz": -0.10}, {"e": 0.10}, {"c_by": -0.05}, {"e": 0.05}, {"k_bz": -0.05})
-_LENGTHS_S = {15.0: 0.4, 30.0: 0.4, 120.0: 0.2, 300.0: 0.12, 600.0: 0.08}
+_LENGTHS_S = {15.0: 0.2, 30.0: 0.2, 120.0: 0.1, 300.0: 0.06, 600.0: 0.04}
 """Window lengths with their share of windows: a ten-minute window costs forty 15-second ones."""
 
 
@@ -91,9 +91,9 @@ def cells_for(fault: float, *, full: bool) -> list[EvaluationCell]:
     if not full:
         return cells
     # One source reads a hundredth of these changes: they are asked of independent sources alone.
-    cells += [EvaluationCell(Topic.SMALL, faults=faults, layout=Layout.INDEPENDENT) for faults in _ALONE]
+    cells += [EvaluationCell(Topic.SMALL, faults=faults, layout=Layout.INDEPENDENT, windows=0.6) for faults in _ALONE]
     cells += [
-        EvaluationCell(Topic.PAPER, faults={name: large[name] for name in names}, windows=0.5)
+        EvaluationCell(Topic.PAPER, faults={name: large[name] for name in names}, windows=0.3)
         for names in PAPER_CONDITIONS
     ]
     cells += [
@@ -101,16 +101,16 @@ def cells_for(fault: float, *, full: bool) -> list[EvaluationCell]:
             Topic.EXCITATION,
             layout=layout,
             excitation=excitation,
-            windows=0.6 if layout is Layout.INDEPENDENT else 0.3,
+            windows=0.4 if layout is Layout.INDEPENDENT else 0.2,
         )
         for layout in (Layout.INDEPENDENT, Layout.ONE_SOURCE)
         for excitation in Excitation
         if excitation is not Excitation.SECOND_ORDER
         and not (excitation is Excitation.OWN_CUTOFFS and layout is Layout.ONE_SOURCE)
     ]
-    cells += [EvaluationCell(Topic.DETECTABLE)]
+    cells += [EvaluationCell(Topic.DETECTABLE, windows=0.8)]
     cells += [
-        EvaluationCell(Topic.OUTSIDE, anomaly=anomaly, windows=0.5)
+        EvaluationCell(Topic.OUTSIDE, anomaly=anomaly, windows=0.3)
         for anomaly in Anomaly
         if anomaly is not Anomaly.NONE
     ]

@@ -132,8 +132,9 @@ def _detection(summary: Summary, by: str) -> Iterator[Goal]:
                 for cell in summary.of(Topic.SMALL, Topic.PAPER, layout=layout)
                 if cell.truth is not None and cell.truth.get(name) == truth
             ]
-            # A 20 % change counts alone, as in the paper's conditions; the small ones come three at a time.
-            cells = [cell for cell in cells if cell.topic is Topic.SMALL or len(cell.truth or {}) == 1]
+            # Alone, where that was measured: beside another change a further one needs stronger evidence.
+            alone = [cell for cell in cells if len(cell.truth or {}) == 1]
+            cells = alone or [cell for cell in cells if cell.topic is Topic.SMALL]
             rate = pooled(one.found[0] for _, one in _read(cells, by, name))
             yield _at_least(
                 summary, f"{by}: {name} {truth:+.0%} detected at 1 % false alarms, {LAYOUT_TEXT[layout]}", rate, least
