@@ -14,11 +14,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.diagnosis.amortised import NetworkDiagnostician
-from models.diagnosis.bundle import load_bundle
-from models.diagnosis.likelihood import LikelihoodFit
+from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for
-from models.diagnosis.networks import RelationDiagnostician
+from models.diagnosis.networks.amortised import NetworkDiagnostician
+from models.diagnosis.networks.bundle import load_bundle
+from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from service.monitor import MachineMonitor
 from simulator.scenario import load_scenario

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from models.diagnosis.detectable import DetectableChange, length_to_find
 from models.diagnosis.readings import EquationReading, ParameterReading
-from models.diagnosis.sequential import SequentialVerdict
+from models.diagnosis.verdict.detectable import DetectableChange, length_to_find
+from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.machine import Machine
 from models.physics.parameters import PARAMETER_TEXT
 from service.alarms import ALARM_TEXT, Alarm, AlarmEvent, AlarmState

@@ -13,12 +13,12 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from models.diagnosis.bundle import Bundle
-from models.diagnosis.detectable import DetectableChange, detectable_changes
 from models.diagnosis.moments import plan_for
+from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
-from models.diagnosis.sequential import SequentialSettings, SequentialTest, SequentialVerdict
-from models.diagnosis.stretch import Stretch, stretch_of
+from models.diagnosis.verdict.detectable import DetectableChange, detectable_changes
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest, SequentialVerdict
+from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError, WireError
 from models.machine import Machine

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.diagnosis.agreement import Agreement, agreements
-from models.diagnosis.amortised import NetworkDiagnostician
-from models.diagnosis.bundle import Bundle
-from models.diagnosis.likelihood import LikelihoodFit
-from models.diagnosis.networks import RelationDiagnostician
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.networks.amortised import NetworkDiagnostician
+from models.diagnosis.networks.bundle import Bundle
+from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, EquationReading, ParameterReading
+from models.diagnosis.verdict.agreement import Agreement, agreements
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine

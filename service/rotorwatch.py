@@ -333,7 +333,7 @@ def _overridden(
 
 def _checked(file: Path) -> str:
     """Check one file and say what it describes."""
-    from models.diagnosis.bundle import load_bundle  # noqa: PLC0415  # keeps --help quick
+    from models.diagnosis.networks.bundle import load_bundle  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine, read_toml  # noqa: PLC0415
     from service.config import load_settings  # noqa: PLC0415
 

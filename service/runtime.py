@@ -25,7 +25,7 @@ from types import FrameType
 
 import uvicorn
 
-from models.diagnosis.bundle import load_bundle
+from models.diagnosis.networks.bundle import load_bundle
 from models.errors import RotorwatchError
 from models.machine import Machine
 from models.signals.keys import MachineKeys

@@ -9,7 +9,7 @@ from typing import Annotated, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.diagnosis.agreement import Verdict as AgreementVerdict
+from models.diagnosis.verdict.agreement import Verdict as AgreementVerdict
 from models.signals.channels import Channel
 from service.alarms import AlarmState, Severity
 from service.monitor import HealthState

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from models.diagnosis.bundle import Bundle
+from models.diagnosis.networks.bundle import Bundle
 from models.machine import Machine
 from service import conversion
 from service.config import HistorySettings, QueueSettings

@@ -48,7 +48,7 @@ def train(
     Example: rotortrain train --machine lab --out lab-bundle
     """
     _one_thread_per_process()
-    from simulator.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
+    from simulator.campaigns.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
         train_bundle(machine, out, windows, draws, seed, processes)
@@ -95,7 +95,7 @@ def evaluate(
     Example: rotortrain evaluate --machine lab --bundle lab --out evaluation --full --page results.md
     """
     _one_thread_per_process()
-    from simulator.evaluate_command import evaluate as run  # noqa: PLC0415  # start-up stays free of numpy and torch
+    from simulator.campaigns.evaluate_command import evaluate as run  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
         run(
@@ -142,7 +142,7 @@ def reproduce(
     Example: rotortrain reproduce --machine lab --out reproduction
     """
     _one_thread_per_process()
-    from simulator.reproduce_command import reproduce_study  # noqa: PLC0415  # start-up stays free of numpy and torch
+    from simulator.campaigns.reproduce_command import reproduce_study  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
         reproduce_study(
@@ -187,7 +187,7 @@ def peers(
     Example: rotortrain peers --machine lab --out peers.json --windows 100
     """
     _one_thread_per_process()
-    from simulator.peers_command import compare_peers  # noqa: PLC0415  # start-up stays free of numpy and torch
+    from simulator.campaigns.peers_command import compare_peers  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
         compare_peers(
@@ -232,7 +232,7 @@ def ablate(
     Example: rotortrain ablate --machine lab --out ablation.json --windows 100
     """
     _one_thread_per_process()
-    from simulator.ablation_command import ablate_networks  # noqa: PLC0415  # start-up stays free of numpy and torch
+    from simulator.campaigns.ablation_command import ablate_networks  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
         ablate_networks(
@@ -270,7 +270,7 @@ def delay(
     Example: rotortrain delay --machine lab --out delay.json
     """
     _one_thread_per_process()
-    from simulator.delay_command import time_detection  # noqa: PLC0415  # start-up stays free of numpy and torch
+    from simulator.campaigns.delay_command import time_detection  # noqa: PLC0415  # start-up stays free of numpy and torch
 
     try:
         time_detection(machine, out, trials=trials, others=others, seed=seed, processes=processes, redraw=redraw)

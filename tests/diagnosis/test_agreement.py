@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.agreement import Verdict, agreements
 from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.verdict.agreement import Verdict, agreements
 from models.physics.parameters import PARAMETERS
 
 SEED = 88_400

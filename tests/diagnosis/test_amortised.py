@@ -6,18 +6,18 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.diagnosis.amortised import OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
-from models.diagnosis.amortised_training import calibrate_networks, train_networks
-from models.diagnosis.bundle import load_bundle
-from models.diagnosis.features import ForceFeatures
-from models.diagnosis.networks import RelationDiagnostician
+from models.diagnosis.networks.amortised import OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
+from models.diagnosis.networks.amortised_training import calibrate_networks, train_networks
+from models.diagnosis.networks.bundle import load_bundle
+from models.diagnosis.networks.features import ForceFeatures
+from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
-from simulator.campaign import Draw, Layout, Purpose, simulate_window, with_tilt
-from simulator.feature_draws import FeatureDraws, batches
-from simulator.spectral_draws import LOG_RATIO, SpectralDraws
+from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window, with_tilt
+from simulator.campaigns.feature_draws import FeatureDraws, batches
+from simulator.campaigns.spectral_draws import LOG_RATIO, SpectralDraws
 
 SEED = 7_700_041
 LAB = load_machine("lab")

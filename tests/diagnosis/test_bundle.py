@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from models.diagnosis.bundle import Training, load_bundle, save_bundle
-from models.diagnosis.equations import EQUATIONS
-from models.diagnosis.networks import EquationNetwork, read_equation
-from models.diagnosis.training import calibrate, train_network
+from models.diagnosis.networks.bundle import Training, load_bundle, save_bundle
+from models.diagnosis.networks.equations import EQUATIONS
+from models.diagnosis.networks.relation import EquationNetwork, read_equation
+from models.diagnosis.networks.relation_training import calibrate, train_network
 from models.errors import BundleError
 from models.machine import Machine, load_machine
-from simulator.campaign import Draw, Layout, Purpose, simulate_window, with_tilt
+from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window, with_tilt
 
 SEED = 7_700_003
 LAB = load_machine("lab")

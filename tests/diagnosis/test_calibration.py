@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.calibration import (
+from models.diagnosis.verdict.calibration import (
     MONTH_S,
     crossing_rate,
     month_thresholds,

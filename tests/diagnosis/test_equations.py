@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation, missing
+from models.diagnosis.networks.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation, missing
 from models.machine import Machine, load_machine
 from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.isolation import Isolation, isolate_window, outside_confidence
 from models.diagnosis.readings import Diagnosis, ParameterReading
-from models.diagnosis.stretch import added, from_scale, slope, stretch_of, to_scale
+from models.diagnosis.verdict.isolation import Isolation, isolate_window, outside_confidence
+from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.bins import AVERAGES_PER_BIN, BinGroups, group_bins
-from models.diagnosis.bound import TrueCondition, cramer_rao
-from models.diagnosis.likelihood import LikelihoodFit
+from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN, BinGroups, group_bins
+from models.diagnosis.likelihood.bound import TrueCondition, cramer_rao
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.scoring import FisherScoring
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.scoring import FisherScoring
-from models.diagnosis.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
-from simulator.campaign import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
+from simulator.campaigns.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
 
 SEED = 7_700_001
 """Of this file's windows alone: neither training, calibration nor the shipped scenarios use it."""

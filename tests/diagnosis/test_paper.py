@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.paper import (
+from models.diagnosis.networks.paper import (
     PAPER_EQUATIONS,
     PaperDiagnostician,
     calibrate_paper,
@@ -12,14 +12,14 @@ from models.diagnosis.paper import (
     paper_rows,
     phase_correlation,
 )
-from models.diagnosis.paper_training import train_paper_network
+from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_correlation, synchronous_response
 from models.physics.matrices import STATE_INDEX
-from simulator.campaign import Draw, Layout, Purpose, draw_condition, simulate_window, with_tilt
+from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition, simulate_window, with_tilt
 
 _SEED = 4711
 

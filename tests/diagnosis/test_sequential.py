@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.diagnosis.calibration import MONTH_S, month_thresholds
-from models.diagnosis.delay import GaussianHops, detection_delays
-from models.diagnosis.detectable import length_for
-from models.diagnosis.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
-from models.diagnosis.stretch import Stretch, to_scale
+from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
+from models.diagnosis.verdict.delay import GaussianHops, detection_delays
+from models.diagnosis.verdict.detectable import length_for
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
+from models.diagnosis.verdict.stretch import Stretch, to_scale
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from models.diagnosis.bundle import load_bundle
+from models.diagnosis.networks.bundle import load_bundle
 from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from models.diagnosis.bundle import load_bundle
+from models.diagnosis.networks.bundle import load_bundle
 from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.link import LinkSettings

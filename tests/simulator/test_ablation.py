@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.diagnosis.bundle import load_bundle
-from models.diagnosis.equations import EQUATIONS
-from models.diagnosis.networks import window_view
-from models.diagnosis.paper import full_correlation
+from models.diagnosis.networks.bundle import load_bundle
+from models.diagnosis.networks.equations import EQUATIONS
+from models.diagnosis.networks.paper import full_correlation
+from models.diagnosis.networks.relation import window_view
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import load_machine
-from simulator.ablation import AblationPlan, run_ablation
-from simulator.ablation_command import ablation_tables
-from simulator.ablation_variants import (
+from simulator.campaigns.ablation import AblationPlan, run_ablation
+from simulator.campaigns.ablation_command import ablation_tables
+from simulator.campaigns.ablation_variants import (
     VARIANTS,
     Measure,
     Reader,
@@ -23,7 +23,7 @@ from simulator.ablation_variants import (
     linear_fit,
     variant_equation,
 )
-from simulator.campaign import Draw, Purpose, simulate_window
+from simulator.campaigns.draws import Draw, Purpose, simulate_window
 
 LAB = load_machine("lab")
 BUNDLE = load_bundle("lab", LAB)

@@ -7,8 +7,8 @@ import pytest
 
 from models.errors import RecordingError
 from models.machine import load_machine
-from simulator.delay_command import delay_table, draw_delays, time_detection
-from simulator.delay_study import (
+from simulator.campaigns.delay_command import delay_table, draw_delays, time_detection
+from simulator.campaigns.delay_study import (
     DelayPlan,
     DelayResult,
     bound_time_s,

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from models.physics.parameters import PARAMETERS
-from simulator.campaign import Anomaly, Excitation, Layout
-from simulator.evaluate_command import read_summaries
-from simulator.evaluation import Opinion, WindowRecord, read_records
-from simulator.evaluation_cells import Topic, cells_for
-from simulator.evaluation_goals import Goal, goals, length_exponent
-from simulator.evaluation_summary import Campaign, Interval, Summary, summarise
-from simulator.rates import Rate
-from simulator.results_page import page
-from simulator.results_plots import FIGURES, draw_results, figure_name
+from simulator.campaigns.draws import Anomaly, Excitation, Layout
+from simulator.campaigns.evaluate_command import read_summaries
+from simulator.campaigns.evaluation import Opinion, WindowRecord, read_records
+from simulator.campaigns.evaluation_cells import Topic, cells_for
+from simulator.campaigns.evaluation_goals import Goal, goals, length_exponent
+from simulator.campaigns.evaluation_summary import Campaign, Interval, Summary, summarise
+from simulator.campaigns.rates import Rate
+from simulator.campaigns.results_page import page
+from simulator.campaigns.results_plots import FIGURES, draw_results, figure_name
 
 SEED = 99
 

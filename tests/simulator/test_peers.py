@@ -8,8 +8,8 @@ from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from simulator.campaign import Draw, Layout, Purpose, draw_condition
-from simulator.peers import FeatureVector, Peer, SubspaceModes, hotelling_limit, reference_modes, score_limit
+from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
+from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, hotelling_limit, reference_modes, score_limit
 from simulator.stream import blocks
 
 LAB = load_machine("lab")

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from models.diagnosis.bundle import load_bundle
+from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
-from simulator.campaign import Layout
-from simulator.evaluate_command import read_summaries
-from simulator.evaluation_cells import Topic
+from simulator.campaigns.draws import Layout
+from simulator.campaigns.evaluate_command import read_summaries
+from simulator.campaigns.evaluation_cells import Topic
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:

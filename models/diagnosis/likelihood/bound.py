@@ -1,0 +1,131 @@
+"""Cramér-Rao bound: how well any unbiased method could read the parameters from one window.
+
+The information of T seconds of a stationary Gaussian process with spectra S(f; θ) is (P. Whittle, J. Roy. Statist. Soc.
+B 15 (1953))
+
+    J_ab = T ∫ tr(S⁻¹ ∂_a S S⁻¹ ∂_b S) df  over the band.
+
+Nothing but the rotor's other properties is taken as known: the level matrix, the cutoff of the excitation and the
+density and colour of every channel's noise are unknown beside the parameters. The excitation's shape, a second-order
+low-pass, is known here; a method that does not know it has a higher bound, given beside it.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.likelihood.bins import BinGroups
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SHAPES, STRUCTURAL, SpectralModel
+from models.diagnosis.likelihood.unbalance import estimate_unbalance
+from models.machine import Machine
+from models.physics.lyapunov import synchronous_response
+from models.physics.matrices import STATE_INDEX
+from models.physics.parameters import changed
+from models.signals.block import FloatArray
+
+__all__ = ["TrueCondition", "cramer_rao"]
+
+_PULL = 1e-6
+"""Keeps directions invertible that the sensors do not see at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrueCondition:
+    """What is true of a window, SI units.
+
+    Attributes
+    ----------
+    changes : dict of str to float
+        Relative changes of parameters.
+    speed_rad_s : float
+    cutoff_hz : float
+        Of the second-order low-pass that colours all forces.
+    levels : ndarray, shape (6, 6)
+        Two-sided spectral density of the forces far below the cutoff, N²/Hz and Nm²/Hz.
+    noise : ndarray, shape (n_states,)
+        Two-sided density of the sensor noise at the lower end of the band.
+    noise_colour : ndarray, shape (n_states,)
+        Exponent b of the noise's colour.
+    """
+
+    changes: dict[str, float]
+    speed_rad_s: float
+    cutoff_hz: float
+    levels: FloatArray
+    noise: FloatArray
+    noise_colour: FloatArray
+
+
+def cramer_rao(
+    machine: Machine, states: tuple[str, ...], true: TrueCondition, duration_s: float, *, shape_known: bool = True
+) -> dict[str, float]:
+    """Smallest standard error of each parameter's relative change.
+
+    Parameters
+    ----------
+    machine : Machine
+    states : tuple of str
+        Measured states.
+    true : TrueCondition
+    duration_s : float
+    shape_known : bool
+        Whether the excitation is known to be a second-order low-pass.
+
+    Returns
+    -------
+    dict of str to float
+        ``k_by, c_by, k_bz, c_bz, EI, e``.
+    """
+    low, high = machine.window.band_hz
+    spacing = 1 / machine.window.segment_s
+    frequencies_hz = np.arange(low, high + spacing / 2, spacing)
+    one = np.ones(frequencies_hz.size)
+    bins = BinGroups(
+        tuple((k, k + 1) for k in range(frequencies_hz.size)),
+        one,
+        frequencies_hz,
+        frequencies_hz[:, None],
+        one[:, None],
+    )
+    lever = machine.rotor.shaft_length_m / 3
+    unit = np.array([1, 1, lever, 1, 1, lever])
+    levels = true.levels / np.outer(unit, unit)
+    force_scale = float(np.sqrt(np.trace(levels) / 6))
+    shapes = 0 if shape_known else SHAPES
+    model = SpectralModel(machine, states, bins, np.ones(len(states)), force_scale, shapes)
+    scale = np.sqrt(np.einsum("fii->i", model.at(_theta(model, true, levels), true.speed_rad_s).S).real / one.size)
+    model = SpectralModel(machine, states, bins, scale, force_scale, shapes)
+    theta = _theta(model, true, levels)
+    point = model.at(theta, true.speed_rad_s)
+    whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(point.S)), dtype=np.complex128)
+    slopes = model.slopes(point, whiten).reshape(model.size, -1)
+    information = duration_s * spacing * (slopes @ slopes.T)
+    pull = np.full(model.size, _PULL)
+    if shape_known:
+        pull[model.order_at] = 1e9
+    everything = np.asarray(np.linalg.inv(information + np.diag(pull)), dtype=np.float64)
+    covariance = everything[: len(STRUCTURAL), : len(STRUCTURAL)]
+    ratio = np.exp(theta[: len(STRUCTURAL)])
+    bound = dict(zip(STRUCTURAL, (ratio * np.sqrt(np.diag(covariance))).tolist(), strict=True))
+    # The exact 1x vector, x = q1 cos(θ + φ) + q2 sin(θ + φ): how much of the structure's uncertainty e inherits depends
+    # on it.
+    q1, q2 = synchronous_response(changed(machine.rotor, true.changes), true.speed_rad_s)
+    order = [STATE_INDEX[name] for name in states]
+    synchronous = np.asarray(
+        (q1 - 1j * q2)[order] * np.exp(1j * machine.operation.unbalance_phase_rad), dtype=np.complex128
+    )
+    e = estimate_unbalance(machine, model, point, covariance, synchronous, true.speed_rad_s, duration_s)
+    return bound | {"e": float(np.sqrt(e.variance))}
+
+
+def _theta(model: SpectralModel, true: TrueCondition, levels: FloatArray) -> FloatArray:
+    """Parameter point of the truth in the model's units."""
+    theta = np.zeros(model.size)
+    theta[: len(STRUCTURAL)] = np.log1p([true.changes.get(name, 0.0) for name in STRUCTURAL])
+    theta[model.cutoff_at], theta[model.order_at] = np.log(true.cutoff_hz), np.log(2)
+    theta[model.noise_at] = np.log(true.noise / model.scale**2)
+    theta[model.colour_at] = true.noise_colour
+    relative = levels / model.force_unit[0] ** 2
+    relative = relative + 1e-12 * np.trace(relative) * np.eye(6)
+    theta[model.level_at] = np.linalg.cholesky(relative)[ROWS, COLUMNS]
+    return theta

@@ -1,0 +1,236 @@
+"""Physical parameters by maximum likelihood from a window's cross-spectra (Whittle), with their standard errors.
+
+References
+----------
+P. Whittle, "Estimation and information in stationary time series", Arkiv för Matematik 2 (1953). Equation numbers are
+the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from models.diagnosis.likelihood.bins import BinGroups, group_bins
+from models.diagnosis.likelihood.goodness import goodness_of_fit
+from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Workspace
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel
+from models.diagnosis.likelihood.start import starting_point
+from models.diagnosis.likelihood.unbalance import estimate_unbalance
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine
+from models.signals.block import FloatArray
+
+__all__ = ["LikelihoodFit"]
+
+_COLD_STEPS, _WARM_STEPS = 40, 15
+_NEAR, _GAIN = 0.15, 3.0
+"""Converged: no diagnosed parameter would move by more than this many standard errors."""
+_COARSE, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN = 3.0, 25, 1.0, 30.0
+"""A cold search finds its region on groups three times as wide."""
+_GROUPS = 150
+"""The band over the widest group."""
+_MOST_LOG_RATIO = float(np.log(5))
+"""No stiffness or damping is believed to have changed by more than a factor of five within the model."""
+_MOST_EXCESS = 10.0
+"""Mean squared excess over its expectation, beyond which a window is not evaluated: a dead or clipped channel."""
+_SYNCHRONOUS_BINS = 3
+
+
+class LikelihoodFit:
+    """Fits window after window, each from where the last one ended.
+
+    The state kept between windows is only the starting point.
+
+    Parameters
+    ----------
+    machine : Machine
+        Nominal rotor and unbalance phase.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
+        self._last: FloatArray | None = None
+        self._groups: dict[bytes, BinGroups] = {}
+        self._workspace = Workspace()
+
+    @property
+    def by(self) -> str:
+        """Name under which it is reported."""
+        return "likelihood"
+
+    def reset(self) -> None:
+        """Start the next window cold."""
+        self._last = None
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        """Estimate the parameters of one window.
+
+        Raises
+        ------
+        EstimationError
+            If a channel has no power in the band (a dead sensor), two carry the same signal, the search finds no
+            maximum, or nothing within the model comes near the window.
+        """
+        speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
+        excluded = _near_rotation(window.frequencies_hz, speed)
+        power = self._checked_power(window, ~excluded)
+        scale = np.sqrt(power)
+        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window"
+        try:
+            # Trial points may lie far out; what comes of them is checked, not warned of.
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                model, search, found = self._maximise(window, excluded, scale, speed)
+            covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
+        except np.linalg.LinAlgError as error:
+            self.reset()
+            raise EstimationError(nowhere) from error
+        theta = found.theta
+        if not (np.all(np.isfinite(theta)) and np.all(np.diag(covariance) > 0)):
+            self.reset()
+            raise EstimationError(nowhere)
+        self._last = theta
+        self._check_explained(model, search, found)
+        n = len(STRUCTURAL)
+        # A search that has not converged adds the step it would still take to the uncertainty.
+        structural = covariance[:n, :n] + np.diag(found.remaining**2)
+        ratio = np.exp(theta[:n])
+        change, spread = ratio - 1, structural * np.outer(ratio, ratio)
+        names: tuple[str, ...] = STRUCTURAL
+        if window.synchronous is not None:
+            e = estimate_unbalance(
+                self._machine,
+                model,
+                found.whitened.point,
+                structural,
+                window.synchronous,
+                speed,
+                window.duration_s,
+            )
+            names, change = (*names, "e"), np.append(change, e.change)
+            cross = (e.covariance * ratio)[:, None]
+            spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
+        goodness = goodness_of_fit(self._machine, model, search, found)
+        readings = tuple(
+            ParameterReading(name, self.by, float(value), float(error))
+            for name, value, error in zip(names, change, np.sqrt(np.diag(spread)), strict=True)
+        )
+        return Diagnosis(
+            self.by,
+            readings,
+            covariance=np.asarray(spread, dtype=np.float64),
+            misfit_z=goodness.misfit_z,
+            suspect=goodness.suspect,
+            steps=found.steps,
+        )
+
+    def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
+        """Mean density of every state; raises EstimationError for dead or doubled channels."""
+        observed = window.spectrum[used]
+        power = np.einsum("fii->i", observed).real / observed.shape[0]
+        twins = _twins(window.states, observed)
+        if twins:
+            raise EstimationError(f"{self._machine.name}: channels {' and '.join(twins)} carry the same signal")
+        dead = _dead(window.states, power)
+        if dead:
+            raise EstimationError(
+                f"{self._machine.name}: no fluctuation in {', '.join(dead)}: nothing to compare with theory"
+            )
+        return np.asarray(power, dtype=np.float64)
+
+    def _maximise(
+        self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float
+    ) -> tuple[SpectralModel, FisherScoring, Maximum]:
+        """Search from the last window's maximum, or cold: first on coarse groups with one low-pass for all forces."""
+        groups = self._grouped(window.frequencies_hz, excluded, 1.0)
+        force_scale = self._force_scale(window.states, groups, scale, speed)
+        model = SpectralModel(self._machine, window.states, groups, scale, force_scale)
+        search = self._search(model, window, speed)
+        if self._last is not None and self._last.size == model.size:
+            try:
+                return model, search, search.maximise(self._last, _WARM_STEPS, _NEAR, _GAIN)
+            except np.linalg.LinAlgError:  # the old point makes no valid spectrum for this window
+                self.reset()
+        wide = self._grouped(window.frequencies_hz, excluded, _COARSE)
+        coarse = SpectralModel(self._machine, window.states, wide, scale, force_scale, shapes=0)
+        first = self._search(coarse, window, speed)
+        start = starting_point(coarse, _observed(coarse, window), first.centre, speed)
+        near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta
+        theta = search.centre.copy()
+        theta[: coarse.colour_at.stop], theta[model.level_at] = near[: coarse.colour_at.stop], near[coarse.level_at]
+        return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN)
+
+    def _search(self, model: SpectralModel, window: WindowStatistics, speed: float) -> FisherScoring:
+        return FisherScoring(
+            model, _observed(model, window), window.n_segments, speed, self._usual_cutoff_hz, self._workspace
+        )
+
+    def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
+        """Groups for a set of excluded bins, remembered while the speed stays in the same bin."""
+        key = excluded.tobytes() + bytes([int(coarser)])
+        if key not in self._groups:
+            if len(self._groups) >= 8:
+                self._groups.clear()
+            low, high = self._machine.window.band_hz
+            widest_hz = coarser * (high - low) / _GROUPS
+            self._groups[key] = group_bins(frequencies_hz, self._machine, excluded, widest_hz)
+        return self._groups[key]
+
+    def _force_scale(self, states: tuple[str, ...], groups: BinGroups, scale: FloatArray, speed: float) -> float:
+        """Unit of forces in which equal independent sources of level one make the mean power of the nominal rotor.
+
+        A parameter point therefore stays a good start when the machine merely becomes louder.
+        """
+        model = SpectralModel(self._machine, states, groups, scale, shapes=0)
+        theta = np.zeros(model.size)
+        theta[model.cutoff_at] = np.log(self._usual_cutoff_hz)
+        theta[model.order_at] = np.log(2)
+        theta[model.noise_at] = -np.inf
+        theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
+        explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
+        return float(explained**-0.5)
+
+    def _check_explained(self, model: SpectralModel, search: FisherScoring, found: Maximum) -> None:
+        """Raise EstimationError for windows that nothing within the model comes near."""
+        excess = np.einsum("fij,fij->f", found.whitened.excess, found.whitened.excess.conj()).real
+        times = float(search.averages @ excess) / (model.n**2 * search.averages.size)
+        if times > _MOST_EXCESS or np.any(np.abs(found.theta[: len(STRUCTURAL)]) > _MOST_LOG_RATIO):
+            self.reset()
+            raise EstimationError(
+                f"{self._machine.name}: the theory does not explain this window (it deviates {times:.3g} times as much "
+                f"as sampling does, at most {_MOST_EXCESS:g} is evaluated): a sensor is at fault, or something outside "
+                "the model has changed"
+            )
+
+
+def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
+    """Estimated spectra in the model's groups and units."""
+    return np.asarray(model.groups.average(window.spectrum) / np.outer(model.scale, model.scale), dtype=np.complex128)
+
+
+def _near_rotation(frequencies_hz: FloatArray, speed_rad_s: float) -> npt.NDArray[np.bool_]:
+    """Bins around the rotation: what is left of its line there is not stochastic."""
+    width_hz = _SYNCHRONOUS_BINS * (frequencies_hz[1] - frequencies_hz[0])
+    return np.asarray(np.abs(frequencies_hz - speed_rad_s / (2 * np.pi)) <= width_hz)
+
+
+def _twins(states: tuple[str, ...], observed: ComplexArray) -> tuple[str, ...]:
+    """Two states whose difference is nothing but rounding; empty if there are none."""
+    cross = observed.real.mean(axis=0)
+    power = np.diag(cross)
+    for i, first in enumerate(states):
+        for j in range(i):
+            if power[i] + power[j] - 2 * cross[i, j] < 1e-9 * power[i]:
+                return states[j], first
+    return ()
+
+
+def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
+    """States without fluctuation: a thousand times less than another one of their kind."""
+    rates = np.array([name.endswith("_dot") for name in states])
+    largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
+    return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]

@@ -1,0 +1,140 @@
+"""Over-identification: whether a window is explained at all, and if not, what else would explain it.
+
+At the maximum of the likelihood every direction that the model does not have is tried by its score (C. R. Rao, Proc.
+Cambridge Phil. Soc. 44 (1948)): the gain of every channel, masses, a shaft that is stiffer in one plane than in the
+other. Each is standard normal where the model holds, and its one-step estimate says how large the thing would be. What
+no such direction explains shows in the total excess of estimated over theoretical spectra.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.stats
+
+from models.diagnosis.likelihood.scoring import FisherScoring, Maximum
+from models.diagnosis.likelihood.spectral_model import STRUCTURAL, SpectralModel, packed, twice_packed
+from models.diagnosis.moments import ComplexArray
+from models.machine import Machine
+from models.physics.matrices import Q_shaft
+from models.signals.block import FloatArray
+
+__all__ = ["Alternative", "Goodness", "goodness_of_fit"]
+
+_PLANES = (slice(0, 3), slice(3, 6))
+_MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
+_LEAST_INFORMATION = 1e-4
+"""An alternative of which less than this is left beside the model's own parameters cannot be told from them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """One thing outside the model, tried on a window.
+
+    Attributes
+    ----------
+    name : str
+    z : float
+        Its score in standard errors.
+    change : float
+        One-step estimate of its relative size.
+    """
+
+    name: str
+    z: float
+    change: float
+
+
+@dataclass(frozen=True, slots=True)
+class Goodness:
+    """How well the theory explains a window.
+
+    Attributes
+    ----------
+    excess_z : float
+        Total squared excess of the whitened spectra over its expectation, in standard deviations.
+    alternatives : tuple of Alternative
+        Everything tried.
+    """
+
+    excess_z: float
+    alternatives: tuple[Alternative, ...]
+
+    @property
+    def misfit_z(self) -> float:
+        """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
+        worst = max(scipy.stats.norm.logsf(self.excess_z) * -1, *(-_two_sided(one.z) for one in self.alternatives))
+        tests = len(self.alternatives) + 1
+        log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
+        return float(scipy.stats.norm.isf(np.exp(max(log_p, -700.0))))
+
+    @property
+    def suspect(self) -> str:
+        """The alternative with the largest score, if it alone is beyond 5 standard errors; else empty."""
+        if not self.alternatives:
+            return ""
+        best = max(self.alternatives, key=lambda one: abs(one.z))
+        return f"{best.name} ({best.change:+.1%})" if abs(best.z) > 5 else ""
+
+
+def _two_sided(z: float) -> float:
+    return float(np.log(2) + scipy.stats.norm.logsf(abs(z)))
+
+
+def goodness_of_fit(machine: Machine, model: SpectralModel, search: FisherScoring, found: Maximum) -> Goodness:
+    """Try the alternatives at the maximum of one window."""
+    names, slopes = _alternatives(machine, model, found)
+    excess = packed(found.whitened.excess)
+    weight = search.averages[:, None]
+    flat = found.slopes.reshape(model.size, -1)
+    weighted = (slopes * weight).reshape(len(names), -1)
+    cross = weighted @ flat.T
+    gradient = (found.slopes * weight).reshape(model.size, -1) @ excess.ravel()
+    projection = np.linalg.solve(found.information, cross.T).T
+    score = weighted @ excess.ravel() - projection @ gradient
+    alone = np.einsum("af,af->a", weighted, slopes.reshape(len(names), -1))
+    left = alone - np.einsum("ap,ap->a", projection, cross)
+    alternatives = tuple(
+        Alternative(name, float(s / np.sqrt(i)), float(s / i))
+        for name, s, i, a in zip(names, score, left, alone, strict=True)
+        if i > _LEAST_INFORMATION * a
+    )
+    return Goodness(_excess_z(model, search, found), alternatives)
+
+
+def _excess_z(model: SpectralModel, search: FisherScoring, found: Maximum) -> float:
+    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖², n² per group where the model holds, over its expectation and standard deviation."""
+    averages = search.averages
+    total = float(averages @ np.einsum("fij,fij->f", found.whitened.excess, found.whitened.excess.conj()).real)
+    degrees = model.n**2 * averages.size
+    return float((total - degrees) / np.sqrt(2 * degrees))
+
+
+def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
+    """Names and packed slopes of everything tried, shape (n_alternatives, n_groups, n²)."""
+    point, L_inverse = found.whitened.point, found.whitened.L_inverse
+    whitened: ComplexArray = L_inverse[:, None] @ point.G
+    response: ComplexArray = whitened @ point.C
+    names, slopes = [], []
+    coloured = point.S @ L_inverse.conj().swapaxes(1, 2)
+    for number, state in enumerate(model.states):
+        outer = L_inverse[:, :, number, None] * coloured[:, None, number, :]
+        names.append(f"gain of {state}")
+        slopes.append(twice_packed(outer))
+    w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
+    rotor = machine.rotor
+    for (name, dofs), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):
+        names.append(name)
+        slopes.append(
+            np.sum([model.local_slope(point, whitened, response, dof, dof, w2 * mass) for dof in dofs], axis=0)
+        )
+    shaft = Q_shaft(rotor) * np.exp(found.theta[STRUCTURAL.index("EI")])
+    one = np.ones_like(w2)
+    unequal = np.zeros_like(slopes[0])
+    for sign, plane in zip((1, -1), _PLANES, strict=True):
+        for row in range(plane.start, plane.stop):
+            for column in range(plane.start, plane.stop):
+                element = -sign * shaft[row, column] * one
+                unequal = unequal + model.local_slope(point, whitened, response, row, column, element)
+    names.append("shaft stiffer in y than in z")
+    slopes.append(unequal)
+    return names, np.stack(slopes)

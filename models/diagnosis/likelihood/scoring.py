@@ -1,0 +1,233 @@
+"""Fisher scoring: the search for the maximum of one window's Whittle likelihood."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, packed
+from models.diagnosis.moments import ComplexArray
+from models.signals.block import FloatArray
+
+__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened", "Workspace"]
+
+LOG_NOISE = float(np.log(1e-3))
+"""Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
+
+_WEAK = 0.05
+"""Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of
+low rank, or a channel without visible noise, leaves them undetermined."""
+_COLOUR, _SHAPE = 1.0, 0.5
+"""The same for the noise's colour and the forces' colour."""
+_CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
+"""The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
+keeps the order: on coarse groups a filter of order nought would pass for anything."""
+
+
+@dataclass(frozen=True, slots=True)
+class Whitened:
+    """Spectra at a point seen through its own Cholesky factors S = L Lᴴ.
+
+    Attributes
+    ----------
+    point : ModelPoint
+    L_inverse : ndarray, shape (n_groups, n, n)
+    excess : ndarray, shape (n_groups, n, n)
+        L⁻¹ Ŝ L⁻ᴴ - I: zero where theory and estimate agree.
+    """
+
+    point: ModelPoint
+    L_inverse: ComplexArray
+    excess: ComplexArray
+
+
+@dataclass(frozen=True, slots=True)
+class Maximum:
+    """Where a search ended.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (size,)
+        The parameter point.
+    information : ndarray, shape (size, size)
+        Fisher information there, on the elements of C (not of T).
+    slopes : ndarray, shape (size, n_groups, n²)
+        Whitened slopes it is made of.
+    whitened : Whitened
+        Theory and estimate there.
+    steps : int
+        Steps tried.
+    remaining : ndarray, shape (n_diagnosed,)
+        Step of the diagnosed parameters that the search would still take; a small part of a standard error if it has
+        converged.
+    """
+
+    theta: FloatArray
+    information: FloatArray
+    slopes: FloatArray
+    whitened: Whitened
+    steps: int
+    remaining: FloatArray
+
+
+class Workspace:
+    """Large arrays that one search after the other uses: allocating them takes longer than filling them."""
+
+    def __init__(self) -> None:
+        self._arrays: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
+
+    def arrays(self, shape: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
+        """Return two arrays of this shape with arbitrary contents."""
+        if shape not in self._arrays:
+            if len(self._arrays) >= 4:
+                self._arrays.clear()
+            self._arrays[shape] = np.empty(shape), np.empty(shape)
+        return self._arrays[shape]
+
+
+class FisherScoring:
+    """Fisher scoring with Levenberg-Marquardt damping: a step counts only if the likelihood rises.
+
+    The levels move as T of C = T Tᵀ. Where the data want less of a direction than there is, T's own curvature is added
+    to the information; without it the small columns of an excitation of low rank overshoot, and every other parameter
+    waits for them.
+
+    Parameters
+    ----------
+    model : SpectralModel
+    observed : ndarray, shape (n_groups, n, n)
+        Estimated cross-spectra in units of the model's scale.
+    n_segments : int
+        Segments they are averaged over.
+    speed_rad_s : float
+    usual_cutoff_hz : float
+        Where the cutoff is pulled, weakly, if the band does not show it.
+    workspace : Workspace, optional
+        Shared by searches that follow each other; the slopes of a `Maximum` are valid until the next one.
+    """
+
+    def __init__(
+        self,
+        model: SpectralModel,
+        observed: ComplexArray,
+        n_segments: int,
+        speed_rad_s: float,
+        usual_cutoff_hz: float,
+        workspace: "Workspace | None" = None,
+    ) -> None:
+        workspace = Workspace() if workspace is None else workspace
+        self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
+        self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
+        self._slopes, self._weighted = workspace.arrays((model.size, self.averages.size, model.n * model.n))
+        self._ridge = np.full(model.size, _WEAK)
+        self._ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
+        self._ridge[model.colour_at] = _COLOUR
+        self._ridge[model.shape_at] = _SHAPE
+        self._ridge[model.cutoff_at] = _CUTOFF
+        self._ridge[model.order_at] = _ORDER if model.shapes else _FIXED
+        self.centre = np.zeros(model.size)
+        self.centre[model.noise_at] = LOG_NOISE
+        self.centre[model.cutoff_at] = np.log(usual_cutoff_hz)
+        self.centre[model.order_at] = np.log(2)
+
+    def maximise(self, theta: FloatArray, most_steps: int, near: float, gain: float) -> Maximum:
+        """Search from a starting point.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (size,)
+        most_steps : int
+        near, gain : float
+            Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
+            gain less than `gain` in log-likelihood.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the information is singular: the window says nothing about a parameter.
+        """
+        model = self._model
+        diagnosed, logarithms = slice(model.cutoff_at), slice(model.level_at.start)
+        damping, steps = 1e-3, 0
+        value, whitened = self._value(theta)
+        if whitened is None:
+            raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
+        gradient, information, slopes, on_levels = self._scores(theta, whitened)
+        while True:
+            covariance = np.linalg.inv(information)
+            full_step = np.asarray(covariance @ gradient, dtype=np.float64)
+            is_near = np.all(full_step[diagnosed] ** 2 < near**2 * np.diag(covariance)[diagnosed])
+            if steps == most_steps or damping > 1e8 or (is_near and gradient @ full_step / 2 < gain):
+                break
+            steps += 1
+            step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+            trial = theta + step
+            # Logarithms move by one at most, for far from the data the theory misleads. A variance moves as the
+            # scoring step on the variance itself says.
+            trial[logarithms] = theta[logarithms] + np.clip(step[logarithms], -1, 1)
+            trial[model.noise_at] = theta[model.noise_at] + np.log(np.clip(1 + step[model.noise_at], 0.2, 4))
+            trial_value, trial_whitened = self._value(trial)
+            if trial_whitened is not None and trial_value > value:
+                theta, value, whitened = trial, trial_value, trial_whitened
+                gradient, information, slopes, on_levels = self._scores(theta, whitened)
+                damping = max(damping / 8, 1e-7)
+            else:
+                damping *= 8
+        return Maximum(theta, on_levels, slopes, whitened, steps, full_step[diagnosed])
+
+    def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
+        """Log-likelihood and the weak pulls, up to a constant."""
+        point = self._model.at(theta, self._speed_rad_s)
+        try:
+            L = np.linalg.cholesky(point.S)
+        except np.linalg.LinAlgError:
+            return -np.inf, None
+        log_determinant = 2 * np.log(np.einsum("fii->fi", L).real).sum(axis=1)
+        L_inverse = np.asarray(np.linalg.inv(L), dtype=np.complex128)
+        excess = L_inverse @ self._observed @ L_inverse.conj().swapaxes(1, 2)
+        trace = np.einsum("fii->f", excess).real
+        diagonal = np.arange(self._model.n)
+        excess[:, diagonal, diagonal] -= 1
+        pull = self._ridge @ (theta - self.centre) ** 2 / 2
+        return float(-self.averages @ (log_determinant + trace) - pull), Whitened(point, L_inverse, excess)
+
+    def _scores(self, theta: FloatArray, whitened: Whitened) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Gradient, information for the step (both by T), packed slopes, and information by C."""
+        model = self._model
+        slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
+        root = np.sqrt(self.averages)[:, None]
+        weighted = np.multiply(slopes, root, out=self._weighted).reshape(model.size, -1)
+        gradient: FloatArray = weighted @ (packed(whitened.excess) * root).ravel()
+        on_levels: FloatArray = weighted @ weighted.T
+        levels = model.level_at
+        chain = _levels_by_factor(model.factor(theta))
+        information = on_levels.copy()
+        information[levels] = chain.T @ information[levels]
+        information[:, levels] = information[:, levels] @ chain
+        information[levels, levels] += _curvature(gradient[levels])
+        gradient[levels] = chain.T @ gradient[levels]
+        gradient -= self._ridge * (theta - self.centre)
+        information[np.diag_indices(model.size)] += self._ridge
+        # On C itself the pull is next to nothing: it only keeps directions invertible that no sensor sees.
+        pull = self._ridge.copy()
+        pull[levels] = 1e-3
+        on_levels[np.diag_indices(model.size)] += pull
+        return gradient, information, slopes, on_levels
+
+
+def _levels_by_factor(T: FloatArray) -> FloatArray:
+    """∂C/∂T of C = T Tᵀ between the lower triangles, shape (21, 21)."""
+    unit = np.zeros((ROWS.size, 6, 6))
+    unit[np.arange(ROWS.size), ROWS, COLUMNS] = 1
+    change = unit @ T.T
+    change = change + change.swapaxes(1, 2)
+    return np.asarray(change[:, ROWS, COLUMNS].T, dtype=np.float64)
+
+
+def _curvature(gradient: FloatArray) -> FloatArray:
+    """What T's second derivatives add to the information: 2 tr(δTᵀ N δT), N the part of -∂/∂C that is positive."""
+    N = np.zeros((6, 6))
+    N[ROWS, COLUMNS] = N[COLUMNS, ROWS] = -gradient * np.where(ROWS == COLUMNS, 1.0, 0.5)
+    values, vectors = np.linalg.eigh(N)
+    N = (vectors * np.maximum(values, 0)) @ vectors.T
+    return np.asarray(2 * N[np.ix_(ROWS, ROWS)] * (COLUMNS[:, None] == COLUMNS), dtype=np.float64)

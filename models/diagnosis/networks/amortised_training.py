@@ -1,0 +1,248 @@
+"""Training of the amortised networks on a stream of fresh windows, and their calibration on windows simulated in time.
+
+Each step sees windows drawn at random from a buffer that is being renewed all the time. A fixed set of training windows
+would be learned by heart: the networks' variances shrink to the errors on that set. The negative logarithm of the
+normal density diverges at high learning rates; gradients are clipped and the rate falls along a half cosine.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from models.diagnosis.networks.amortised import (
+    LAYERS,
+    LIMIT,
+    OWN,
+    AmortisedNetwork,
+    AmortisedNetworks,
+    Calibration,
+    NetworkDiagnostician,
+)
+from models.diagnosis.networks.features import FeatureBasis, Float32Array, fit_basis
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine
+from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
+
+__all__ = ["calibrate_networks", "train_networks"]
+
+_BATCH = 512
+_PASSES = 3.0
+"""How often a window is seen on average."""
+_BUFFER = 160_000
+_WARM_UP = 24_000
+"""Windows in the buffer before the first step: they standardise the inputs."""
+_RATE, _RATE_RISES_OVER = 2e-3, 100
+_WEIGHT_DECAY = 2e-2
+_USUAL = 0.3
+"""Standard deviation of the drawn logarithmic ratios, about: the networks work in units of it."""
+_NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
+_KNOTS = 3
+
+
+class _Learner:
+    """One equation's network while it learns."""
+
+    def __init__(self, equation: str, n_inputs: int, generator: torch.Generator) -> None:
+        self.equation = equation
+        self.targets = [PARAMETERS.index(name) for name in OWN[equation]]
+        self.n_inputs = n_inputs
+        p = len(self.targets)
+        sizes = (n_inputs, *LAYERS, 1 + 1 if p == 1 else 5)
+        self.weights = [torch.randn(a, b, generator=generator) * (0.5 / a**0.5) for a, b in pairwise(sizes)]
+        self.weights[-1] *= 0.1
+        self.biases = [torch.zeros(b) for b in sizes[1:]]
+        self.direct = torch.zeros(n_inputs, p)
+        parts = [*self.weights, *self.biases, self.direct]
+        for part in parts:
+            part.requires_grad_(True)
+        self.parts = parts
+        self.optimiser = torch.optim.AdamW(parts, lr=_RATE, weight_decay=_WEIGHT_DECAY)
+
+    def step(self, inputs: torch.Tensor, log_ratio: torch.Tensor, rate: float) -> None:
+        """Take one step on a batch."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        self.optimiser.zero_grad()
+        loss = self._loss(inputs[:, : self.n_inputs], log_ratio[:, self.targets] / _USUAL)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch annotates it only in part
+        torch.nn.utils.clip_grad_norm_(self.parts, 1.0)
+        self.optimiser.step()
+
+    def _loss(self, inputs: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        """Negative logarithm of the normal density."""
+        hidden = inputs
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            hidden = torch.nn.functional.silu(hidden @ weight + bias)
+        out = hidden @ self.weights[-1] + self.biases[-1]
+        p = len(self.targets)
+        error = target - out[:, :p] - inputs @ self.direct
+        log_deviation = out[:, p : 2 * p]
+        white = error * torch.exp(-log_deviation)
+        if p == 2:
+            white = torch.stack([white[:, 0], white[:, 1] - out[:, 4] * white[:, 0]], dim=1)
+        return torch.mean(torch.sum(white**2 / 2 + log_deviation, dim=1))
+
+    def finished(self) -> AmortisedNetwork:
+        """Return the network in units of the logarithmic ratio."""
+        p = len(self.targets)
+        weights = [_array(weight) for weight in self.weights]
+        biases = [_array(bias) for bias in self.biases]
+        weights[-1][:, :p] *= _USUAL
+        biases[-1][:p] *= _USUAL
+        biases[-1][p : 2 * p] += np.log(_USUAL).astype(np.float32)
+        return AmortisedNetwork(self.equation, tuple(weights), tuple(biases), _array(self.direct) * np.float32(_USUAL))
+
+
+def train_networks(
+    machine: Machine,
+    states: tuple[str, ...],
+    principal: tuple[Float32Array, Float32Array],
+    n_common: int,
+    batches: Iterable[tuple[Float32Array, Float32Array]],
+    expected_windows: int,
+    log_range: float,
+    seed: int,
+    progress: Callable[[int], None] = lambda _: None,
+) -> AmortisedNetworks:
+    """Train the networks of all equations on a stream of batches.
+
+    Parameters
+    ----------
+    machine : Machine
+    states : tuple of str
+        Measured states that the features were made of.
+    principal : tuple of ndarray
+        Mean and directions that condensed them.
+    n_common : int
+        Features that all networks share; the rest are equation 29's.
+    batches : iterable of (features, logarithmic ratios)
+        Condensed features, shape (n_windows, n_features), and targets, shape (n_windows, 6).
+    expected_windows : int
+        Windows in all batches together: it sets the course of the learning rate.
+    log_range : float
+        Largest drawn logarithmic ratio.
+    seed : int
+        Of initial weights and of the choice from the buffer.
+    progress : callable
+        Called with the number of windows of each batch.
+
+    Raises
+    ------
+    EstimationError
+        If the batches hold too few windows to start, or the training diverges.
+    """
+    torch.set_num_threads(1)  # the windows are made by processes beside it, and sums keep their order
+    generator = torch.Generator().manual_seed(seed)
+    warm_up = min(_WARM_UP, expected_windows // 2)
+    buffer = _Buffer(min(_BUFFER, expected_windows))
+    total_steps = max(1, int(_PASSES * (expected_windows - warm_up) / _BATCH))
+    basis: FeatureBasis | None = None
+    learners: list[_Learner] = []
+    step = 0
+    for features, log_ratio in batches:
+        buffer.add(features, log_ratio)
+        progress(features.shape[0])
+        if buffer.seen < warm_up:
+            continue
+        if basis is None:
+            basis = fit_basis(*principal, buffer.features[: buffer.filled], n_common)
+            n_all = features.shape[1]
+            equations = [number for number in OWN if number != "29" or n_all > n_common]
+            learners = [_Learner(number, n_all if number == "29" else n_common, generator) for number in equations]
+        due = int(_PASSES * (buffer.seen - warm_up) / _BATCH)
+        while step < min(due, total_steps):
+            chosen = torch.randint(buffer.filled, (_BATCH,), generator=generator).numpy()
+            inputs = torch.from_numpy(np.clip(basis.standardised(buffer.features[chosen]), -LIMIT, LIMIT))
+            targets = torch.from_numpy(buffer.log_ratio[chosen])
+            rate = _RATE * min(1.0, (step + 1) / _RATE_RISES_OVER) * 0.5 * (1 + np.cos(np.pi * step / total_steps))
+            for learner in learners:
+                learner.step(inputs, targets, rate)
+            step += 1
+    if basis is None:
+        raise EstimationError(f"{machine.name}: {buffer.seen} windows are too few to train on, expected {warm_up}")
+    networks = tuple(learner.finished() for learner in learners)
+    if not all(np.all(np.isfinite(part)) for network in networks for part in (*network.weights, *network.biases)):
+        raise EstimationError(f"{machine.name}: training of the amortised networks diverged")
+    novelty = basis.novelty(basis.standardised(buffer.features[: buffer.filled]))
+    limit = float(np.quantile(novelty, _NOVELTY_QUANTILE)) * _NOVELTY_MARGIN
+    return AmortisedNetworks(states, basis, networks, {}, limit, log_range)
+
+
+class _Buffer:
+    """The latest windows of the stream."""
+
+    def __init__(self, size: int) -> None:
+        self._size = size
+        self.seen = 0
+        self.features: Float32Array = np.empty((0, 0), dtype=np.float32)
+        self.log_ratio: Float32Array = np.empty((size, len(PARAMETERS)), dtype=np.float32)
+
+    @property
+    def filled(self) -> int:
+        """Windows in it."""
+        return min(self.seen, self._size)
+
+    def add(self, features: Float32Array, log_ratio: Float32Array) -> None:
+        """Put windows in the place of the oldest ones."""
+        if not self.seen:
+            self.features = np.empty((self._size, features.shape[1]), dtype=np.float32)
+        places = (self.seen + np.arange(features.shape[0])) % self._size
+        self.features[places], self.log_ratio[places] = features, log_ratio
+        self.seen += features.shape[0]
+
+
+def calibrate_networks(
+    machine: Machine, trained: AmortisedNetworks, windows: Sequence[tuple[WindowStatistics, dict[str, float]]]
+) -> AmortisedNetworks:
+    """Measure bias and true size of the standard errors on windows simulated in time.
+
+    Parameters
+    ----------
+    machine : Machine
+    trained : AmortisedNetworks
+    windows : sequence of (WindowStatistics, relative changes)
+        From seeds of their own, in all layouts; parameters that are not named are nominal.
+    """
+    reader = NetworkDiagnostician(machine, trained)
+    found: dict[str, list[tuple[float, float]]] = {}
+    for window, changes in windows:
+        inputs = reader.inputs(window)
+        if inputs is None:
+            continue
+        for network in trained.networks:
+            n_inputs = network.direct.shape[0]
+            if inputs.shape[1] < n_inputs:
+                continue
+            mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
+            deviation = np.sqrt(np.einsum("ij,ij->i", factor[0], factor[0]))
+            for position, name in enumerate(OWN[network.equation]):
+                error = float(mean[0, position] - np.log1p(changes.get(name, 0.0)))
+                found.setdefault(name, []).append((error, float(deviation[position])))
+    calibration = {name: _calibration(np.array(pairs)) for name, pairs in found.items()}
+    return AmortisedNetworks(
+        trained.states, trained.basis, trained.networks, calibration, trained.novelty_limit, trained.log_range
+    )
+
+
+def _calibration(pairs: FloatArray) -> Calibration:
+    """Bias and scale of z in thirds of the stated standard error: what is easy to see and what is hard differ."""
+    error, deviation = pairs[:, 0], pairs[:, 1]
+    # Weighted median: windows that see the parameter well decide.
+    order, weight = np.argsort(error), 1 / deviation**2
+    cumulated = np.cumsum(weight[order])
+    bias = float(error[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
+    z = np.abs(error - bias) / deviation
+    knots, scales = [], []
+    for part in np.array_split(np.argsort(deviation), _KNOTS):
+        knots.append(float(np.median(np.log(deviation[part]))))
+        # Two quantiles scatter less than one.
+        scales.append(float(np.mean(np.quantile(z[part], [0.9, 0.95]) / [1.644854, 1.959964])))
+    return Calibration(bias, tuple(knots), tuple(scales))
+
+
+def _array(part: torch.Tensor) -> Float32Array:
+    return np.ascontiguousarray(part.detach().numpy(), dtype=np.float32).copy()

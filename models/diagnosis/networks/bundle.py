@@ -1,0 +1,377 @@
+"""The trained bundle: a manifest (JSON) and weights (safetensors) in one directory. No code in it, no pickle.
+
+::
+
+    lab/
+    ├── manifest.json        machine, equations, units, seeds, versions, healthy spread, hash of the weights
+    └── weights.safetensors  relation networks, float64: 28.input_scale, 28.W1, …
+                             amortised networks, float32: basis.mean, …, amortised.28.W1, …
+
+Loading refuses a bundle that is damaged or was trained for another machine, and says what differs.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
+
+from models.diagnosis.networks.amortised import LAYERS, OWN, AmortisedNetwork, AmortisedNetworks, Calibration
+from models.diagnosis.networks.features import FeatureBasis
+from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy, Network, equation_by_number
+from models.errors import BundleError
+from models.machine import Machine
+
+__all__ = ["Bundle", "Manifest", "Training", "load_bundle", "save_bundle"]
+
+_SHIPPED = Path(__file__).parents[2] / "bundles"
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+_Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
+_FORMAT = 2
+_PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
+_BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
+_ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
+
+
+class HealthyEntry(BaseModel):
+    """Healthy spread of one equation, see `models.diagnosis.networks.relation.Healthy`."""
+
+    model_config = _STRICT
+
+    windows: int = Field(ge=1)
+    msd: float = Field(ge=0)
+    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...]
+    spread: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
+
+
+class EquationEntry(BaseModel):
+    """One equation of the bundle."""
+
+    model_config = _STRICT
+
+    number: str
+    channels: tuple[str, ...] = Field(description="measured states in order, references first")
+    units: Literal["SI"] = Field(default="SI", description="units of the channels")
+    inputs: tuple[str, ...] = Field(description="inputs in order, divided by the rms of the target")
+    parameters: tuple[str, ...]
+    hidden: int
+    healthy: HealthyEntry
+
+
+class CalibrationEntry(BaseModel):
+    """Calibration of one parameter, see `models.diagnosis.networks.amortised.Calibration`."""
+
+    model_config = _STRICT
+
+    bias: float = Field(allow_inf_nan=False)
+    log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
+    z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
+
+
+class AmortisedEntry(BaseModel):
+    """The amortised networks, see `models.diagnosis.networks.amortised.AmortisedNetworks`."""
+
+    model_config = _STRICT
+
+    channels: tuple[str, ...] = Field(min_length=1, description="measured states in order")
+    units: Literal["SI"] = Field(default="SI", description="units of the channels")
+    equations: tuple[Literal["28", "29", "30", "31"], ...]
+    layers: tuple[int, ...]
+    calibration: dict[str, CalibrationEntry]
+    calibration_windows: int = Field(ge=1)
+    novelty_limit: float = Field(gt=0, allow_inf_nan=False)
+    log_range: float = Field(gt=0, allow_inf_nan=False)
+
+
+class Training(BaseModel):
+    """How the bundle was made: enough to make it again."""
+
+    model_config = _STRICT
+
+    seed: int
+    training_windows: int
+    calibration_windows: int
+    drawn_conditions: int = Field(default=0, description="random machines and conditions of the amortised networks")
+    versions: dict[str, str]
+
+
+class Manifest(BaseModel):
+    """What a bundle says about itself."""
+
+    model_config = _STRICT
+
+    format: int
+    machine: str
+    physics: dict[str, Any] = Field(description="rotor, operation, condition, rate and window it was trained for")
+    equations: tuple[EquationEntry, ...]
+    amortised: AmortisedEntry | None = None
+    training: Training
+    weights_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """Trained networks of one machine.
+
+    Attributes
+    ----------
+    manifest : Manifest
+    networks : tuple of EquationNetwork
+        Relation networks in the order of the equation table.
+    amortised : AmortisedNetworks or None
+    """
+
+    manifest: Manifest
+    networks: tuple[EquationNetwork, ...]
+    amortised: AmortisedNetworks | None = None
+
+    @property
+    def identity(self) -> str:
+        """Twelve hexadecimal digits that change with anything in the bundle."""
+        return hashlib.sha256(_canonical(self.manifest)).hexdigest()[:12]
+
+
+def _canonical(manifest: Manifest) -> bytes:
+    return json.dumps(manifest.model_dump(mode="json"), sort_keys=True, indent=1).encode()
+
+
+def _physics(machine: Machine) -> dict[str, Any]:
+    return json.loads(json.dumps(machine.model_dump(mode="json", include=set(_PHYSICS))))  # type: ignore[no-any-return]
+
+
+def save_bundle(
+    directory: Path,
+    machine: Machine,
+    networks: tuple[EquationNetwork, ...],
+    training: Training,
+    amortised: AmortisedNetworks | None = None,
+) -> Bundle:
+    """Write a bundle.
+
+    Raises
+    ------
+    BundleError
+        If a network is not calibrated or the directory cannot be written.
+    """
+    arrays: _Arrays = {}
+    entries = []
+    for trained in networks:
+        number, healthy = trained.equation.number, trained.healthy
+        if healthy is None:
+            raise BundleError(f"{directory}: equation {number} has no healthy spread: calibrate it before saving")
+        for name in _ARRAYS:
+            arrays[f"{number}.{name}"] = np.ascontiguousarray(getattr(trained.network, name))
+        entries.append(
+            EquationEntry(
+                number=number,
+                channels=trained.equation.channels,
+                inputs=trained.equation.input_names,
+                parameters=trained.equation.parameters,
+                hidden=HIDDEN,
+                healthy=HealthyEntry(
+                    windows=healthy.windows, msd=healthy.msd, z_scale=healthy.z_scale, spread=healthy.spread
+                ),
+            )
+        )
+    entry = None
+    if amortised is not None:
+        if set(amortised.calibration) != {name for network in amortised.networks for name in OWN[network.equation]}:
+            raise BundleError(f"{directory}: the amortised networks are not calibrated: calibrate them before saving")
+        arrays |= _amortised_arrays(amortised)
+        entry = _amortised_entry(amortised, training)
+    weights = save(arrays)
+    manifest = Manifest(
+        format=_FORMAT,
+        machine=machine.name,
+        physics=_physics(machine),
+        equations=tuple(entries),
+        amortised=entry,
+        training=training,
+        weights_sha256=hashlib.sha256(weights).hexdigest(),
+    )
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / "weights.safetensors").write_bytes(weights)
+        (directory / "manifest.json").write_bytes(_canonical(manifest) + b"\n")
+    except OSError as error:
+        raise BundleError(f"{directory}: cannot be written ({error.strerror})") from error
+    return Bundle(manifest, networks, amortised)
+
+
+def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
+    """Load a bundle and check that it belongs to a machine.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        "lab" (shipped), or a directory.
+    machine : Machine
+        The machine it must have been trained for: rotor, operation, condition range, rate and window.
+
+    Raises
+    ------
+    BundleError
+        Naming what is missing, damaged, or different, with both values.
+    """
+    directory = Path(name_or_path)
+    if not directory.is_dir() and (_SHIPPED / str(name_or_path)).is_dir():
+        directory = _SHIPPED / str(name_or_path)
+    try:
+        manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
+        weights = (directory / "weights.safetensors").read_bytes()
+    except OSError as error:
+        raise BundleError(f"{directory}: not a bundle: {Path(error.filename).name}: {error.strerror}") from error
+    except ValidationError as error:
+        raise BundleError(f"{directory}/manifest.json: {error}") from error
+    if manifest.format != _FORMAT:
+        raise BundleError(f"{directory}: format is {manifest.format}, this program reads {_FORMAT}")
+    digest = hashlib.sha256(weights).hexdigest()
+    if digest != manifest.weights_sha256:
+        raise BundleError(
+            f"{directory}/weights.safetensors: sha256 is {digest[:12]}…, "
+            f"the manifest says {manifest.weights_sha256[:12]}…"
+        )
+    numbers = [entry.number for entry in manifest.equations]
+    if len(set(numbers)) < len(numbers):
+        raise BundleError(f"{directory}: an equation occurs twice: {', '.join(numbers)}")
+    differences = list(_differences(manifest.physics, _physics(machine)))
+    if differences:
+        raise BundleError(
+            f"{directory}: trained for another machine than {machine.site}/{machine.name}: {'; '.join(differences)}"
+        )
+    try:
+        arrays = load(weights)
+    except SafetensorError as error:
+        raise BundleError(f"{directory}/weights.safetensors: {error}") from error
+    amortised = None if manifest.amortised is None else _amortised(directory, manifest.amortised, arrays)
+    return Bundle(manifest, tuple(_network(directory, entry, arrays) for entry in manifest.equations), amortised)
+
+
+def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> EquationNetwork:
+    """One equation's network, checked against this program's equation table."""
+    where = f"{directory}: equation {entry.number}"
+    try:
+        equation = equation_by_number(entry.number)
+    except KeyError:
+        raise BundleError(f"{where} is not in this program's table") from None
+    checks: tuple[tuple[str, object, object], ...] = (
+        ("channels", entry.channels, equation.channels),
+        ("inputs", entry.inputs, equation.input_names),
+        ("parameters", entry.parameters, equation.parameters),
+        ("hidden", entry.hidden, HIDDEN),
+        ("lengths of z_scale and spread", _lengths(entry.healthy), (len(entry.parameters),) * 2),
+    )
+    for field, found, expected in checks:
+        if found != expected:
+            raise BundleError(f"{where}: {field} are {found}, this program expects {expected}")
+    n_inputs = len(equation.input_names)
+    shapes = {"input_scale": (n_inputs,), "W1": (n_inputs, HIDDEN), "b1": (HIDDEN,), "W2": (HIDDEN,), "b2": (1,)}
+    parts = []
+    for name in _ARRAYS:
+        array = arrays.get(f"{entry.number}.{name}")
+        if array is None or array.shape != shapes[name] or array.dtype != np.float64 or not np.isfinite(array).all():
+            state = "missing" if array is None else f"{array.dtype}{array.shape}"
+            raise BundleError(f"{where}: weight {name} is {state}, expected finite float64{shapes[name]}")
+        if name == "input_scale" and not np.all(array > 0):
+            raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
+        parts.append(array)
+    healthy = Healthy(entry.healthy.windows, entry.healthy.msd, entry.healthy.z_scale, entry.healthy.spread)
+    return EquationNetwork(equation, Network(*parts), healthy)
+
+
+def _amortised_arrays(amortised: AmortisedNetworks) -> _Arrays:
+    arrays: _Arrays = {f"basis.{name}": np.ascontiguousarray(getattr(amortised.basis, name)) for name in _BASIS}
+    for network in amortised.networks:
+        where = f"amortised.{network.equation}"
+        for number, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
+            arrays[f"{where}.W{number}"], arrays[f"{where}.b{number}"] = weight, bias
+        arrays[f"{where}.direct"] = network.direct
+    return arrays
+
+
+def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> AmortisedEntry:
+    return AmortisedEntry.model_validate(
+        {
+            "channels": amortised.states,
+            "equations": tuple(network.equation for network in amortised.networks),
+            "layers": LAYERS,
+            "calibration": {
+                name: {"bias": one.bias, "log_deviation": one.log_deviation, "z_scale": one.z_scale}
+                for name, one in amortised.calibration.items()
+            },
+            "calibration_windows": training.calibration_windows,
+            "novelty_limit": amortised.novelty_limit,
+            "log_range": amortised.log_range,
+        }
+    )
+
+
+def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> AmortisedNetworks:
+    """The amortised networks, every array checked against what the others say its shape must be."""
+    where = f"{directory}: amortised networks"
+    if entry.layers != LAYERS:
+        raise BundleError(f"{where}: layers are {entry.layers}, this program expects {LAYERS}")
+    parameters = {name for number in entry.equations for name in OWN[number]}
+    if set(entry.calibration) != parameters:
+        raise BundleError(f"{where}: calibrated are {sorted(entry.calibration)}, expected {sorted(parameters)}")
+    for name, one in entry.calibration.items():
+        if len(one.log_deviation) != len(one.z_scale) or list(one.log_deviation) != sorted(one.log_deviation):
+            raise BundleError(f"{where}: calibration of {name}: expected ascending log_deviation, one z_scale for each")
+    n_inputs = arrays.get("basis.centre", np.empty(0)).size
+    n_common = arrays.get("basis.precision_factor", np.empty((0, 0))).shape[0]
+    n_series, n_bins, n_kept = arrays.get("basis.directions", np.empty((0, 0, 0))).shape
+    shapes: dict[str, tuple[int, ...]] = {
+        "basis.mean": (n_series, 1, n_bins),
+        "basis.directions": (n_series, n_bins, n_kept),
+        "basis.centre": (n_inputs,),
+        "basis.scale": (n_inputs,),
+        "basis.precision_factor": (n_common, n_common),
+    }
+    for number in entry.equations:
+        own = len(OWN[number])
+        first = n_inputs if number == "29" else n_common
+        sizes = (first, *LAYERS, 2 * own + own * (own - 1) // 2)
+        for layer, (n_in, n_out) in enumerate(pairwise(sizes), start=1):
+            shapes[f"amortised.{number}.W{layer}"] = (n_in, n_out)
+            shapes[f"amortised.{number}.b{layer}"] = (n_out,)
+        shapes[f"amortised.{number}.direct"] = (first, own)
+    for name, shape in shapes.items():
+        array = arrays.get(name)
+        if array is None or array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
+            state = "missing" if array is None else f"{array.dtype}{array.shape}"
+            raise BundleError(f"{where}: {name} is {state}, expected finite float32{shape}")
+    basis = FeatureBasis(*(arrays[f"basis.{name}"] for name in _BASIS))
+    layers = range(1, len(LAYERS) + 2)
+    networks = tuple(
+        AmortisedNetwork(
+            number,
+            tuple(arrays[f"amortised.{number}.W{layer}"] for layer in layers),
+            tuple(arrays[f"amortised.{number}.b{layer}"] for layer in layers),
+            arrays[f"amortised.{number}.direct"],
+        )
+        for number in entry.equations
+    )
+    calibration = {
+        name: Calibration(one.bias, one.log_deviation, one.z_scale) for name, one in entry.calibration.items()
+    }
+    return AmortisedNetworks(entry.channels, basis, networks, calibration, entry.novelty_limit, entry.log_range)
+
+
+def _lengths(healthy: HealthyEntry) -> tuple[int, int]:
+    return len(healthy.z_scale), len(healthy.spread)
+
+
+def _differences(trained: Any, present: Any, path: str = "") -> list[str]:
+    """Fields whose values differ, with both values."""
+    if isinstance(trained, dict) and isinstance(present, dict):
+        found: list[str] = []
+        for key in sorted({*trained, *present}):
+            found += _differences(trained.get(key), present.get(key), f"{path}.{key}" if path else str(key))
+        return found
+    return [] if trained == present else [f"{path} is {present}, trained for {trained}"]

@@ -1,0 +1,204 @@
+"""The per-equation network: one hidden layer of fifteen (Eq. 32), evaluated in numpy.
+
+Training needs torch, evaluation does not: the monitor starts without it and gives the same numbers everywhere.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.networks.equations import (
+    EQUATIONS,
+    Equation,
+    EquationRows,
+    StatisticsView,
+    SynchronousEquation,
+    missing,
+)
+from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
+from models.diagnosis.window import WindowStatistics
+from models.machine import Machine
+from models.signals.block import FloatArray
+
+__all__ = [
+    "HIDDEN",
+    "EquationNetwork",
+    "Healthy",
+    "Network",
+    "RelationDiagnostician",
+    "equation_by_number",
+    "hop_views",
+    "read_equation",
+    "window_view",
+]
+
+HIDDEN = 15
+"""Neurons of the hidden layer, as in the paper."""
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """A multi-layer perceptron with one hidden layer and one output.
+
+    Attributes
+    ----------
+    input_scale : ndarray, shape (n_inputs,)
+        Inputs are divided by it.
+    W1, b1 : ndarray, shapes (n_inputs, 15) and (15,)
+    W2 : ndarray, shape (15,)
+    b2 : ndarray, shape (1,)
+    """
+
+    input_scale: FloatArray
+    W1: FloatArray
+    b1: FloatArray
+    W2: FloatArray
+    b2: FloatArray
+
+    def __call__(self, inputs: FloatArray) -> FloatArray:
+        """Output for each row of inputs, shape (n_rows,)."""
+        hidden = np.tanh(inputs / self.input_scale @ self.W1 + self.b1)
+        return np.asarray(hidden @ self.W2 + self.b2[0], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Healthy:
+    """How an equation reads on healthy windows that training did not see.
+
+    Attributes
+    ----------
+    windows : int
+        How many.
+    msd : float
+        Mean of the mean squared deviation.
+    z_scale : tuple of float
+        What the standard errors are multiplied by so that 95 % intervals hold 95 %: from quantiles of the readings in
+        their own standard errors, not from their mean square, which a few windows with one source decide.
+    spread : tuple of float
+        Robust standard deviation of each own parameter's reading.
+    """
+
+    windows: int
+    msd: float
+    z_scale: tuple[float, ...]
+    spread: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class EquationNetwork:
+    """A trained network with the equation it stands for."""
+
+    equation: Equation | SynchronousEquation
+    network: Network
+    healthy: Healthy | None
+
+
+def _used_lags(window: WindowStatistics, machine: Machine) -> slice:
+    """Lags from ``lag_from_s``: shorter ones see the excitation itself."""
+    first = int(np.searchsorted(window.lags_s, machine.window.lag_from_s - 1e-9))
+    return slice(first, None)
+
+
+def window_view(window: WindowStatistics, machine: Machine) -> StatisticsView:
+    """The whole window, as equations look at it."""
+    lags = _used_lags(window, machine)
+    speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
+    return StatisticsView(window.states, window.correlation[lags], window.synchronous, speed)
+
+
+def hop_views(window: WindowStatistics, machine: Machine) -> list[StatisticsView]:
+    """Each hop of the window alone."""
+    lags, whole = _used_lags(window, machine), window_view(window, machine)
+    return [
+        StatisticsView(
+            window.states,
+            window.hop_correlation[hop][lags],
+            None if window.hop_synchronous is None else window.hop_synchronous[hop],
+            whole.speed_rad_s,
+        )
+        for hop in range(window.hop_correlation.shape[0])
+    ]
+
+
+def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: Machine) -> EquationReading:
+    """Evaluate one equation on one window.
+
+    The residual is projected on the signatures of the equation's own parameters: detection, location inside the
+    equation, and size in one step. The scatter over the window's hops gives the standard error.
+    """
+    equation = trained.equation
+    absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
+    if absent:
+        return EquationReading(equation.number, equation.title, reason=f"not measured: {', '.join(absent)}")
+    rows = equation.rows(window_view(window, machine), machine)
+    norm = rows.norm
+    if not norm > 0:
+        return EquationReading(equation.number, equation.title, reason="the target correlation is zero")
+    residual = _residual(trained.network, rows, norm)
+    projection = np.linalg.pinv(rows.signatures / norm)
+    change = projection @ residual
+    hop_rows = [equation.rows(view, machine) for view in hop_views(window, machine)]
+    n_hops = len(hop_rows)
+    inputs = np.concatenate([hop.inputs for hop in hop_rows]) / norm
+    targets = np.concatenate([hop.target for hop in hop_rows]) / norm
+    hops = (targets - trained.network(inputs)).reshape(n_hops, -1) @ projection.T
+    error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
+    healthy = trained.healthy
+    if healthy is not None:
+        error = error * np.array(healthy.z_scale)
+    readings = tuple(
+        ParameterReading(name, "relation", float(value), float(spread))
+        for name, value, spread in zip(equation.parameters, change, error, strict=True)
+    )
+    return EquationReading(
+        equation.number,
+        equation.title,
+        msd=float(np.mean(residual**2)),
+        msd_healthy=None if healthy is None else healthy.msd,
+        parameters=readings,
+    )
+
+
+def _residual(network: Network, rows: EquationRows, norm: float) -> FloatArray:
+    return np.asarray(rows.target / norm - network(rows.inputs / norm), dtype=np.float64)
+
+
+def equation_by_number(number: str) -> Equation | SynchronousEquation:
+    """Look an equation up; KeyError for a number that is not in the table."""
+    return {equation.number: equation for equation in EQUATIONS}[number]
+
+
+class RelationDiagnostician:
+    """Reads the parameters of a window from the residuals of equations (28)-(31).
+
+    Parameters
+    ----------
+    machine : Machine
+    networks : tuple of EquationNetwork
+        The trained networks, calibrated.
+    """
+
+    def __init__(self, machine: Machine, networks: tuple[EquationNetwork, ...]) -> None:
+        self._machine = machine
+        self._networks = {trained.equation.number: trained for trained in networks}
+
+    @property
+    def by(self) -> str:
+        """Name under which it is reported."""
+        return "relation"
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
+        equations: list[EquationReading] = []
+        parameters: list[ParameterReading] = []
+        for equation in EQUATIONS:
+            trained = self._networks.get(equation.number)
+            if trained is None:
+                reading = EquationReading(equation.number, equation.title, reason="no trained network")
+            else:
+                reading = read_equation(trained, window, self._machine)
+            equations.append(reading)
+            parameters += reading.parameters or [
+                ParameterReading(name, self.by, reason=reading.reason) for name in equation.parameters
+            ]
+        return Diagnosis(self.by, tuple(parameters), tuple(equations))

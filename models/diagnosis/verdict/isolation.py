@@ -1,0 +1,178 @@
+"""Which parameters changed: a choice among all sets of parameters, with its confidence.
+
+For every set A the parameters outside A are held at nominal. What is then left of the window's information,
+R(A) = x'Jx - x_A' J_AA x_A with the restricted estimate x_A = J_AA⁻¹ (Jx)_A, is χ² with one degree of freedom per
+parameter outside A if nothing outside A changed. A set pays for its size, R(A) + h₁² + (|A| - 1) h₂², and the cheapest
+set is the verdict. So a single parameter is named where its restricted test value exceeds h₁, the declared rate's
+threshold, and another one is added where it takes more than h₂² further off R.
+
+The prior that belongs to this: odds of exp(-h₁²/2) against the first and exp(-h₂²/2) against every further changed
+parameter, the spread of possible sizes included. The confidence is the posterior under that prior.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+
+import numpy as np
+from scipy.special import ndtr
+
+from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.verdict.calibration import Thresholds, window_thresholds
+from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch_of
+from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
+
+__all__ = ["Isolation", "isolate", "isolate_window", "outside_confidence", "restricted"]
+
+
+@dataclass(frozen=True, slots=True)
+class Isolation:
+    """Verdict on one stretch of data.
+
+    Attributes
+    ----------
+    changed : tuple of str
+        Parameters that changed, in the order of `PARAMETERS`; empty: none.
+    confidence : float
+        Posterior probability of exactly this set among all sets.
+    probability : tuple of float
+        Posterior probability of each of `PARAMETERS` to be among the changed ones.
+    readings : tuple of ParameterReading
+        The changed parameters with all others held at nominal: sharper than the free estimates, and right if the
+        verdict is.
+    outside : bool
+        The window is further from the model than sampling explains: something changed that no parameter describes, or
+        a sensor is at fault. The verdict on the parameters is then of low confidence.
+    outside_confidence : float or None
+        Of that, see `outside_confidence`; None where there is no such test.
+    """
+
+    changed: tuple[str, ...]
+    confidence: float
+    probability: tuple[float, ...]
+    readings: tuple[ParameterReading, ...] = ()
+    outside: bool = False
+    outside_confidence: float | None = None
+
+    @property
+    def low_confidence(self) -> bool:
+        """Whether what is said of parameters should be believed with reserve."""
+        return self.outside or self.confidence < 0.5
+
+
+def outside_confidence(misfit_z: float) -> float:
+    """Most that a misfit can say for "outside the model", at even odds beforehand.
+
+    One minus the bound of Sellke, Bayarri and Berger (The American Statistician 55, 2001) on the posterior of the
+    model: 1 / (1 + 1/(-e p ln p)) with the one-sided probability p of the misfit.
+    """
+    p = float(ndtr(-misfit_z))
+    if p >= math.exp(-1):
+        return 0.5
+    bound = -math.e * p * math.log(p) if p > 0 else 0.0
+    return 1 / (1 + bound)
+
+
+def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
+    """Decide one window by itself at a declared rate of false alarms per window.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        One diagnostician's opinion.
+    rate : float
+        Probability that a healthy window is called changed; the test of the model has the same rate to itself.
+    """
+    stretch = stretch_of(diagnosis, 0, 0)
+    return isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
+
+
+def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:
+    """Decide a stretch of data.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What it says.
+    thresholds : Thresholds
+        From the declared rate.
+    by : str
+        Who said it; the readings carry the name.
+    """
+    known = stretch.known
+    outside, confidence = False, None
+    if stretch.misfit_z is not None and math.isfinite(stretch.misfit_z):
+        outside = stretch.misfit_z > thresholds.outside
+        confidence = outside_confidence(stretch.misfit_z)
+    probability = np.zeros(len(PARAMETERS))
+    if not known:
+        return Isolation((), 1.0, tuple(probability.tolist()), (), outside, confidence)
+    sets = _sets(len(known))
+    J = stretch.information[np.ix_(known, known)]
+    b = stretch.vector[list(known)]
+    explained = _explained(J, b, sets)
+    price = np.array([0.0 if not A else thresholds.first**2 + (len(A) - 1) * thresholds.further**2 for A in sets])
+    gain = (explained - price) / 2
+    weight = np.exp(gain - gain.max())
+    weight /= weight.sum()
+    best = int(np.argmax(gain))
+    for A, share in zip(sets, weight, strict=True):
+        for i in A:
+            probability[known[i]] += share
+    changed = tuple(PARAMETERS[known[i]] for i in sets[best])
+    return Isolation(
+        changed=changed,
+        confidence=float(weight[best]),
+        probability=tuple(np.minimum(probability, 1.0).tolist()),
+        readings=restricted(stretch, changed, by),
+        outside=outside,
+        outside_confidence=confidence,
+    )
+
+
+@lru_cache
+def _sets(n: int) -> tuple[tuple[int, ...], ...]:
+    """All subsets of n parameters, the empty one first, small ones before large ones."""
+    return tuple(A for size in range(n + 1) for A in combinations(range(n), size))
+
+
+def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) -> FloatArray:
+    """What each set explains, b_A' J_AA⁻¹ b_A; sets of one size are solved in one go."""
+    explained = np.zeros(len(sets))
+    scale = 1 / np.sqrt(np.diag(J))
+    J, b = J * np.outer(scale, scale), b * scale
+    at = 1
+    for size in range(1, J.shape[0] + 1):
+        index = np.array([A for A in sets if len(A) == size])
+        own = b[index]
+        solved = np.linalg.solve(J[index[:, :, None], index[:, None, :]], own[:, :, None])[:, :, 0]
+        explained[at : at + len(index)] = np.sum(own * solved, axis=1)
+        at += len(index)
+    return explained
+
+
+def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[ParameterReading, ...]:
+    """Read some parameters with all others held at nominal.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What the data says.
+    names : tuple of str
+        Parameters that may differ from nominal; those that were not evaluable are left out.
+    by : str
+        Who said it.
+    """
+    chosen = [i for i in stretch.known if PARAMETERS[i] in names]
+    if not chosen:
+        return ()
+    covariance = np.linalg.inv(stretch.information[np.ix_(chosen, chosen)])
+    values = covariance @ stretch.vector[chosen]
+    readings = []
+    for i, value, variance in zip(chosen, values.tolist(), np.diag(covariance).tolist(), strict=True):
+        name = PARAMETERS[i]
+        error = math.sqrt(variance) * slope(name, value)
+        readings.append(ParameterReading(name, by, from_scale(name, value), error))
+    return tuple(readings)

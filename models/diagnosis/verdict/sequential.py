@@ -1,0 +1,429 @@
+"""Sequential test: large changes at once, small ones as soon as enough data is there.
+
+At every hop stretches of several lengths that end now are looked at: short ones inside the window, the window itself,
+and sums of 2, 4, 8, … windows that do not overlap. This is a generalised likelihood ratio over dyadic lengths. Each
+length has its share of the declared rate of false alarms.
+
+A stretch that straddles a change mixes two machines, and a parameter that did not change may then read wrong. So as
+soon as a short stretch and a longer one contradict each other, the change is dated, and what is older no longer counts:
+only *clean* stretches, which begin after that date, say which parameters changed. Until one is long enough, a
+straddling stretch may name one parameter, the one that stands out most. A change too small for the short stretches to
+see leaves no bias worth speaking of (it is of second order in the change), so sums of windows across it are taken as
+they are.
+
+All times are those of the data.
+"""
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from models.diagnosis.readings import ParameterReading
+from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
+from models.diagnosis.verdict.isolation import Isolation, isolate, restricted
+from models.diagnosis.verdict.stretch import Stretch, added, from_scale, slope
+from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
+
+__all__ = ["Finding", "SequentialSettings", "SequentialState", "SequentialTest", "SequentialVerdict"]
+
+_DOUBLINGS = 6
+_CONTRADICTION_RATE = 1e-7
+"""Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data."""
+
+
+@dataclass(frozen=True, slots=True)
+class SequentialSettings:
+    """Lengths and declared rate.
+
+    Attributes
+    ----------
+    hop_s : float
+        Data time between looks, s.
+    window_hops : int
+        Hops of a full window.
+    short_hops : tuple of int
+        Hops of the short stretches, shortest first.
+    false_alarms_per_month : float
+        Over all parameters and lengths together.
+    short_widening : float
+        Factor on the standard errors of the short stretches: with little more than as many segments as channels the
+        stated ones are too small.
+    systematic : float
+        Standard error that more windows do not remove, of every parameter: an estimate on nominal values is not true to
+        the last digit however long it is averaged.
+    """
+
+    hop_s: float
+    window_hops: int
+    short_hops: tuple[int, ...] = (2, 4)
+    false_alarms_per_month: float = 1.0
+    short_widening: float = 1.0
+    systematic: float = 0.002
+
+    @property
+    def lengths(self) -> tuple[int, ...]:
+        """Hops of all stretches, shortest first."""
+        return (*self.short_hops, *(self.window_hops * 2**n for n in range(_DOUBLINGS + 1)))
+
+    def thresholds(self, hops: int) -> Thresholds:
+        """Thresholds of the stretches of one length."""
+        return month_thresholds(
+            self.false_alarms_per_month, self.hop_s, hops, len(PARAMETERS), n_stretches=len(self.lengths)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One parameter that changed, and how that was found.
+
+    Attributes
+    ----------
+    name : str
+        Parameter.
+    since_ns : int
+        The change is not known to be older than this: start of the stretch that found it first.
+    found_ns : int
+        When it was found: end of that stretch.
+    stretch_s : float
+        Length of that stretch.
+    """
+
+    name: str
+    since_ns: int
+    found_ns: int
+    stretch_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SequentialVerdict:
+    """What is known at the end of a hop.
+
+    Attributes
+    ----------
+    detected : bool
+        Some stretch says that something changed, whether or not it is clear yet what.
+    findings : tuple of Finding
+        Parameters that changed, in the order of `PARAMETERS`.
+    isolation : Isolation
+        Verdict of the stretch that decided.
+    decided_s : float
+        Length of that stretch.
+    settled : bool
+        No change within the window: the window's own readings hold for one machine.
+    current : tuple of ParameterReading
+        Readings of the longest clean stretch up to the window, with the changed parameters' others held at nominal;
+        empty for the moment in which there is no clean stretch.
+    """
+
+    detected: bool
+    findings: tuple[Finding, ...]
+    isolation: Isolation
+    decided_s: float
+    settled: bool
+    current: tuple[ParameterReading, ...]
+
+
+@dataclass(slots=True)
+class SequentialState:
+    """All that the test remembers.
+
+    Attributes
+    ----------
+    sums : dict of int to list of Stretch
+        Latest stretches of one window (key 1) and of the sums of 2, 4, … windows, oldest first.
+    looks : int
+        Hops judged so far.
+    change_ns : int or None
+        Data before this belongs to another condition of the machine.
+    before : tuple of float
+        Values of `PARAMETERS` in that condition, in the scale of their errors.
+    findings : tuple of Finding
+        What has been found and still holds.
+    """
+
+    sums: dict[int, list[Stretch]] = field(default_factory=dict)
+    looks: int = 0
+    change_ns: int | None = None
+    before: tuple[float, ...] = (0.0,) * len(PARAMETERS)
+    findings: tuple[Finding, ...] = ()
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays of numbers and text, for any array file format."""
+        found: dict[str, np.ndarray] = {
+            "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
+            "before": np.array(self.before),
+            "looks": np.array(self.looks),
+            "findings": np.array([(PARAMETERS.index(f.name), f.since_ns, f.found_ns) for f in self.findings], np.int64),
+            "finding_stretch_s": np.array([f.stretch_s for f in self.findings]),
+        }
+        for windows, ring in self.sums.items():
+            found[f"times_{windows}"] = np.array([(one.start_ns, one.end_ns) for one in ring], dtype=np.int64)
+            found[f"vector_{windows}"] = np.array([one.vector for one in ring])
+            found[f"information_{windows}"] = np.array([one.information for one in ring])
+            misfits = [np.nan if one.misfit_z is None else one.misfit_z for one in ring]
+            found[f"misfit_z_{windows}"] = np.array(misfits)
+        return found
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, np.ndarray]) -> "SequentialState":
+        """State from what `checkpoint` gave."""
+        state = cls(looks=int(arrays["looks"]), before=tuple(arrays["before"].tolist()))
+        if arrays["change_ns"].size:
+            state.change_ns = int(arrays["change_ns"][0])
+        state.findings = tuple(
+            Finding(PARAMETERS[number], since, found, length)
+            for (number, since, found), length in zip(
+                arrays["findings"].reshape(-1, 3).tolist(), arrays["finding_stretch_s"].tolist(), strict=True
+            )
+        )
+        for name in arrays:
+            if name.startswith("times_"):
+                windows = int(name.removeprefix("times_"))
+                columns = zip(
+                    arrays[name].reshape(-1, 2).tolist(),
+                    arrays[f"vector_{windows}"],
+                    arrays[f"information_{windows}"],
+                    arrays[f"misfit_z_{windows}"].tolist(),
+                    strict=True,
+                )
+                state.sums[windows] = [
+                    Stretch(start, end, vector, information, None if np.isnan(misfit) else misfit)
+                    for (start, end), vector, information, misfit in columns
+                ]
+        return state
+
+
+class SequentialTest:
+    """Looks at one hop after the other.
+
+    Parameters
+    ----------
+    settings : SequentialSettings
+        Lengths and declared rate.
+    state : SequentialState, optional
+        Where an earlier test stood.
+    by : str
+        Whose readings these are.
+    """
+
+    def __init__(
+        self, settings: SequentialSettings, state: SequentialState | None = None, by: str = "likelihood"
+    ) -> None:
+        self.settings = settings
+        self.state = SequentialState() if state is None else state
+        self._by = by
+        self._thresholds = {hops: settings.thresholds(hops) for hops in settings.lengths}
+        self._contradiction = window_thresholds(_CONTRADICTION_RATE, len(PARAMETERS)).first
+        self._slack_ns = round(settings.hop_s * 0.5e9)
+
+    def thresholds(self, hops: int) -> Thresholds:
+        """Thresholds of the stretches of one length, hops."""
+        return self._thresholds[hops]
+
+    def clear(self) -> None:
+        """Forget everything: the data's clock was set, or another machine is watched."""
+        self.state = SequentialState()
+
+    def wanted(self) -> tuple[int, ...]:
+        """Short stretches worth evaluating at the next hop, by their hops; every one costs as much as a window.
+
+        On an unchanged machine the lengths take turns. After a change the longest clean one is wanted, or, before there
+        is one, the shortest.
+        """
+        short, state = self.settings.short_hops, self.state
+        if not short:
+            return ()
+        windows = state.sums.get(1)
+        if state.change_ns is not None and windows:
+            hop_ns = self.settings.hop_s * 1e9
+            next_hops = (windows[-1].end_ns - state.change_ns + self._slack_ns + hop_ns) // hop_ns
+            if next_hops < self.settings.window_hops:
+                return (max((hops for hops in short if hops <= next_hops), default=short[0]),)
+        return (short[state.looks % len(short)],)
+
+    def update(self, looks: Mapping[int, Stretch]) -> SequentialVerdict:
+        """Judge one hop.
+
+        Parameters
+        ----------
+        looks : mapping of int to Stretch
+            Stretches that end with this hop, by their hops: the full window, and those of the short ones that are
+            there. `wanted` says which suffice.
+
+        Raises
+        ------
+        KeyError
+            If the full window is not among them.
+        """
+        self.state.looks += 1
+        window_hops = self.settings.window_hops
+        window = looks[window_hops]
+        widening = self.settings.short_widening
+        every = {hops: looks[hops].widened(widening) for hops in self.settings.short_hops if hops in looks}
+        every[window_hops] = window
+        for windows, total in self._accumulate(window).items():
+            every[windows * window_hops] = total if windows == 1 else total.blurred(self.settings.systematic)
+        self._watch_for_contradiction(every)
+        clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
+        loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
+        verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
+        decided, isolation = self._decide(every, clean, verdicts)
+        self._note(isolation.changed, every, clean, verdicts)
+        deciding = [hops for hops in clean if hops <= window_hops]
+        current = self._current(clean[deciding[-1]], isolation.changed) if deciding else ()
+        # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.
+        tested = self._isolate(deciding[-1], clean[deciding[-1]]) if deciding else None
+        isolation = replace(
+            isolation,
+            outside=tested is not None and tested.outside,
+            outside_confidence=None if tested is None else tested.outside_confidence,
+        )
+        return SequentialVerdict(
+            detected=bool(verdicts),
+            findings=self.state.findings,
+            isolation=isolation,
+            decided_s=decided.duration_s,
+            settled=window_hops in clean,
+            current=current,
+        )
+
+    def _is_loud(self, hops: int, look: Stretch) -> bool:
+        """Whether a stretch may name anything: no set explains more than all parameters together."""
+        if not look.known:
+            return False
+        values, _ = look.estimate()
+        return float(values @ look.vector[list(look.known)]) > self._thresholds[hops].first ** 2
+
+    def _isolate(self, hops: int, look: Stretch) -> Isolation:
+        return isolate(look, self._thresholds[hops], self._by)
+
+    def _accumulate(self, window: Stretch) -> dict[int, Stretch]:
+        """Add the window to what is remembered; returns it and the sums of windows that end with it."""
+        sums, length_ns = self.state.sums, round(self.settings.window_hops * self.settings.hop_s * 1e9)
+        found, windows, total = {1: window}, 1, window
+        while True:
+            ring = sums.setdefault(windows, [])
+            ring.append(total)
+            while ring[0].end_ns < total.start_ns - windows * length_ns:
+                ring.pop(0)
+            if windows == 2**_DOUBLINGS:
+                return found
+            before = bisect_right(ring, total.start_ns + self._slack_ns, key=lambda one: one.end_ns)
+            if not before:
+                return found
+            total = added([ring[before - 1], total])
+            windows *= 2
+            found[windows] = total
+
+    def _is_clean(self, look: Stretch) -> bool:
+        change_ns = self.state.change_ns
+        return change_ns is None or look.start_ns >= change_ns - self._slack_ns
+
+    def _watch_for_contradiction(self, every: Mapping[int, Stretch]) -> None:
+        """Date a change if a stretch contradicts a longer clean one that contains it."""
+        clean = [(hops, look, _values(look)) for hops, look in every.items() if self._is_clean(look)]
+        for at, (hops, short, part) in enumerate(clean):
+            if hops > self.settings.window_hops:
+                return
+            for _, _, whole in reversed(clean[at + 1 :]):
+                if _worst(part, whole) > self._contradiction:
+                    inside = hops < self.settings.window_hops
+                    self.state.change_ns = short.end_ns if inside else short.start_ns
+                    self.state.before = tuple(whole[0].tolist())
+                    return
+
+    def _decide(
+        self, every: Mapping[int, Stretch], clean: Mapping[int, Stretch], verdicts: Mapping[int, Isolation]
+    ) -> tuple[Stretch, Isolation]:
+        """The stretch that says which parameters changed: the longest clean one that says any."""
+        for hops in sorted(clean, reverse=True):
+            if hops in verdicts:
+                return clean[hops], verdicts[hops]
+        for hops, look in every.items():
+            if hops not in clean and hops in verdicts:
+                leader = self._leader(look, verdicts[hops], clean)
+                if leader is not None:
+                    return look, leader
+        shown = self.settings.window_hops if self.settings.window_hops in clean else min(clean, default=min(every))
+        verdict = self._isolate(shown, every[shown])  # of a straddling stretch nothing is believed here
+        return every[shown], replace(verdict, changed=(), readings=())
+
+    def _leader(self, look: Stretch, verdict: Isolation, clean: Mapping[int, Stretch]) -> Isolation | None:
+        """What a straddling stretch may say: the parameter that moved most, if it moved away from nominal.
+
+        One on its way back to nominal reads as changed for as long as the stretch holds old data.
+        """
+        before = np.array(self.state.before)
+        values, variances = _values(look)
+        most = int(np.argmax(np.abs(values - before) / np.sqrt(variances)))
+        if PARAMETERS[most] not in verdict.changed or abs(values[most]) < abs(before[most]):
+            return None
+        if clean:
+            now, now_variances = _values(clean[max(clean)])
+            if abs(now[most] - values[most]) > self._contradiction * np.sqrt(now_variances[most]):
+                return None
+        readings = tuple(reading for reading in verdict.readings if reading.name == PARAMETERS[most])
+        return replace(verdict, changed=(PARAMETERS[most],), readings=readings)
+
+    def _note(
+        self,
+        changed: tuple[str, ...],
+        every: Mapping[int, Stretch],
+        clean: Mapping[int, Stretch],
+        verdicts: Mapping[int, Isolation],
+    ) -> None:
+        """Keep when each changed parameter was first found; forget what is no longer so."""
+        known = {finding.name: finding for finding in self.state.findings}
+        found = {name: known[name] for name in known if name in changed or self._still(name, clean)}
+        for name in changed:
+            if name not in known:
+                shortest = next(every[hops] for hops, verdict in verdicts.items() if name in verdict.changed)
+                found[name] = Finding(name, shortest.start_ns, shortest.end_ns, shortest.duration_s)
+        self.state.findings = tuple(found[name] for name in PARAMETERS if name in found)
+
+    def _still(self, name: str, clean: Mapping[int, Stretch]) -> bool:
+        """Whether a parameter found earlier holds on: there is no whole clean window yet, and the clean data agree."""
+        if self.settings.window_hops in clean:
+            return False
+        if not clean:
+            return True
+        at = PARAMETERS.index(name)
+        values, variances = _values(clean[max(clean)])
+        return bool(abs(values[at] - self.state.before[at]) < self._contradiction * np.sqrt(variances[at]))
+
+    def _current(self, look: Stretch, changed: tuple[str, ...]) -> tuple[ParameterReading, ...]:
+        """Free readings of a stretch; the changed parameters with the unchanged ones held at nominal."""
+        sharp = {reading.name: reading for reading in restricted(look, changed, self._by)}
+        values, covariance = look.estimate()
+        errors = np.sqrt(np.diag(covariance)).tolist()
+        return tuple(
+            sharp.get(name) or ParameterReading(name, self._by, from_scale(name, value), error * slope(name, value))
+            for name, value, error in zip(look.names, values.tolist(), errors, strict=True)
+        )
+
+
+def _worst(part: tuple[FloatArray, FloatArray], whole: tuple[FloatArray, FloatArray]) -> float:
+    """Largest difference of a stretch from one that contains it, in standard errors of the difference.
+
+    The errors of a part and of the whole differ by as much as their variances do (Hausman); half of the part's variance
+    is the least that is believed, because both variances are estimates.
+    """
+    common = np.isfinite(part[1]) & np.isfinite(whole[1])
+    if not common.any():
+        return 0.0
+    variance = part[1][common]
+    spread = np.maximum(variance - whole[1][common], variance / 2)
+    return float(np.max(np.abs(part[0] - whole[0])[common] / np.sqrt(spread)))
+
+
+def _values(look: Stretch) -> tuple[FloatArray, FloatArray]:
+    """Values and variances of all `PARAMETERS`; 0 and infinity for what was not evaluable."""
+    values, variances = np.zeros(len(PARAMETERS)), np.full(len(PARAMETERS), np.inf)
+    if look.known:
+        found, covariance = look.estimate()
+        values[list(look.known)] = found
+        variances[list(look.known)] = np.diag(covariance)
+    return values, variances

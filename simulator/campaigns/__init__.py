@@ -1,0 +1,1 @@
+"""Simulation campaigns behind ``rotortrain``: random windows, training, evaluation, studies and their pages."""

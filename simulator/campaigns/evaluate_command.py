@@ -1,0 +1,307 @@
+"""What ``rotortrain evaluate`` does: evaluate the cells, keep every window, sum up, and write the results page."""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import typer
+from pydantic import BaseModel, ValidationError
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from models.diagnosis.networks.bundle import load_bundle
+from models.errors import RecordingError
+from models.machine import load_machine, validation_text
+from models.physics.parameters import PARAMETERS
+from simulator.campaigns.draws import Anomaly, Excitation
+from simulator.campaigns.evaluation import RATES, WindowRecord, evaluate_cells, read_records
+from simulator.campaigns.evaluation_cells import EvaluationCell, Topic, cells_for
+from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, anomaly_text, excitation_text, goals, percent, rate_text
+from simulator.campaigns.evaluation_summary import Campaign, Summary, summarise
+from simulator.campaigns.rates import Rate
+from simulator.campaigns.results_page import page as results_page
+from simulator.campaigns.results_plots import draw_results
+from simulator.campaigns.results_tables import paragraph, table
+
+__all__ = ["evaluate", "read_summaries", "write_page"]
+
+_QUICK = 4
+_CAMPAIGN, _SUMMARY = ".campaign.json", ".summary.json"
+_PEERS = "peers.json"
+"""What `rotortrain peers` wrote, if it is put beside the summaries."""
+
+
+def evaluate(
+    name: str,
+    bundle_name: str | None,
+    out: Path,
+    *,
+    windows: int,
+    fault: float,
+    seed: int,
+    processes: int,
+    full: bool,
+    quick: bool,
+    page: Path | None,
+) -> None:
+    """Evaluate a machine; carries on where an interrupted evaluation stopped.
+
+    Parameters
+    ----------
+    name : str
+        Machine file or shipped machine.
+    bundle_name : str or None
+        Without a bundle only the likelihood is evaluated.
+    out : Path
+        Folder of the records, one file per machine, and of the summaries.
+    windows : int
+        Per cell of weight one.
+    fault : float
+        Relative size of the large changes.
+    seed, processes : int
+    full : bool
+        All topics instead of the short plan.
+    quick : bool
+        At most four windows per cell.
+    page : Path or None
+        Results page to write from all summaries in `out`; its figures go to ``figures/`` beside it.
+
+    Raises
+    ------
+    RotorwatchError
+        If machine or bundle cannot be used, `out` holds windows of another campaign, or a file cannot be written.
+    """
+    machine = load_machine(name)
+    bundle = None if bundle_name is None else load_bundle(bundle_name, machine)
+    plan = cells_for(fault, full=full)
+    campaign = Campaign(
+        machine=machine.name,
+        physics=machine.physics_hash,
+        bundle="" if bundle is None else bundle.identity,
+        bundle_name=bundle_name or "",
+        seed=seed,
+        windows=min(windows, _QUICK) if quick else windows,
+        fault=fault,
+        full=full,
+        plan=_digest(plan),
+    )
+    records = out / f"{machine.name}.jsonl"
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        _same_campaign(out / f"{machine.name}{_CAMPAIGN}", campaign, records)
+        with _Lines(plan, campaign.windows) as lines:
+            evaluate_cells(
+                machine,
+                bundle,
+                plan,
+                n_windows=campaign.windows,
+                seed=seed,
+                processes=processes,
+                kept=records,
+                progress=lines.progress,
+            )
+        summary = summarise(_asked_for(read_records(records), plan, campaign.windows), campaign)
+        _write(out / f"{machine.name}{_SUMMARY}", summary)
+    except OSError as error:
+        raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
+    Console().print(_overview(summary))
+    typer.echo(f"written: {records}, {out / f'{machine.name}{_SUMMARY}'}")
+    if page is not None:
+        for path in write_page(out, page):
+            typer.echo(f"written: {path}")
+
+
+def write_page(out: Path, page: Path) -> list[Path]:
+    """Write the results page and its figures from all summaries in a folder; returns what was written.
+
+    ``peers.json`` and Markdown files in the folder become sections of their own.
+
+    Raises
+    ------
+    RecordingError
+        If there is no summary, a file is damaged, or the page cannot be written.
+    """
+    summaries = read_summaries(out)
+    figures = page.parent / "figures"
+    try:
+        figures.mkdir(parents=True, exist_ok=True)
+        drawn = [path for summary in summaries for path in draw_results(summary, figures)]
+        sections = [path.read_text(encoding="utf-8") for path in sorted(out.glob("*.md"))]
+        if (out / _PEERS).exists():
+            section, figure = _peers_section(out / _PEERS, figures)
+            sections.insert(0, section)
+            drawn.append(figure)
+        page.write_text(results_page(summaries, sections), encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{page}: cannot be written ({error.strerror})") from error
+    return [page, *drawn]
+
+
+def read_summaries(out: Path) -> list[Summary]:
+    """Read the summaries of all machines in a folder.
+
+    Raises
+    ------
+    RecordingError
+        If there are none, or one is damaged.
+    """
+    found = []
+    for path in sorted(out.glob(f"*{_SUMMARY}")):
+        try:
+            found.append(Summary.model_validate_json(path.read_text(encoding="utf-8")))
+        except ValidationError as error:
+            raise RecordingError(validation_text(path, error)) from error
+    if not found:
+        raise RecordingError(f"{out}: no summaries (*{_SUMMARY}), expected those of at least one machine")
+    return found
+
+
+def _same_campaign(path: Path, campaign: Campaign, records: Path) -> None:
+    """Refuse to mix windows of different campaigns; more or fewer windows of the same one are welcome."""
+    if records.exists():
+        if not path.exists():
+            raise RecordingError(f"{records}: holds windows of an unknown campaign, {path.name} is missing")
+        try:
+            kept = Campaign.model_validate_json(path.read_text(encoding="utf-8"))
+        except ValidationError as error:
+            raise RecordingError(validation_text(path, error)) from error
+        for field in ("physics", "bundle", "seed", "fault", "full", "plan"):
+            before, now = getattr(kept, field), getattr(campaign, field)
+            if before != now:
+                raise RecordingError(
+                    f"{records}: holds windows of another campaign, {field} is {before!r} there, expected {now!r}; "
+                    "choose another --out or remove the file"
+                )
+    _write(path, campaign)
+
+
+def _digest(plan: list[EvaluationCell]) -> str:
+    """What the cells are, apart from their numbers of windows: records know their cell by its place in the plan."""
+    cells = [(c.topic, sorted(c.faults.items()), c.layout, c.excitation, c.anomaly, c.length_s) for c in plan]
+    return hashlib.sha256(repr(cells).encode()).hexdigest()[:12]
+
+
+def _write(path: Path, model: BaseModel) -> None:
+    """Write it whole or not at all."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_text(model.model_dump_json() + "\n", encoding="utf-8")
+    os.replace(part, path)
+
+
+def _asked_for(records: Iterator[WindowRecord], plan: list[EvaluationCell], windows: int) -> Iterator[WindowRecord]:
+    """Leave out what an earlier, longer evaluation of the same campaign has beyond this one."""
+    return (record for record in records if record.number < plan[record.cell].count(windows))
+
+
+def _cell_text(cell: EvaluationCell) -> str:
+    parts: list[str] = [cell.topic.value]
+    if cell.faults:
+        parts.append(", ".join(f"{name} {change:+.0%}" for name, change in cell.faults.items()))
+    if cell.excitation is not Excitation.SECOND_ORDER:
+        parts.append(excitation_text(cell.excitation))
+    if cell.anomaly is not Anomaly.NONE:
+        parts.append(anomaly_text(cell.anomaly))
+    if cell.length_s is not None:
+        parts.append(f"{cell.length_s:g} s")
+    if cell.layout is not None:
+        parts.append(LAYOUT_TEXT[cell.layout])
+    return ": ".join((parts[0], ", ".join(parts[1:]))) if parts[1:] else parts[0]
+
+
+class _Lines:
+    """A line for every cell that is done, bars for the running one and for all."""
+
+    def __init__(self, plan: list[EvaluationCell], windows: int) -> None:
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._all = self._bar.add_task("all windows", total=sum(cell.count(windows) for cell in plan))
+        self._running: tuple[EvaluationCell, TaskID] | None = None
+        self._before = 0
+
+    def __enter__(self) -> "_Lines":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def progress(self, cell: EvaluationCell, done: int, total: int) -> None:
+        """Take note of a cell's progress."""
+        if self._running is None or self._running[0] is not cell:
+            self._running = cell, self._bar.add_task(_cell_text(cell), total=total)
+        self._bar.update(self._running[1], completed=done)
+        self._bar.update(self._all, completed=self._before + done)
+        if done >= total:
+            self._bar.console.print(f"{_cell_text(cell)}: {total} windows", highlight=False)
+            self._bar.remove_task(self._running[1])
+            self._running = None
+            self._before += total
+
+
+def _overview(summary: Summary) -> Table:
+    """Healthy windows on the terminal, and the goals that were missed."""
+    made = summary.campaign
+    columns = ("force", "by", "parameter", "spread", "std. error", "95 % covers", f"named at {100 * RATES[0]:g} %")
+    missed = [goal for goal in goals(summary) if goal.met is False]
+    table_of = Table(
+        *columns,
+        title=f"{made.machine}, healthy {summary.length_s:g} s windows, seed {made.seed}",
+        caption=f"{len(missed)} declared goals missed; changes and everything else: the summary, or --page",
+    )
+    for cell in summary.of(Topic.HEALTHY):
+        for by in summary.diagnosticians:
+            opinion = cell.opinions.get(by)
+            for name in PARAMETERS:
+                one = None if opinion is None else opinion.parameter(name)
+                if one is not None:
+                    table_of.add_row(
+                        LAYOUT_TEXT[cell.layout],
+                        by,
+                        name,
+                        "–" if one.spread is None else percent(one.spread.value, 3),
+                        percent(one.standard_error, 3),
+                        _short(one.covered),
+                        _short(one.mistaken[0]),
+                    )
+        table_of.add_section()
+    return table_of
+
+
+def _short(rate: Rate) -> str:
+    return f"{100 * rate.rate:.3g} ({100 * rate.low:.3g}–{100 * rate.high:.3g}) %"
+
+
+def _peers_section(path: Path, figures: Path) -> tuple[str, Path]:
+    from simulator.campaigns.peers_campaign import SETTINGS, Comparison  # noqa: PLC0415  # the peers are an extra of their own
+    from simulator.campaigns.peers_command import draw_comparison  # noqa: PLC0415
+
+    try:
+        comparison = Comparison.model_validate_json(path.read_text(encoding="utf-8"))
+    except ValidationError as error:
+        raise RecordingError(validation_text(path, error)) from error
+    figure = draw_comparison(comparison, figures / "results-peers.png")
+    methods = tuple(comparison.cells[0].methods)
+    lines = [
+        f"## Beside other methods ({comparison.machine})",
+        "",
+        *paragraph(
+            f"{comparison.windows} windows per change and setting, {comparison.healthy_windows} healthy windows to",
+            f"learn from and as many to set the limits, {100 * comparison.false_alarm_rate:g} % false alarms declared",
+            f"for every method, seed {comparison.seed}. *Something*: said to have changed; *exactly*: the right",
+            "parameters (for the printed networks: equations) are named, and no others.",
+        ),
+        "",
+        f"![Detected and named exactly](figures/{figure.name})",
+        "",
+    ]
+    for setting in SETTINGS:
+        rows = []
+        for cell in (cell for cell in comparison.cells if cell.setting == setting):
+            change = ", ".join(f"{name} {size:+.0%}" for name, size in cell.faults.items()) or "healthy"
+            rates = [cell.methods[method] for method in methods]
+            rows.append((change, "something", *(rate_text(one.detected) for one in rates)))
+            rows.append((change, "exactly", *(rate_text(one.exact) for one in rates)))
+        lines += [f"### In the setting “{setting}”", "", *table(("true change", "named", *methods), rows)]
+    return "\n".join(lines), figure

@@ -1,0 +1,230 @@
+"""Training windows for the amortised networks, drawn as spectra: no time series is made.
+
+A window's averaged cross-spectrum at one frequency is a sum of outer products of nearly independent complex Gaussian
+Fourier coefficients. Its distribution therefore follows from the expected spectrum alone: complex Wishart, as many
+degrees of freedom as untapered segments fit into the window. The Hann taper of the real segments mixes three
+neighbouring frequencies, (1, 4, 1)/6 in power. The theoretical spectrum is mixed like this, and so are the white
+Wishart matrices that scatter around it; so expectation, scatter at one frequency and correlation between neighbouring
+frequencies come out as in `models.diagnosis.moments`. A thousand times faster than simulating, which is what lets every
+training step see windows never seen before.
+
+The real thing remains the judge: calibration and evaluation use windows simulated in time
+(`simulator.campaigns.draws`).
+
+References
+----------
+N. R. Goodman, "Statistical analysis based on a certain multivariate complex Gaussian distribution", Ann. Math. Stat. 34
+(1963); the triangular factor of a Wishart matrix after Bartlett (1933). P. D. Welch, IEEE Trans. Audio 15 (1967).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from models.diagnosis.moments import ComplexArray, plan_for
+from models.machine import Machine
+from models.physics.matrices import STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix
+from models.physics.parameters import PARAMETERS, changed
+from models.signals.block import FloatArray
+
+__all__ = ["LOG_RATIO", "DrawnConditions", "SpectralDraws"]
+
+_Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex128])
+
+LOG_RATIO = 0.55
+"""Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
+would teach the network to answer "healthy" to everything small."""
+
+_PER_ROTOR = 3
+"""Windows that share a rotor and a speed; excitation, noise, unbalance and realisation are their own."""
+
+_HANN = (np.float32(1 / 6), np.float32(4 / 6), np.float32(1 / 6))
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnConditions:
+    """A batch of random machines in random conditions.
+
+    Attributes
+    ----------
+    log_ratio : ndarray, shape (n_windows, 6)
+        Logarithm of each of `PARAMETERS` over nominal.
+    speed_rad_s : ndarray, shape (n_windows,)
+    spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
+        Expected cross-spectra of the segments, as `WindowStatistics.spectrum` estimates them, SI²/Hz.
+    synchronous : ndarray of complex, shape (n_windows, n)
+        Rotation-synchronous vectors as of `WindowStatistics.synchronous`, SI.
+    synchronous_factor : ndarray of complex, shape (n_windows, n, n)
+        Factor of the covariance that the stochastic part gives the estimate of `synchronous`.
+    """
+
+    log_ratio: FloatArray
+    speed_rad_s: FloatArray
+    spectrum: ComplexArray
+    synchronous: ComplexArray
+    synchronous_factor: ComplexArray
+
+
+class SpectralDraws:
+    """Draws windows of one machine in random conditions and with random parameters.
+
+    The excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all sources,
+    as in the simulator, but also other slopes and a cutoff per source, and sensor noise that differs between channels.
+
+    Parameters
+    ----------
+    machine : Machine
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        plan = plan_for(machine)
+        self._machine = machine
+        self._duration_s = plan.hops * plan.hop / plan.rate_hz
+        self._spacing_hz = plan.rate_hz / plan.segment
+        band = plan.frequencies_hz
+        self._grid_hz = np.concatenate([[band[0] - self._spacing_hz], band, [band[-1] + self._spacing_hz]])
+        index = np.array([STATE_INDEX[name] for name in plan.states])
+        self.states = plan.states
+        self._dofs, self._is_rate = index % 6, index >= 6
+        # The segments' whole span, which is half a segment longer than the window.
+        self._averages = (self._duration_s + machine.window.segment_s / 2) * self._spacing_hz
+
+    @property
+    def averages(self) -> float:
+        """Degrees of freedom of the untapered spectra."""
+        return self._averages
+
+    def draw(self, rng: np.random.Generator, count: int) -> DrawnConditions:
+        """Draw machines and conditions: what is expected of their windows."""
+        groups = [self._rotor(rng, min(_PER_ROTOR, count - first)) for first in range(0, count, _PER_ROTOR)]
+        parts = (np.concatenate(part) for part in zip(*groups, strict=True))
+        return DrawnConditions(*parts)
+
+    def realisations(
+        self, rng: np.random.Generator, expected: ComplexArray, speed_rad_s: FloatArray, count: int
+    ) -> Iterator[npt.NDArray[np.complex64]]:
+        """Realisations of the averaged cross-spectra, each of the shape of `expected`.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+        expected : ndarray of complex, shape (n_windows, n_bins, n, n)
+            Expected cross-spectra of any linear combinations of the measured states.
+        speed_rad_s : ndarray, shape (n_windows,)
+        count : int
+            How many.
+        """
+        n_windows, n_bins, n, _ = expected.shape
+        # What the regression on the shaft angle takes out of the bins around the rotation: one coefficient's worth.
+        turns = speed_rad_s[:, None] / (2 * np.pi)
+        removed = np.clip(1 - np.abs(self._grid_hz - turns) / self._spacing_hz, 0, 1)
+        freedom = (self._averages - removed)[:, :, None] - np.arange(n)
+        L = _factor(expected).astype(np.complex64)
+        L_adjoint = np.ascontiguousarray(L.conj().swapaxes(-1, -2))
+        A = np.zeros((n_windows, n_bins + 2, n, n), dtype=np.complex64)
+        below, diagonal = np.tril_indices(n, -1), np.arange(n)
+        for _ in range(count):
+            A[..., below[0], below[1]] = _complex_normal(rng, (n_windows, n_bins + 2, below[0].size))
+            A[..., diagonal, diagonal] = np.sqrt(rng.standard_gamma(freedom))
+            white = self._mixed(A @ A.conj().swapaxes(-1, -2)) / np.float32(self._averages)
+            yield L @ white @ L_adjoint
+
+    def scattered_vectors(self, rng: np.random.Generator, conditions: DrawnConditions) -> ComplexArray:
+        """One realisation of the rotation-synchronous vectors, shape (n_windows, n)."""
+        normal = _complex_normal(rng, (*conditions.synchronous.shape, 1)).astype(np.complex128)
+        return np.asarray(conditions.synchronous + (conditions.synchronous_factor @ normal)[..., 0])
+
+    def _rotor(
+        self, rng: np.random.Generator, n: int
+    ) -> tuple[FloatArray, FloatArray, ComplexArray, ComplexArray, ComplexArray]:
+        """Machines that share a rotor."""
+        machine, condition = self._machine, self._machine.condition
+        shared = rng.uniform(-LOG_RATIO, LOG_RATIO, len(PARAMETERS))
+        log_ratio = np.tile(shared, (n, 1))
+        unbalance = PARAMETERS.index("e")
+        log_ratio[:, unbalance] = rng.uniform(-LOG_RATIO, LOG_RATIO, n)
+        rotor = changed(machine.rotor, dict(zip(PARAMETERS, np.expm1(log_ratio[0]), strict=True)))
+        tolerance = machine.operation.speed_tolerance
+        speed = machine.operation.speed_rad_s * float(rng.uniform(1 - tolerance, 1 + tolerance))
+        frequencies = np.append(self._grid_hz, speed / (2 * np.pi))
+        w = 2 * np.pi * frequencies[:, None, None]
+        dynamic = -(w**2) * M_matrix(rotor) + 1j * w * P_matrix(rotor, speed) + Q_matrix(rotor)
+        receptance = np.linalg.inv(dynamic)
+        G = receptance[:, self._dofs] * np.where(self._is_rate[:, None], 1j * w, 1.0)
+        S = np.empty((n, frequencies.size, len(self.states), len(self.states)), dtype=np.complex128)
+        response = (receptance[-1] @ (H_matrix(rotor, speed) @ np.array([1.0, -1.0j])))[self._dofs]
+        response = response * np.where(self._is_rate, 1j * speed, 1.0)
+        response = response * np.exp(1j * machine.operation.unbalance_phase_rad)
+        q = response * np.exp(log_ratio[:, unbalance, None] - log_ratio[0, unbalance])
+        disc = [position for position, name in enumerate(self.states) if name in {"y2", "z2"}]
+        for number in range(n):
+            directions, shapes = self._sources(rng, frequencies)
+            forced = G @ directions
+            S[number] = (forced * shapes[:, None, :]) @ forced.conj().swapaxes(1, 2)
+            # Levels as the simulator sets them: the stochastic displacement at the disc over its 1x amplitude, or over
+            # that of all channels where the disc has none.
+            seen = disc or list(range(len(self.states)))
+            power = np.einsum("fii->i", S[number, :-1]).real * 2 * self._spacing_hz
+            synchronous = np.abs(q[number]) ** 2 / 2
+            wanted = float(rng.uniform(*condition.stochastic_to_1x)) ** 2
+            factor = wanted * float(synchronous[seen].mean() / power[seen].mean())
+            S[number] *= factor
+            S[number] += self._noise(rng, power * factor + synchronous, frequencies)
+        scatter = _factor(S[:, -1] * (4 / self._duration_s))
+        return log_ratio, np.full(n, speed), self._mixed(S[:, :-1]), q, scatter
+
+    def _sources(self, rng: np.random.Generator, frequencies: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Directions of the sources, shape (6, n_sources), and their spectra, shape (n_frequencies, n_sources)."""
+        condition, lever = self._machine.condition, self._machine.rotor.shaft_length_m / 3
+        layout = rng.random()
+        if layout < 0.45:
+            directions = np.eye(6)[:, [0, 1, 3, 4]] * rng.uniform(0.3, 1.0, 4)
+        else:
+            n_random = 1 if layout < 0.9 else int(rng.integers(2, 4))
+            directions = rng.standard_normal((6, n_random)) * np.array([1, 1, lever, 1, 1, lever])[:, None]
+            directions *= rng.uniform(0.3, 1.0, n_random) / np.linalg.norm(directions, axis=0)
+        n_sources = directions.shape[1]
+        low, high = condition.cutoff_hz
+        if rng.random() < 0.6:
+            cutoff, slope = np.full(n_sources, rng.uniform(low, high)), np.full(n_sources, 2.0)
+        else:
+            own = 1 if rng.random() < 0.5 else n_sources
+            cutoff = np.resize(np.exp(rng.uniform(np.log(0.8 * low), np.log(1.25 * high), own)), n_sources)
+            slope = np.resize(rng.uniform(1.0, 4.0, own), n_sources)
+        # A Butterworth low-pass of any order; order two is the colouring filter of Eqs. (7)-(8).
+        return directions, 1 / (1 + (frequencies[:, None] / cutoff) ** (2 * slope)) / cutoff
+
+    def _noise(self, rng: np.random.Generator, power: FloatArray, frequencies: FloatArray) -> FloatArray:
+        """Two-sided densities of the sensor noise as diagonal matrices, shape (n_frequencies, n, n)."""
+        n = power.size
+        level = np.full(n, rng.uniform(*self._machine.condition.noise_relative))
+        corner = np.full(n, np.exp(rng.uniform(np.log(50), np.log(500))))
+        if rng.random() < 0.3:
+            level *= np.exp(rng.uniform(-0.5, 0.5, n))
+            corner = np.exp(rng.uniform(np.log(50), np.log(500), n))
+        rate = self._machine.rate_hz
+        memory = np.zeros(n) if rng.random() < 0.5 else np.exp(-2 * np.pi * corner / rate)
+        turn = np.exp(-2j * np.pi * frequencies[:, None] / rate)
+        density = level**2 * power * (1 - memory**2) / np.abs(1 - memory * turn) ** 2 / rate
+        return np.asarray(density[:, :, None] * np.eye(n), dtype=np.float64)
+
+    @staticmethod
+    def _mixed(S: _Complex) -> _Complex:
+        mixed: _Complex = _HANN[0] * S[:, :-2] + _HANN[1] * S[:, 1:-1] + _HANN[2] * S[:, 2:]
+        return mixed
+
+
+def _factor(S: ComplexArray) -> ComplexArray:
+    """Cholesky factor; channels are scaled first, as displacements and velocities differ by many powers of ten."""
+    scale = np.sqrt(np.einsum("...ii->...i", S).real)
+    L = np.linalg.cholesky(S / scale[..., :, None] / scale[..., None, :])
+    return np.asarray(L * scale[..., :, None], dtype=np.complex128)
+
+
+def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDArray[np.complex64]:
+    """Circular complex normal numbers of unit variance."""
+    parts = rng.standard_normal((*shape[:-1], 2 * shape[-1]), dtype=np.float32)
+    return np.asarray(parts.view(np.complex64) * np.float32(np.sqrt(0.5)))
