@@ -30,13 +30,6 @@ from service.residuals import Opinion, WindowEvaluator
 
 __all__ = ["DataQuality", "HealthState", "MachineHealth", "MachineMonitor", "MonitorReport", "WindowReport"]
 
-_SHORT_HOPS = (2, 4)
-"""Stretches shorter than the window in which large changes are looked for."""
-
-_SHORT_WIDENING = 1.15
-"""Measured on 178 stretches of two and 88 of four hops of the healthy rotor kit (seeds 301, 302): z of the stiffnesses
-scatters by 1.15 instead of 1, of the other parameters by 0.95 to 1.25."""
-
 
 class HealthState(StrEnum):
     """Health of a machine in one word."""
@@ -172,15 +165,7 @@ class MachineMonitor:
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
         self._evaluator = WindowEvaluator(machine, bundle)
-        self._test = SequentialTest(
-            SequentialSettings(
-                hop_s=machine.window.hop_s,
-                window_hops=machine.window.hops,
-                short_hops=tuple(hops for hops in _SHORT_HOPS if hops < machine.window.hops),
-                short_widening=_SHORT_WIDENING,
-                false_alarms_per_month=machine.alarms.false_alarms_per_month,
-            )
-        )
+        self._test = SequentialTest(SequentialSettings.for_machine(machine))
         self._alarms = AlarmBook(machine.alarms)
         self._quality = DataQuality()
         self._refused: Counter[str] = Counter()

@@ -1,7 +1,7 @@
 """Evaluation of one window: several diagnosticians side by side, and whether they agree."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,18 +11,12 @@ from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, EquationReading, ParameterReading
 from models.diagnosis.verdict.agreement import Agreement, agreements
+from models.diagnosis.verdict.determined import determined
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.parameters import PARAMETERS
 
 __all__ = ["Evaluation", "Opinion", "WindowEvaluator"]
-
-_VAGUE = 0.2
-"""A larger standard error of a full window is no longer one: the reading says nothing."""
-
-_PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}
-"""Plane in which a bearing parameter acts."""
 
 _STEADY = 0.05
 """Range of speed within a window, relative: what the changing 1x leaves behind then stays next to the excluded line."""
@@ -156,32 +150,7 @@ class WindowEvaluator:
             diagnosis = likelihood.diagnose(window)
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{self._place}: {error} in this window") from error
-        # A stretch of a tenth of the window has three times its errors, and says as much as that.
-        vague = _VAGUE * max(1.0, self._machine.window.length_s / window.duration_s) ** 0.5
-        found = {reading.name: reading for reading in diagnosis.parameters}
-        stated = tuple(_stated(name, found.get(name), window.states, vague) for name in PARAMETERS)
-        before = [reading.name for reading in diagnosis.evaluable]
-        kept = [before.index(reading.name) for reading in stated if reading.change is not None]
-        covariance = diagnosis.full_covariance[np.ix_(kept, kept)]
-        return replace(diagnosis, parameters=stated, covariance=covariance)
-
-
-def _stated(name: str, reading: ParameterReading | None, states: tuple[str, ...], vague: float) -> ParameterReading:
-    """The reading of one parameter, or why these sensors do not determine it."""
-    plane = _PLANES.get(name)
-    if reading is None:
-        return ParameterReading(name, "likelihood", reason="no phase reference")
-    if plane is not None and not any(state.startswith(plane) for state in states):
-        return ParameterReading(name, "likelihood", reason=f"no displacement or velocity measured in {plane}")
-    if reading.change is None or reading.standard_error is None:
-        return reading
-    if not reading.standard_error < vague:
-        return ParameterReading(
-            name,
-            "likelihood",
-            reason=f"not determined in this window (standard error {reading.standard_error:.0%})",
-        )
-    return reading
+        return determined(diagnosis, window, self._machine.window.length_s)
 
 
 def _opinion(deciding: Diagnosis, other: Diagnosis) -> Opinion:

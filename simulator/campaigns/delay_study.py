@@ -20,6 +20,7 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.delay import detection_delays
+from models.diagnosis.verdict.determined import determined
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.diagnosis.window import SlidingWindow, WindowStatistics
@@ -58,9 +59,6 @@ GAUSSIAN: tuple[tuple[float, tuple[int, ...]], ...] = (
 
 _POWER = 1.644854
 """Normal quantile of 95 %: how far above its threshold a change must lie to be found that often."""
-_WIDENING = 1.15
-"""What the monitor multiplies the standard errors of short stretches by."""
-_VAGUE = 0.2
 _HEALTHY_HOPS = 3
 _BLOCK_S = 0.5
 _STREAM = 40
@@ -188,15 +186,10 @@ def with_hop(machine: Machine, hop_s: float) -> Machine:
     return machine.model_copy(update={"window": window})
 
 
-def settings_for(machine: Machine, per_month: float, short_hops: tuple[int, ...] = (2, 4)) -> SequentialSettings:
+def settings_for(machine: Machine, per_month: float, short_hops: tuple[int, ...] | None = None) -> SequentialSettings:
     """The monitor's settings of the sequential test, at another declared rate."""
-    return SequentialSettings(
-        hop_s=machine.window.hop_s,
-        window_hops=machine.window.hops,
-        short_hops=short_hops,
-        false_alarms_per_month=per_month,
-        short_widening=_WIDENING,
-    )
+    settings = SequentialSettings.for_machine(machine, per_month)
+    return settings if short_hops is None else replace(settings, short_hops=short_hops)
 
 
 def bound_time_s(standard_error: float, duration_s: float, parameter: str, change: float, threshold: float) -> float:
@@ -326,18 +319,7 @@ def _follow(settings: tuple[SequentialSettings, ...], trial: _Trial) -> tuple[_O
 
 def _stretch(machine: Machine, diagnosis: Diagnosis, window: WindowStatistics) -> Stretch:
     """What is determined of a diagnosis, as the monitor takes it."""
-    vague = _VAGUE * max(1.0, machine.window.length_s / window.duration_s) ** 0.5
-    stated = tuple(
-        reading if reading.standard_error is None or reading.standard_error < vague else replace(reading, change=None)
-        for reading in diagnosis.parameters
-    )
-    kept = [
-        at
-        for at, reading in enumerate(diagnosis.evaluable)
-        if reading.standard_error is not None and reading.standard_error < vague
-    ]
-    covariance = diagnosis.full_covariance[np.ix_(kept, kept)]
-    return stretch_of(replace(diagnosis, parameters=stated, covariance=covariance), window.start_ns, window.end_ns)
+    return stretch_of(determined(diagnosis, window, machine.window.length_s), window.start_ns, window.end_ns)
 
 
 def run_delay_study(plan: DelayPlan, processes: int, progress: Callable[[str, int, int], None]) -> DelayResult:
