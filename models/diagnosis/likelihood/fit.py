@@ -26,7 +26,7 @@ from models.signals.block import FloatArray
 
 __all__ = ["LikelihoodFit"]
 
-_COLD_STEPS, _WARM_STEPS = 40, 15
+_COLD_STEPS, _WARM_STEPS = 100, 15
 _NEAR, _GAIN = 0.15, 3.0
 """Converged: no diagnosed parameter would move by more than this many standard errors."""
 _COARSE, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN = 3.0, 25, 1.0, 30.0
