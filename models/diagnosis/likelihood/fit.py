@@ -35,7 +35,7 @@ _GROUPS = 150
 """The band over the widest group."""
 _MOST_LOG_RATIO = float(np.log(5))
 """No stiffness or damping is believed to have changed by more than a factor of five within the model."""
-_MOST_EXCESS = 10.0
+_MOST_EXCESS = 100.0
 """Mean squared excess over its expectation, beyond which a window is not evaluated: a dead or clipped channel."""
 _SYNCHRONOUS_BINS = 3
 
