@@ -373,8 +373,12 @@ class SequentialTest:
     def _leader(self, look: Stretch, verdict: Isolation, clean: Mapping[int, Stretch]) -> Isolation | None:
         """What a straddling stretch may say: the parameter that moved most, if it moved away from nominal.
 
-        One on its way back to nominal reads as changed for as long as the stretch holds old data.
+        One on its way back to nominal reads as changed for as long as the stretch holds old data. A stretch that no
+        single machine explains says nothing at all: with one source of force whatever it reads is far outside its
+        errors, and may be another parameter than the one that changed.
         """
+        if verdict.outside:
+            return None
         before = np.array(self.state.before)
         values, variances = _values(look)
         most = int(np.argmax(np.abs(values - before) / np.sqrt(variances)))
