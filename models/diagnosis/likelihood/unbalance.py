@@ -106,7 +106,7 @@ def _around_rotation(
     spacing_hz = 1 / machine.window.segment_s
     edge_hz = max(float(np.min(distance_hz - groups.bins * spacing_hz / 2)), spacing_hz)
     k = np.arange(max(1, round(edge_hz * duration_s))) + 0.5
-    weights = np.concatenate([np.ones(2)[:, None] * (np.pi * k) ** -2.0]).ravel()
+    weights = np.tile((np.pi * k) ** -2.0, 2)
     nodes_hz = np.abs(np.concatenate([centre_hz - k / duration_s, centre_hz + k / duration_s]))
     near = BinGroups(((0, 1),), np.ones(1), np.array([centre_hz]), nodes_hz[np.newaxis], weights[np.newaxis])
     force_scale = float(model.force_unit[0])
