@@ -258,7 +258,9 @@ def _add_problems(app: FastAPI) -> None:
         # A handler for Exception would let it through to the server after answering, which then drops the connection.
         try:
             return await call_next(request)
-        except Exception:  # callers learn nothing about the inside, the log everything
+        except Exception:
+            # Nothing narrower: refusals and invalid requests were answered further in, what arrives here is an error
+            # in any code behind any path. Each must be a 500 in problem details that tells nothing of the inside.
             _log.exception("request failed", path=request.url.path)
             return _problem(request, 500, "an error inside the service; its log says more")
 

@@ -242,7 +242,9 @@ class _Supervisor:
             for number, (worker, link) in enumerate(self._watched):
                 try:
                     self._look(number, worker, link)
-                except Exception:  # the others must still be looked at
+                except Exception:
+                    # Nothing narrower: an error of any kind, Zenoh's while publishing or one in making up the health,
+                    # would end this thread, and with it the notice of silence for every machine.
                     _log.exception("health could not be published", machine=worker.machine.name)
             if self._stop.wait(_TICK_S):
                 return

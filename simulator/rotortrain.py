@@ -1,6 +1,8 @@
 """``rotortrain``: train a machine's networks, and evaluate what they and the likelihood find."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +24,10 @@ _SEED = 20260101
 _CORES = os.cpu_count() or 1
 MachineOption = Annotated[
     str, typer.Option("--machine", "-m", help='Machine file (TOML), or a shipped machine: "lab", "heavy".')
+]
+BundleOption = Annotated[
+    str | None,
+    typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
 ]
 ProcessesOption = Annotated[int, typer.Option(min=1, help="Worker processes.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
@@ -47,13 +53,10 @@ def train(
 
     Example: rotortrain train --machine lab --out lab-bundle
     """
-    _one_thread_per_process()
-    from simulator.campaigns.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
+    with _running():
+        from simulator.campaigns.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-    try:
         train_bundle(machine, out, windows, draws, seed, processes)
-    except RotorwatchError as error:
-        _fail(error)
 
 
 @app.command()
@@ -94,10 +97,9 @@ def evaluate(
 
     Example: rotortrain evaluate --machine lab --bundle lab --out evaluation --full --page results.md
     """
-    _one_thread_per_process()
-    from simulator.campaigns.evaluate_command import evaluate as run  # noqa: PLC0415  # start-up stays free of numpy and torch
+    with _running():
+        from simulator.campaigns.evaluate_command import evaluate as run  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-    try:
         run(
             machine,
             bundle,
@@ -110,18 +112,13 @@ def evaluate(
             quick=quick,
             page=page,
         )
-    except RotorwatchError as error:
-        _fail(error)
 
 
 @app.command()
 def reproduce(
     machine: MachineOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the page, the figures and the numbers.")],
-    bundle: Annotated[
-        str | None,
-        typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
-    ] = None,
+    bundle: BundleOption = None,
     windows: Annotated[int, typer.Option(min=2, help="Windows per fault condition, cutoff and kind.")] = 20,
     calibration: Annotated[int, typer.Option(min=9, help="Healthy windows that set the limits of the MSD.")] = 199,
     false_alarms: Annotated[
@@ -141,10 +138,9 @@ def reproduce(
 
     Example: rotortrain reproduce --machine lab --out reproduction
     """
-    _one_thread_per_process()
-    from simulator.campaigns.reproduce_command import reproduce_study  # noqa: PLC0415  # start-up stays free of numpy and torch
+    with _running():
+        from simulator.campaigns.reproduce_command import reproduce_study  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-    try:
         reproduce_study(
             machine,
             machine if bundle is None else bundle,
@@ -157,18 +153,13 @@ def reproduce(
             quick=quick,
             redraw=redraw,
         )
-    except RotorwatchError as error:
-        _fail(error)
 
 
 @app.command()
 def peers(
     machine: MachineOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="JSON file for the numbers; the figure goes beside it.")],
-    bundle: Annotated[
-        str | None,
-        typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
-    ] = None,
+    bundle: BundleOption = None,
     windows: Annotated[int, typer.Option(min=2, help="Windows per true change and setting.")] = 100,
     healthy: Annotated[
         int, typer.Option(min=9, help="Healthy windows to learn from; as many again set the limits.")
@@ -186,10 +177,9 @@ def peers(
 
     Example: rotortrain peers --machine lab --out peers.json --windows 100
     """
-    _one_thread_per_process()
-    from simulator.campaigns.peers_command import compare_peers  # noqa: PLC0415  # start-up stays free of numpy and torch
+    with _running():
+        from simulator.campaigns.peers_command import compare_peers  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-    try:
         compare_peers(
             machine,
             machine if bundle is None else bundle,
@@ -200,18 +190,13 @@ def peers(
             seed=seed,
             processes=processes,
         )
-    except RotorwatchError as error:
-        _fail(error)
 
 
 @app.command()
 def ablate(
     machine: MachineOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="JSON file for the numbers; the tables go beside it.")],
-    bundle: Annotated[
-        str | None,
-        typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
-    ] = None,
+    bundle: BundleOption = None,
     windows: Annotated[int, typer.Option(min=2, help="Evaluation windows per true change.")] = 100,
     training: Annotated[int, typer.Option(min=4, help="Training windows of each equation.")] = 60,
     calibration: Annotated[int, typer.Option(min=9, help="Healthy windows that set every variant's limit.")] = 199,
@@ -231,10 +216,9 @@ def ablate(
 
     Example: rotortrain ablate --machine lab --out ablation.json --windows 100
     """
-    _one_thread_per_process()
-    from simulator.campaigns.ablation_command import ablate_networks  # noqa: PLC0415  # start-up stays free of numpy and torch
+    with _running():
+        from simulator.campaigns.ablation_command import ablate_networks  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-    try:
         ablate_networks(
             machine,
             machine if bundle is None else bundle,
@@ -247,8 +231,6 @@ def ablate(
             seed=seed,
             processes=processes,
         )
-    except RotorwatchError as error:
-        _fail(error)
 
 
 @app.command()
@@ -269,24 +251,25 @@ def delay(
 
     Example: rotortrain delay --machine lab --out delay.json
     """
-    _one_thread_per_process()
-    from simulator.campaigns.delay_command import time_detection  # noqa: PLC0415  # start-up stays free of numpy and torch
+    with _running():
+        from simulator.campaigns.delay_command import time_detection  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-    try:
         time_detection(machine, out, trials=trials, others=others, seed=seed, processes=processes, redraw=redraw)
-    except RotorwatchError as error:
-        _fail(error)
 
 
-def _one_thread_per_process() -> None:
-    """Keep the linear algebra to one thread: the workers are processes. Takes effect before numpy is first imported."""
+@contextmanager
+def _running() -> Iterator[None]:
+    """Run a command's work: linear algebra on one thread, the workers are processes; trouble is told in a sentence.
+
+    Takes effect on the linear algebra only before numpy is first imported, so the command imports its work inside.
+    """
     for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-
-
-def _fail(error: RotorwatchError) -> None:
-    typer.echo(f"rotortrain: {error}", err=True)
-    raise typer.Exit(2)
+    try:
+        yield
+    except RotorwatchError as error:
+        typer.echo(f"rotortrain: {error}", err=True)
+        raise typer.Exit(2) from error
 
 
 if __name__ == "__main__":

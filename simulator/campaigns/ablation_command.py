@@ -3,15 +3,15 @@
 from pathlib import Path
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from models.diagnosis.networks.bundle import load_bundle
-from models.errors import EstimationError, RecordingError
+from models.errors import EstimationError
 from models.machine import load_machine
 from simulator.campaigns.ablation import Ablation, AblationPlan, AblationRow, run_ablation
 from simulator.campaigns.draws import Layout
+from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.rates import Rate
+from simulator.campaigns.written import writing
 
 __all__ = ["ablate_networks", "ablation_tables"]
 
@@ -47,23 +47,13 @@ def ablate_networks(
         false_alarm_rate,
         layout=_layout(layout),
     )
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def progress(label: str, done: int, total: int) -> None:
-            if label not in tasks:
-                tasks[label] = bar.add_task(label, total=total)
-            bar.update(tasks[label], completed=done)
-
+    with labelled_bars() as progress:
         ablation = run_ablation(plan, processes, progress)
     tables = ablation_tables(ablation)
     typer.echo(tables)
-    try:
+    with writing(out):
         out.write_text(ablation.model_dump_json(indent=1) + "\n", encoding="utf-8")
         out.with_suffix(".md").write_text(tables, encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
     typer.echo(f"written: {out}, {out.with_suffix('.md')}")
 
 

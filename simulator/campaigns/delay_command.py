@@ -7,14 +7,12 @@ import numpy as np
 import typer
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from pydantic import ValidationError
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from models.errors import RecordingError
-from models.machine import load_machine, validation_text
+from models.machine import load_machine
 from simulator.campaigns.delay_study import DelayCell, DelayPlan, DelayResult, run_delay_study
+from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.study_plots import COLOURS, STYLE, save_figure
+from simulator.campaigns.written import read_to_redraw, writing
 
 __all__ = ["delay_table", "draw_delays", "time_detection"]
 
@@ -31,15 +29,13 @@ def time_detection(
     RotorwatchError
         If the machine cannot be used, numbers to redraw from are damaged, or a file cannot be written.
     """
-    result = _read(out) if redraw else _run(name, trials, others, seed, processes)
+    result = read_to_redraw(DelayResult, out) if redraw else _run(name, trials, others, seed, processes)
     table = delay_table(result)
     typer.echo(table)
-    try:
+    with writing(out):
         out.write_text(result.model_dump_json() + "\n", encoding="utf-8")
         out.with_suffix(".md").write_text(table, encoding="utf-8")
         figure = draw_delays(result, out.with_suffix(".svg"))
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
     typer.echo(f"written: {out}, {out.with_suffix('.md')}, {figure}")
 
 
@@ -47,25 +43,8 @@ def _run(name: str, trials: int, others: int, seed: int, processes: int) -> Dela
     machine = load_machine(name)
     own = machine.window.hop_s
     plan = DelayPlan(machine, seed, trials, others, hops_s=(own,) if own <= 2.0 else (own, 2.0))
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def progress(label: str, done: int, total: int) -> None:
-            if label not in tasks:
-                tasks[label] = bar.add_task(label, total=total)
-            bar.update(tasks[label], completed=done)
-
+    with labelled_bars() as progress:
         return run_delay_study(plan, processes, progress)
-
-
-def _read(out: Path) -> DelayResult:
-    try:
-        return DelayResult.model_validate_json(out.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be read ({error.strerror}); run without --redraw first") from error
-    except ValidationError as error:
-        raise RecordingError(validation_text(out, error)) from error
 
 
 def delay_table(result: DelayResult) -> str:

@@ -6,24 +6,26 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import typer
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import TaskID
 from rich.table import Table
 
 from models.diagnosis.networks.bundle import load_bundle
 from models.errors import RecordingError
-from models.machine import load_machine, validation_text
+from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
 from simulator.campaigns.draws import Anomaly, Excitation
 from simulator.campaigns.evaluation import RATES, WindowRecord, evaluate_cells, read_records
 from simulator.campaigns.evaluation_cells import EvaluationCell, Topic, cells_for
 from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, anomaly_text, excitation_text, goals, percent, rate_text
 from simulator.campaigns.evaluation_summary import Campaign, Summary, summarise
+from simulator.campaigns.progress import bars
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.results_page import page as results_page
 from simulator.campaigns.results_plots import draw_results
 from simulator.campaigns.results_tables import paragraph, table
+from simulator.campaigns.written import read_numbers, writing
 
 __all__ = ["evaluate", "read_summaries", "write_page"]
 
@@ -88,7 +90,7 @@ def evaluate(
         plan=_digest(plan),
     )
     records = out / f"{machine.name}.jsonl"
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         _same_campaign(out / f"{machine.name}{_CAMPAIGN}", campaign, records)
         with _Lines(plan, campaign.windows) as lines:
@@ -104,8 +106,6 @@ def evaluate(
             )
         summary = summarise(_asked_for(read_records(records), plan, campaign.windows), campaign)
         _write(out / f"{machine.name}{_SUMMARY}", summary)
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
     Console().print(_overview(summary))
     typer.echo(f"written: {records}, {out / f'{machine.name}{_SUMMARY}'}")
     if page is not None:
@@ -125,7 +125,7 @@ def write_page(out: Path, page: Path) -> list[Path]:
     """
     summaries = read_summaries(out)
     figures = page.parent / "figures"
-    try:
+    with writing(page):
         figures.mkdir(parents=True, exist_ok=True)
         drawn = [path for summary in summaries for path in draw_results(summary, figures)]
         sections = [path.read_text(encoding="utf-8") for path in sorted(out.glob("*.md"))]
@@ -134,8 +134,6 @@ def write_page(out: Path, page: Path) -> list[Path]:
             sections.insert(0, section)
             drawn.append(figure)
         page.write_text(results_page(summaries, sections), encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"{page}: cannot be written ({error.strerror})") from error
     return [page, *drawn]
 
 
@@ -147,12 +145,7 @@ def read_summaries(out: Path) -> list[Summary]:
     RecordingError
         If there are none, or one is damaged.
     """
-    found = []
-    for path in sorted(out.glob(f"*{_SUMMARY}")):
-        try:
-            found.append(Summary.model_validate_json(path.read_text(encoding="utf-8")))
-        except ValidationError as error:
-            raise RecordingError(validation_text(path, error)) from error
+    found = [read_numbers(Summary, path) for path in sorted(out.glob(f"*{_SUMMARY}"))]
     if not found:
         raise RecordingError(f"{out}: no summaries (*{_SUMMARY}), expected those of at least one machine")
     return found
@@ -163,10 +156,7 @@ def _same_campaign(path: Path, campaign: Campaign, records: Path) -> None:
     if records.exists():
         if not path.exists():
             raise RecordingError(f"{records}: holds windows of an unknown campaign, {path.name} is missing")
-        try:
-            kept = Campaign.model_validate_json(path.read_text(encoding="utf-8"))
-        except ValidationError as error:
-            raise RecordingError(validation_text(path, error)) from error
+        kept = read_numbers(Campaign, path)
         for field in ("physics", "bundle", "seed", "fault", "full", "plan"):
             before, now = getattr(kept, field), getattr(campaign, field)
             if before != now:
@@ -214,8 +204,7 @@ class _Lines:
     """A line for every cell that is done, bars for the running one and for all."""
 
     def __init__(self, plan: list[EvaluationCell], windows: int) -> None:
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._bar = Progress(*columns, console=Console(stderr=True))
+        self._bar = bars()
         self._all = self._bar.add_task("all windows", total=sum(cell.count(windows) for cell in plan))
         self._running: tuple[EvaluationCell, TaskID] | None = None
         self._before = 0
@@ -277,10 +266,7 @@ def _peers_section(path: Path, figures: Path) -> tuple[str, Path]:
     from simulator.campaigns.peers_campaign import SETTINGS, Comparison  # noqa: PLC0415  # the peers are an extra of their own
     from simulator.campaigns.peers_command import draw_comparison  # noqa: PLC0415
 
-    try:
-        comparison = Comparison.model_validate_json(path.read_text(encoding="utf-8"))
-    except ValidationError as error:
-        raise RecordingError(validation_text(path, error)) from error
+    comparison = read_numbers(Comparison, path)
     figure = draw_comparison(comparison, figures / "results-peers.png")
     methods = tuple(comparison.cells[0].methods)
     lines = [

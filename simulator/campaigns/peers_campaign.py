@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -23,6 +23,7 @@ from models.signals.block import FloatArray
 from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.campaigns.opinions import diagnosticians, named_parameters, opinion_of
 from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, score_limit
+from simulator.campaigns.pool import done_in
 from simulator.campaigns.rates import Rate
 from simulator.scenario import Event
 from simulator.stream import blocks
@@ -30,7 +31,6 @@ from simulator.stream import blocks
 __all__ = ["CHANGES", "SETTINGS", "Comparison", "ComparisonCell", "ComparisonPlan", "MethodRates", "Setting", "compare"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
-_T = TypeVar("_T")
 _BLOCK_S = 5.0
 _APART = 1_000_000
 """Numbers of the laboratory's windows: fit, limit and every cell have a million of their own."""
@@ -162,11 +162,8 @@ def _setting(
     plan: ComparisonPlan, setting: Setting, pool: ProcessPoolExecutor, progress: Callable[[str, int, int], None]
 ) -> list[ComparisonCell]:
     def over(label: str, series: _Series, count: int, *, judge: bool) -> list[_Looked]:
-        made = []
-        for one in pool.map(partial(_look, plan, series, judge), range(count), chunksize=2):
-            made.append(one)
-            progress(f"{setting}: {label}", len(made), count)
-        return made
+        look = partial(_look, plan, series, judge)
+        return done_in(pool, look, range(count), partial(progress, f"{setting}: {label}"), chunk=2)
 
     machine, rate, n_healthy = plan.machine, plan.false_alarm_rate, plan.healthy_windows
     fit = over("healthy, to learn", _Series(setting, 0, {}), n_healthy, judge=False)

@@ -6,14 +6,14 @@ import matplotlib as mpl
 import typer
 from matplotlib.figure import Figure
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from models.diagnosis.networks.bundle import load_bundle
-from models.errors import RecordingError
 from models.machine import load_machine
 from simulator.campaigns.peers_campaign import SETTINGS, Comparison, ComparisonCell, ComparisonPlan, compare
+from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.study_plots import COLOURS, MARKERS, METHOD_TEXT, STYLE, save_figure
+from simulator.campaigns.written import writing
 
 __all__ = ["compare_peers", "draw_comparison"]
 
@@ -38,22 +38,12 @@ def compare_peers(
     """
     machine = load_machine(name)
     plan = ComparisonPlan(machine, load_bundle(bundle_name, machine), seed, windows, healthy, false_alarm_rate)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def progress(label: str, done: int, total: int) -> None:
-            if label not in tasks:
-                tasks[label] = bar.add_task(label, total=total)
-            bar.update(tasks[label], completed=done)
-
+    with labelled_bars() as progress:
         comparison = compare(plan, processes, progress)
     Console().print(_table(comparison))
-    try:
+    with writing(out):
         out.write_text(comparison.model_dump_json(indent=1) + "\n", encoding="utf-8")
         figure = draw_comparison(comparison, out.with_suffix(".png"))
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
     typer.echo(f"written: {out}, {figure}")
 
 

@@ -3,25 +3,15 @@
 from pathlib import Path
 
 import typer
-from pydantic import ValidationError
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from models.diagnosis.networks.bundle import load_bundle
-from models.errors import RecordingError
-from models.machine import load_machine, validation_text
+from models.machine import load_machine
+from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.study import Study, run_study
 from simulator.campaigns.study_page import study_page
 from simulator.campaigns.study_plots import draw_study
 from simulator.campaigns.study_windows import CUTOFFS_HZ, NOISE_LEVELS, StudyPlan
+from simulator.campaigns.written import read_to_redraw, writing
 
 __all__ = ["read_study", "reproduce_study", "write_study"]
 
@@ -62,14 +52,7 @@ def reproduce_study(
             CUTOFFS_HZ[1:3] if quick else CUTOFFS_HZ,
             NOISE_LEVELS[::4] if quick else NOISE_LEVELS,
         )
-        with _progress() as bar:
-            tasks: dict[str, TaskID] = {}
-
-            def progress(label: str, done: int, total: int) -> None:
-                if label not in tasks:
-                    tasks[label] = bar.add_task(label, total=total)
-                bar.update(tasks[label], completed=done)
-
+        with labelled_bars(remaining=True) as progress:
             study = run_study(plan, processes, progress)
     for path in write_study(study, out):
         typer.echo(f"written: {path}")
@@ -84,13 +67,11 @@ def write_study(study: Study, out: Path) -> list[Path]:
         If the folder cannot be written.
     """
     figures, page = out / "figures", out / "reproduction.md"
-    try:
+    with writing(out):
         figures.mkdir(parents=True, exist_ok=True)
         (figures / _NUMBERS).write_text(study.model_dump_json() + "\n", encoding="utf-8")
         drawn = draw_study(study, figures)
         page.write_text(study_page(study), encoding="utf-8")
-    except OSError as error:
-        raise RecordingError(f"{out}: cannot be written ({error.strerror})") from error
     return [figures / _NUMBERS, *drawn, page]
 
 
@@ -102,21 +83,4 @@ def read_study(out: Path) -> Study:
     RecordingError
         If there are none, or they are damaged.
     """
-    path = out / "figures" / _NUMBERS
-    try:
-        return Study.model_validate_json(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}); run without --redraw first") from error
-    except ValidationError as error:
-        raise RecordingError(validation_text(path, error)) from error
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    )
+    return read_to_redraw(Study, out / "figures" / _NUMBERS)

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperHealthy, calibrate_paper
 from models.diagnosis.networks.paper_training import train_paper_network
 from simulator.campaigns.draws import Purpose, with_tilt
+from simulator.campaigns.pool import done_in
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.study_windows import (
     CONDITIONS,
@@ -171,11 +172,7 @@ def run_study(plan: StudyPlan, processes: int, progress: Callable[[str, int, int
     with ProcessPoolExecutor(processes) as pool:
 
         def over(label: str, function: Callable[[Run], _T], runs: Sequence[Run]) -> list[_T]:
-            made = []
-            for one in pool.map(function, runs, chunksize=4):
-                made.append(one)
-                progress(label, len(made), len(runs))
-            return made
+            return done_in(pool, function, runs, partial(progress, label), chunk=4)
 
         training = over("training windows", partial(simulate, plan), training_runs)
         networks = tuple(train_paper_network(equation, training, rig, plan.seed) for equation in PAPER_EQUATIONS)

@@ -9,15 +9,7 @@ from pathlib import Path
 import numpy as np
 import typer
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from models.diagnosis.networks.amortised import AmortisedNetworks
@@ -31,6 +23,7 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
 from simulator.campaigns.draws import Draw, Purpose, draw_condition, windows, with_tilt
 from simulator.campaigns.feature_draws import FeatureDraws, batches
+from simulator.campaigns.progress import bars
 from simulator.campaigns.spectral_draws import LOG_RATIO
 
 __all__ = ["train_bundle"]
@@ -61,7 +54,7 @@ def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, 
     machine = load_machine(name)
     networks: list[EquationNetwork] = []
     held_out: list[tuple[WindowStatistics, dict[str, float]]] = []
-    with _progress() as bar:
+    with bars(remaining=True) as bar:
         for stream, equation in enumerate(EQUATIONS):
             # Tilt is simulated where it is not measured: the same bundle serves the machine once it has tilt probes.
             rig = with_tilt(machine) if missing(equation, machine.descriptor.states) else machine
@@ -152,14 +145,3 @@ def _slim(window: WindowStatistics) -> WindowStatistics:
 
 def _complete(bar: Progress, task: TaskID, done: float) -> None:
     bar.update(task, completed=done)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-    )

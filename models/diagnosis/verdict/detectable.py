@@ -54,18 +54,24 @@ def detectable_changes(
     power : float
         Probability of finding the change.
     """
-    found = []
     variances = np.diag(stretch.estimate()[1]).tolist()
-    for name, variance in zip(stretch.names, variances, strict=True):
-        size = (thresholds.first + float(ndtri(power))) * math.sqrt(variance)
-        found.append(DetectableChange(name, max(-1.0, from_scale(name, -size)), from_scale(name, size), length_s))
-    return tuple(found)
+    return tuple(
+        _detectable(name, math.sqrt(variance), length_s, thresholds, power)
+        for name, variance in zip(stretch.names, variances, strict=True)
+    )
+
+
+def _detectable(
+    name: str, standard_error: float, length_s: float, thresholds: Thresholds, power: float
+) -> DetectableChange:
+    size = (thresholds.first + float(ndtri(power))) * standard_error
+    return DetectableChange(name, max(-1.0, from_scale(name, -size)), from_scale(name, size), length_s)
 
 
 def length_for(
     name: str, change: float, standard_error: float, length_s: float, thresholds: Thresholds, power: float = _POWER
 ) -> float:
-    """Data it takes to find a change of one parameter: standard errors fall as one over the root of the length.
+    """Data it takes to find a change of one parameter whose standard error is known.
 
     Parameters
     ----------
@@ -92,14 +98,11 @@ def length_for(
     ValueError
         If the change is 0 or -1 and below.
     """
-    if change == 0 or not change > -1:
-        raise ValueError(f"change of {name} to be found is {change}, expected above -1 and not 0")
-    needed = (thresholds.first + float(ndtri(power))) * standard_error / abs(to_scale(name, change))
-    return length_s * needed**2
+    return length_to_find(_detectable(name, standard_error, length_s, thresholds, power), change)
 
 
 def length_to_find(found: DetectableChange, change: float) -> float:
-    """Data it takes to find another change of the parameter than the smallest one of a known length.
+    """Data it takes to find another change of the parameter: standard errors fall as one over the root of the length.
 
     Parameters
     ----------
