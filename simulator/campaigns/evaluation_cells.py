@@ -91,9 +91,9 @@ def cells_for(fault: float, *, full: bool) -> list[EvaluationCell]:
     if not full:
         return cells
     # One source reads a hundredth of these changes: they are asked of independent sources alone.
-    cells += [EvaluationCell(Topic.SMALL, faults=faults, layout=Layout.INDEPENDENT, windows=0.6) for faults in _ALONE]
+    cells += [EvaluationCell(Topic.SMALL, faults=faults, layout=Layout.INDEPENDENT) for faults in _ALONE]
     cells += [
-        EvaluationCell(Topic.PAPER, faults={name: large[name] for name in names}, windows=0.3)
+        EvaluationCell(Topic.PAPER, faults={name: large[name] for name in names}, windows=0.4)
         for names in PAPER_CONDITIONS
     ]
     cells += [
@@ -110,7 +110,7 @@ def cells_for(fault: float, *, full: bool) -> list[EvaluationCell]:
     ]
     cells += [EvaluationCell(Topic.DETECTABLE, windows=0.8)]
     cells += [
-        EvaluationCell(Topic.OUTSIDE, anomaly=anomaly, windows=0.3)
+        EvaluationCell(Topic.OUTSIDE, anomaly=anomaly, windows=0.4)
         for anomaly in Anomaly
         if anomaly is not Anomaly.NONE
     ]

@@ -46,8 +46,8 @@ def test_drawn_spectra_scatter_around_their_expectation_like_averaged_segments()
     made = np.concatenate(list(draws.realisations(rng, expected, speed, 600)))
     power = np.einsum("bfii->bfi", made).real / np.einsum("bfii->bfi", expected).real
     assert power.mean() == pytest.approx(1.0, abs=0.01)
-    # Half-overlapped Hann segments: variance 1/60 · (1 + 2/36) in each bin, correlation 4/9 between neighbours.
-    assert power.var(axis=0).mean() == pytest.approx((1 + 2 / 36) / 60, rel=0.12)
+    # Half-overlapped Hann segments: variance 1/24 · (1 + 2/36) in each bin, correlation 4/9 between neighbours.
+    assert power.var(axis=0).mean() == pytest.approx((1 + 2 / 36) / 24, rel=0.12)
     deviation = power - power.mean(axis=0)
     neighbours = (deviation[:, 1:] * deviation[:, :-1]).mean() / deviation.var()
     assert neighbours == pytest.approx(4 / 9, abs=0.04)

@@ -6,6 +6,7 @@ import pytest
 from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN, BinGroups, group_bins
 from models.diagnosis.likelihood.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.moments import plan_for
@@ -56,7 +57,7 @@ def test_derivatives_of_the_spectra() -> None:
     machine, rng = load_machine("lab"), np.random.default_rng(0)
     states = plan_for(machine).states
     scale = np.where([name.endswith("dot") for name in states], 0.04, 2e-4)
-    model = SpectralModel(machine, states, groups_of(machine, 8.0), scale, 2.0)
+    model = SpectralModel(machine, Motions(states, scale), groups_of(machine, 8.0), 2.0)
     theta = rng.normal(0, 0.2, model.size)
     theta[model.cutoff_at], theta[model.order_at] = np.log(80), np.log(2.5)
     theta[model.noise_at] -= 5
@@ -86,8 +87,8 @@ def test_the_score_is_the_slope_of_the_likelihood() -> None:
     window = simulate_window(Draw(machine, SEED, Purpose.EVALUATION, 30, layout=Layout.ONE_SOURCE), 0)
     groups = groups_of(machine, 4.0)
     power = np.einsum("fii->i", window.spectrum).real / window.spectrum.shape[0]
-    model = SpectralModel(machine, window.states, groups, np.sqrt(power), 1.0)
-    observed = groups.average(window.spectrum) / np.sqrt(np.outer(power, power))
+    model = SpectralModel(machine, Motions(window.states, np.sqrt(power)), groups, 1.0)
+    observed = model.motions.spectra(groups.average(window.spectrum), model.centre)
     search = FisherScoring(model, observed, window.n_segments, window.speed_rad_s, 80.0)
     rng = np.random.default_rng(1)
     theta = search.centre + rng.normal(0, 0.1, model.size)

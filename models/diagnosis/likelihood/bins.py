@@ -22,8 +22,10 @@ __all__ = ["AVERAGES_PER_BIN", "BinGroups", "group_bins", "natural_frequencies"]
 
 AVERAGES_PER_BIN = 0.4737
 """Independent averages per half-overlapped Hann segment and bin: one over the sum of the squared correlations with all
-neighbouring segments and bins (1, 2 · 4/9, 2 · 1/36 within a segment; 1/36, 2 · 0.0200, 2 · 0.0069 with either
-neighbour)."""
+neighbouring segments and bins."""
+
+_SCATTER = AVERAGES_PER_BIN * np.array([1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069])
+"""Squared correlations with the bin itself and the two next to it: within a segment, and twice with a neighbour."""
 
 _KERNEL = np.array([1.0, 4.0, 1.0]) / 6
 _OFFSETS = np.arange(-2.5, 2.6, 0.5)  # in bins
@@ -53,6 +55,9 @@ class BinGroups:
         Frequencies at which the theory is needed; padded with copies of weight zero.
     weights : ndarray, shape (n_groups, n_nodes)
         What each of them contributes to the group's expected spectrum.
+    shared : ndarray, shape (n_groups, n_groups)
+        Squared correlations of the groups' scatter, in units of what `AVERAGES_PER_BIN` says of each: a group of few
+        bins scatters less than that, and together with its neighbours.
     """
 
     edges: tuple[tuple[int, int], ...]
@@ -60,6 +65,7 @@ class BinGroups:
     centre_hz: FloatArray
     nodes_hz: FloatArray
     weights: FloatArray
+    shared: FloatArray
 
     def average(self, spectrum: ComplexArray) -> ComplexArray:
         """Average estimated cross-spectra over each group, shape (n_groups, n, n)."""
@@ -121,4 +127,20 @@ def group_bins(
         centre_hz=np.array([frequencies_hz[first:end].mean() for first, end in edges]),
         nodes_hz=nodes_hz,
         weights=weights,
+        shared=_shared_scatter(edges, frequencies_hz.size),
     )
+
+
+def _shared_scatter(edges: list[tuple[int, int]], n_bins: int) -> FloatArray:
+    group_of = np.full(n_bins, -1)
+    for group, (first, end) in enumerate(edges):
+        group_of[first:end] = group
+    shared = np.zeros((len(edges), len(edges)))
+    for apart, correlation in enumerate(_SCATTER):
+        left, right = group_of[: n_bins - apart], group_of[apart:]
+        both = (left >= 0) & (right >= 0)
+        np.add.at(shared, (left[both], right[both]), correlation)
+        if apart:
+            np.add.at(shared, (right[both], left[both]), correlation)
+    width = np.array([end - first for first, end in edges])
+    return shared / np.sqrt(np.outer(width, width))

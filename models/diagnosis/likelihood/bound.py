@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.likelihood.bins import BinGroups
+from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SHAPES, STRUCTURAL, SpectralModel
 from models.diagnosis.likelihood.unbalance import estimate_unbalance
 from models.machine import Machine
@@ -86,15 +87,16 @@ def cramer_rao(
         frequencies_hz,
         frequencies_hz[:, None],
         one[:, None],
+        np.eye(one.size),
     )
     lever = machine.rotor.shaft_length_m / 3
     unit = np.array([1, 1, lever, 1, 1, lever])
     levels = true.levels / np.outer(unit, unit)
     force_scale = float(np.sqrt(np.trace(levels) / 6))
     shapes = 0 if shape_known else SHAPES
-    model = SpectralModel(machine, states, bins, np.ones(len(states)), force_scale, shapes)
-    scale = np.sqrt(np.einsum("fii->i", model.at(_theta(model, true, levels), true.speed_rad_s).S).real / one.size)
-    model = SpectralModel(machine, states, bins, scale, force_scale, shapes)
+    # In units of the true noise the motions lose nothing of what displacement and velocity say.
+    motions = Motions(states, np.sqrt(true.noise))
+    model = SpectralModel(machine, motions, bins, force_scale, shapes)
     theta = _theta(model, true, levels)
     point = model.at(theta, true.speed_rad_s)
     whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(point.S)), dtype=np.complex128)
@@ -123,8 +125,7 @@ def _theta(model: SpectralModel, true: TrueCondition, levels: FloatArray) -> Flo
     theta = np.zeros(model.size)
     theta[: len(STRUCTURAL)] = np.log1p([true.changes.get(name, 0.0) for name in STRUCTURAL])
     theta[model.cutoff_at], theta[model.order_at] = np.log(true.cutoff_hz), np.log(2)
-    theta[model.noise_at] = np.log(true.noise / model.scale**2)
-    theta[model.colour_at] = true.noise_colour
+    theta[model.colour_at] = true.noise_colour.mean()
     relative = levels / model.force_unit[0] ** 2
     relative = relative + 1e-12 * np.trace(relative) * np.eye(6)
     theta[model.level_at] = np.linalg.cholesky(relative)[ROWS, COLUMNS]

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from models.diagnosis.likelihood.bins import BinGroups, group_bins
 from models.diagnosis.likelihood.goodness import goodness_of_fit
+from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Workspace
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
@@ -43,7 +44,7 @@ _SYNCHRONOUS_BINS = 3
 class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
-    The state kept between windows is only the starting point.
+    The state kept between windows is only the starting point, and how alike the forces' colours were.
 
     Parameters
     ----------
@@ -55,6 +56,7 @@ class LikelihoodFit:
         self._machine = machine
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
         self._last: FloatArray | None = None
+        self._strength: float | None = None
         self._groups: dict[bytes, BinGroups] = {}
         self._workspace = Workspace()
 
@@ -65,7 +67,7 @@ class LikelihoodFit:
 
     def reset(self) -> None:
         """Start the next window cold."""
-        self._last = None
+        self._last = self._strength = None
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
@@ -93,7 +95,7 @@ class LikelihoodFit:
         if not (np.all(np.isfinite(theta)) and np.all(np.diag(covariance) > 0)):
             self.reset()
             raise EstimationError(nowhere)
-        self._last = theta
+        self._last, self._strength = theta, search.strength
         self._check_explained(model, search, found)
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
@@ -114,7 +116,8 @@ class LikelihoodFit:
             names, change = (*names, "e"), np.append(change, e.change)
             cross = (e.covariance * ratio)[:, None]
             spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
-        goodness = goodness_of_fit(self._machine, model, search, found)
+        states = model.groups.average(window.spectrum)
+        goodness = goodness_of_fit(self._machine, model, search, found, states)
         readings = tuple(
             ParameterReading(name, self.by, float(value), float(error))
             for name, value, error in zip(names, change, np.sqrt(np.diag(spread)), strict=True)
@@ -147,16 +150,18 @@ class LikelihoodFit:
     ) -> tuple[SpectralModel, FisherScoring, Maximum]:
         """Search from the last window's maximum, or cold: first on coarse groups with one low-pass for all forces."""
         groups = self._grouped(window.frequencies_hz, excluded, 1.0)
-        force_scale = self._force_scale(window.states, groups, scale, speed)
-        model = SpectralModel(self._machine, window.states, groups, scale, force_scale)
-        search = self._search(model, window, speed)
+        motions = Motions(window.states, scale)
+        force_scale = self._force_scale(motions, groups, speed)
+        model = SpectralModel(self._machine, motions, groups, force_scale)
+        search = self._search(model, window, speed, self._strength)
         if self._last is not None and self._last.size == model.size:
             try:
                 return model, search, search.maximise(self._last, _WARM_STEPS, _NEAR, _GAIN)
             except np.linalg.LinAlgError:  # the old point makes no valid spectrum for this window
                 self.reset()
+                search = self._search(model, window, speed)
         wide = self._grouped(window.frequencies_hz, excluded, _COARSE)
-        coarse = SpectralModel(self._machine, window.states, wide, scale, force_scale, shapes=0)
+        coarse = SpectralModel(self._machine, motions, wide, force_scale, shapes=0)
         first = self._search(coarse, window, speed)
         start = starting_point(coarse, _observed(coarse, window), first.centre, speed)
         near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta
@@ -164,9 +169,12 @@ class LikelihoodFit:
         theta[: coarse.colour_at.stop], theta[model.level_at] = near[: coarse.colour_at.stop], near[coarse.level_at]
         return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN)
 
-    def _search(self, model: SpectralModel, window: WindowStatistics, speed: float) -> FisherScoring:
+    def _search(
+        self, model: SpectralModel, window: WindowStatistics, speed: float, strength: float | None = None
+    ) -> FisherScoring:
+        observed = _observed(model, window)
         return FisherScoring(
-            model, _observed(model, window), window.n_segments, speed, self._usual_cutoff_hz, self._workspace
+            model, observed, window.n_segments, speed, self._usual_cutoff_hz, strength, self._workspace
         )
 
     def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
@@ -180,12 +188,12 @@ class LikelihoodFit:
             self._groups[key] = group_bins(frequencies_hz, self._machine, excluded, widest_hz)
         return self._groups[key]
 
-    def _force_scale(self, states: tuple[str, ...], groups: BinGroups, scale: FloatArray, speed: float) -> float:
+    def _force_scale(self, motions: Motions, groups: BinGroups, speed: float) -> float:
         """Unit of forces in which equal independent sources of level one make the mean power of the nominal rotor.
 
         A parameter point therefore stays a good start when the machine merely becomes louder.
         """
-        model = SpectralModel(self._machine, states, groups, scale, shapes=0)
+        model = SpectralModel(self._machine, motions, groups, shapes=0)
         theta = np.zeros(model.size)
         theta[model.cutoff_at] = np.log(self._usual_cutoff_hz)
         theta[model.order_at] = np.log(2)
@@ -209,7 +217,7 @@ class LikelihoodFit:
 
 def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:
     """Estimated spectra in the model's groups and units."""
-    return np.asarray(model.groups.average(window.spectrum) / np.outer(model.scale, model.scale), dtype=np.complex128)
+    return model.motions.spectra(model.groups.average(window.spectrum), model.centre)
 
 
 def _near_rotation(frequencies_hz: FloatArray, speed_rad_s: float) -> npt.NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.stats
 
+from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, SpectralModel, packed, twice_packed
 from models.diagnosis.moments import ComplexArray
@@ -54,16 +55,19 @@ class Goodness:
         Total squared excess of the whitened spectra over its expectation, in standard deviations.
     alternatives : tuple of Alternative
         Everything tried.
+    tests : int
+        How many of them, and the total, say something of their own.
     """
 
     excess_z: float
     alternatives: tuple[Alternative, ...]
+    tests: int
 
     @property
     def misfit_z(self) -> float:
         """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
         worst = max(scipy.stats.norm.logsf(self.excess_z) * -1, *(-_two_sided(one.z) for one in self.alternatives))
-        tests = len(self.alternatives) + 1
+        tests = self.tests
         log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
         return float(scipy.stats.norm.isf(np.exp(max(log_p, -700.0))))
 
@@ -80,8 +84,20 @@ def _two_sided(z: float) -> float:
     return float(np.log(2) + scipy.stats.norm.logsf(abs(z)))
 
 
-def goodness_of_fit(machine: Machine, model: SpectralModel, search: FisherScoring, found: Maximum) -> Goodness:
-    """Try the alternatives at the maximum of one window."""
+def goodness_of_fit(
+    machine: Machine, model: SpectralModel, search: FisherScoring, found: Maximum, states: ComplexArray
+) -> Goodness:
+    """Try the alternatives at the maximum of one window.
+
+    Parameters
+    ----------
+    machine : Machine
+    model : SpectralModel
+    search : FisherScoring
+    found : Maximum
+    states : ndarray, shape (n_groups, n_states, n_states)
+        Estimated cross-spectra of the states, SI: displacement and velocity are compared with each other, too.
+    """
     names, slopes = _alternatives(machine, model, found)
     excess = packed(found.whitened.excess)
     weight = search.averages[:, None]
@@ -98,15 +114,31 @@ def goodness_of_fit(machine: Machine, model: SpectralModel, search: FisherScorin
         for name, s, i, a in zip(names, score, left, alone, strict=True)
         if i > _LEAST_INFORMATION * a
     )
-    return Goodness(_excess_z(model, search, found), alternatives)
+    mismatches = model.motions.mismatches(states, model.centre, search.averages)
+    pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
+    # The gains of a pair are nearly one test, and how far the pair disagrees is hardly random.
+    tests = len(alternatives) - len(pairs) + 1
+    return Goodness(_excess_z(model, search, found), (*alternatives, *pairs), tests)
+
+
+def _named(mismatch: Mismatch, alternatives: dict[str, Alternative]) -> Alternative:
+    """Displacement and velocity disagree: which of them deviates is the one whose gain explains the window better."""
+    x, v = (f"gain of {state}" for state in mismatch.states)
+    z_x, z_v = (abs(alternatives[name].z) if name in alternatives else 0.0 for name in (x, v))
+    if z_x > z_v:
+        return Alternative(x, mismatch.z, 1 / (1 + mismatch.change) - 1)
+    return Alternative(v, mismatch.z, mismatch.change)
 
 
 def _excess_z(model: SpectralModel, search: FisherScoring, found: Maximum) -> float:
-    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖², n² per group where the model holds, over its expectation and standard deviation."""
-    averages = search.averages
-    total = float(averages @ np.einsum("fij,fij->f", found.whitened.excess, found.whitened.excess.conj()).real)
-    degrees = model.n**2 * averages.size
-    return float((total - degrees) / np.sqrt(2 * degrees))
+    """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, in its standard deviations.
+
+    Where the model holds every element scatters as the groups say, less one for every parameter that was fitted.
+    """
+    shared, excess = model.groups.shared, found.whitened.excess
+    total = float(search.averages @ np.einsum("fij,fji->f", excess, excess).real)
+    expected = model.n**2 * float(np.trace(shared)) - found.fitted
+    return float((total - expected) / (model.n * np.sqrt(2 * np.sum(shared**2))))
 
 
 def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tuple[list[str], FloatArray]:
@@ -116,8 +148,8 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     response: ComplexArray = whitened @ point.C
     names, slopes = [], []
     coloured = point.S @ L_inverse.conj().swapaxes(1, 2)
-    for number, state in enumerate(model.states):
-        outer = L_inverse[:, :, number, None] * coloured[:, None, number, :]
+    for state, (number, share) in model.motions.shares(model.centre).items():
+        outer = share[:, None, None] * L_inverse[:, :, number, None] * coloured[:, None, number, :]
         names.append(f"gain of {state}")
         slopes.append(twice_packed(outer))
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2

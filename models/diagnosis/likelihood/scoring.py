@@ -17,8 +17,13 @@ LOG_NOISE = float(np.log(1e-3))
 _WEAK = 0.05
 """Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of
 low rank, or a channel without visible noise, leaves them undetermined."""
-_COLOUR, _SHAPE = 1.0, 0.5
-"""The same for the noise's colour and the forces' colour."""
+_COLOUR = 1.0
+"""The same for the noise's colour."""
+_STRENGTHS = np.geomspace(0.5, 2000, 24)
+"""How strongly the forces' own colours may be pulled towards none. The window itself says which (D. J. C. MacKay,
+Neural Computation 4 (1992)): forces of one colour cost next to nothing, and a hump is left alone."""
+_LOOKS, _SAME_STRENGTH = 3, 0.5
+"""How often a search asks for the strength anew, and the change of its logarithm that is not worth more steps."""
 _CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
 """The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
 keeps the order: on coarse groups a filter of order nought would pass for anything."""
@@ -57,6 +62,8 @@ class Maximum:
         Theory and estimate there.
     steps : int
         Steps tried.
+    fitted : float
+        Parameters that the window determined; what the weak pulls determine does not count.
     remaining : ndarray, shape (n_diagnosed,)
         Step of the diagnosed parameters that the search would still take; a small part of a standard error if it has
         converged.
@@ -67,6 +74,7 @@ class Maximum:
     slopes: FloatArray
     whitened: Whitened
     steps: int
+    fitted: float
     remaining: FloatArray
 
 
@@ -102,6 +110,9 @@ class FisherScoring:
     speed_rad_s : float
     usual_cutoff_hz : float
         Where the cutoff is pulled, weakly, if the band does not show it.
+    strength : float, optional
+        How strongly the forces' own colours are pulled towards none until the window itself has said so; the weakest
+        pull without it.
     workspace : Workspace, optional
         Shared by searches that follow each other; the slopes of a `Maximum` are valid until the next one.
     """
@@ -113,7 +124,8 @@ class FisherScoring:
         n_segments: int,
         speed_rad_s: float,
         usual_cutoff_hz: float,
-        workspace: "Workspace | None" = None,
+        strength: float | None = None,
+        workspace: Workspace | None = None,
     ) -> None:
         workspace = Workspace() if workspace is None else workspace
         self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
@@ -122,7 +134,8 @@ class FisherScoring:
         self._ridge = np.full(model.size, _WEAK)
         self._ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
         self._ridge[model.colour_at] = _COLOUR
-        self._ridge[model.shape_at] = _SHAPE
+        self.strength = float(_STRENGTHS[0]) if strength is None else strength
+        self._ridge[model.shape_at] = self.strength
         self._ridge[model.cutoff_at] = _CUTOFF
         self._ridge[model.order_at] = _ORDER if model.shapes else _FIXED
         self.centre = np.zeros(model.size)
@@ -148,17 +161,26 @@ class FisherScoring:
         """
         model = self._model
         diagnosed, logarithms = slice(model.cutoff_at), slice(model.level_at.start)
-        damping, steps = 1e-3, 0
+        damping, steps, looks = 1e-3, 0, 0
         value, whitened = self._value(theta)
         if whitened is None:
             raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
         gradient, information, slopes, on_levels = self._scores(theta, whitened)
         while True:
-            covariance = np.linalg.inv(information)
+            covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
             full_step = np.asarray(covariance @ gradient, dtype=np.float64)
             is_near = np.all(full_step[diagnosed] ** 2 < near**2 * np.diag(covariance)[diagnosed])
-            if steps == most_steps or damping > 1e8 or (is_near and gradient @ full_step / 2 < gain):
+            if steps == most_steps or damping > 1e8:
                 break
+            if is_near and gradient @ full_step / 2 < gain:
+                if not model.shapes or looks == _LOOKS or not self._learn_strength(theta, covariance):
+                    break
+                looks += 1
+                value, whitened = self._value(theta)
+                if whitened is None:
+                    raise AssertionError("a point that made a valid spectrum still makes one")
+                gradient, information, slopes, on_levels = self._scores(theta, whitened)
+                continue
             steps += 1
             step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
             trial = theta + step
@@ -173,7 +195,25 @@ class FisherScoring:
                 damping = max(damping / 8, 1e-7)
             else:
                 damping *= 8
-        return Maximum(theta, on_levels, slopes, whitened, steps, full_step[diagnosed])
+        fitted = model.size - float(self._ridge @ np.diag(covariance))
+        return Maximum(theta, on_levels, slopes, whitened, steps, fitted, full_step[diagnosed])
+
+    def _learn_strength(self, theta: FloatArray, covariance: FloatArray) -> bool:
+        """Pull the colours as strongly as is likeliest for the ones found; False if that is as before.
+
+        Around the present maximum the log-likelihood of the colours, everything else maximised, is quadratic, so the
+        evidence of every strength is known at once.
+        """
+        at, old = self._model.shape_at, self.strength
+        precision = np.linalg.inv(covariance[at, at])
+        eigenvalues, vectors = np.linalg.eigh(precision)
+        left = np.maximum(eigenvalues - old, 0)[:, None] + _STRENGTHS
+        slope = vectors.T @ (precision @ theta[at])
+        evidence = np.sum(np.log(_STRENGTHS / left) + slope[:, None] ** 2 / left, axis=0)
+        new = float(_STRENGTHS[np.argmax(evidence)])
+        self.strength = new
+        self._ridge[at] = new
+        return bool(abs(np.log(new / old)) > _SAME_STRENGTH)
 
     def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
         """Log-likelihood and the weak pulls, up to a constant."""

@@ -1,8 +1,9 @@
 """Theoretical cross-spectra for the likelihood: rotor, unknown smooth excitation, sensor noise.
 
-The measured states' cross-spectral matrix at frequency f is
+The cross-spectral matrix of the measured motions (displacement and velocity of a degree of freedom combined, see
+`models.diagnosis.likelihood.motions`) at frequency f is
 
-    S(f) = c(f; fc) · G D(f) C D(f) Gᴴ + diag(d(f)),   G = [H; jωH] at the measured rows,
+    S(f) = c(f; fc) · G D(f) C D(f) Gᴴ + diag(d(f)),   G = H at the measured rows, in the motions' units,
 
 with H = (-ω²M + jωP + Q)⁻¹ the receptance of Eq. (1), c the power gain of a low-pass of unknown cutoff and order, C an
 unknown full level matrix over all six degrees of freedom, and D = diag(exp(½ Σ_j a_ij b_j(f))) what every degree of
@@ -14,9 +15,9 @@ comparison of theoretical and estimated correlations with the right weight on ev
 C = T Tᵀ with T lower triangular, so that every point the search tries is a possible excitation. Standard errors come
 from the information on C itself, which stays honest where T loses rank (decision 0002).
 
-The sensor noise has a smooth spectrum of its own in every channel, d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of
-the band's end: white for b = 0, first-order low-pass at f_r for b = -1. Taken as white when it is not, it pulled the
-damping of the heavy machine down by up to 15 %.
+The sensor noise has a smooth spectrum of its own in every motion, d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of
+the band's end: white for b = 0, first-order low-pass at f_r for b = -1; d₀ is made of a density of each sensor.
+Taken as white when it is not, it pulled the damping of the heavy machine down by up to 15 %.
 """
 
 from dataclasses import dataclass
@@ -24,10 +25,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.likelihood.bins import BinGroups
+from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.moments import ComplexArray
 from models.machine import Machine
 from models.physics.excitation import low_pass, low_pass_slopes
-from models.physics.matrices import STATE_INDEX, M_matrix, P_matrix, Q_matrix, Q_shaft
+from models.physics.matrices import M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
 
 __all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralModel", "packed", "twice_packed"]
@@ -35,7 +37,7 @@ __all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralMod
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
 
-SHAPES = 5
+SHAPES = 8
 """Polynomials in √f for the colour of every degree of freedom's force."""
 
 ROWS, COLUMNS = np.tril_indices(6)
@@ -46,7 +48,7 @@ _BEARING_DOFS = (0, 0, 3, 3)
 
 @dataclass(frozen=True, slots=True)
 class ModelPoint:
-    """Expected spectra at one parameter point and what their derivatives are made of, in units of the states' scale.
+    """Expected spectra at one parameter point and what their derivatives are made of, in the motions' units.
 
     Attributes
     ----------
@@ -55,7 +57,7 @@ class ModelPoint:
     S : ndarray, shape (n_groups, n, n)
         Cross-spectral matrices.
     G : ndarray, shape (n_groups, n_nodes, n, 6)
-        Transfer from forces (in units of C, coloured) to measured states, times the root of the node's weight.
+        Transfer from forces (in units of C, coloured) to measured motions, times the root of the node's weight.
     H : ndarray, shape (n_groups, n_nodes, 6, 6)
         Receptance of all six degrees of freedom for the same forces, without that root.
     colour : ndarray, shape (n_groups, 6)
@@ -76,19 +78,17 @@ class SpectralModel:
     """Expected cross-spectra and their derivatives for one machine, set of measured states, and groups of bins.
 
     The parameter vector holds the logarithmic ratios of `STRUCTURAL` to nominal, the logarithms of the low-pass's
-    cutoff (Hz) and order, the logarithms of the noise densities d₀ of the measured states (in units of `scale`² per
+    cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per
     Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
 
     Parameters
     ----------
     machine : Machine
         Nominal rotor.
-    states : tuple of str
-        Measured states.
+    motions : Motions
+        What is measured, in units that make all spectra of the order of one.
     groups : BinGroups
         Frequencies of the spectra.
-    scale : ndarray, shape (n,)
-        Unit of each measured state, so that all spectra are of the order of one.
     force_scale : float
         Unit of forces, N/√Hz, so that the elements of C are of the order of one.
     shapes : int
@@ -98,20 +98,16 @@ class SpectralModel:
     def __init__(
         self,
         machine: Machine,
-        states: tuple[str, ...],
+        motions: Motions,
         groups: BinGroups,
-        scale: FloatArray,
         force_scale: float = 1.0,
         shapes: int = SHAPES,
     ) -> None:
         rotor = machine.rotor
-        self.n = len(states)
-        self.states = states
+        self.n = motions.n
+        self.motions = motions
         self.groups = groups
-        self.scale = scale
         self.shapes = shapes
-        index = np.array([STATE_INDEX[name] for name in states])
-        self._dofs, self._is_rate = index % 6, index >= 6
         # A moment acts through a lever of a third of the shaft, so that levels of forces and moments share one unit.
         lever = rotor.shaft_length_m / 3
         self.force_unit = force_scale * np.array([1.0, 1.0, lever, 1.0, 1.0, lever])
@@ -125,9 +121,14 @@ class SpectralModel:
         polynomials = [np.polynomial.legendre.Legendre.basis(j + 1)(x) for j in range(shapes)]
         self._b = np.reshape(polynomials, (shapes, x.size)).T
         self._w = 2 * np.pi * groups.nodes_hz
+        self.centre = 2 * np.pi * groups.centre_hz
+        self._factor = motions.factor(self._w, self.centre[:, None])
         self.cutoff_at = len(STRUCTURAL)
         self.order_at = self.cutoff_at + 1
-        self.noise_at = slice(self.order_at + 1, self.order_at + 1 + self.n)
+        shares = motions.shares(self.centre)
+        self._motion_of = np.array([shares[state][0] for state in motions.states])
+        self._share = np.stack([shares[state][1] for state in motions.states], axis=1)
+        self.noise_at = slice(self.order_at + 1, self.order_at + 1 + len(motions.states))
         self.colour_at = slice(self.noise_at.stop, self.noise_at.stop + self.n)
         self.shape_at = slice(self.colour_at.stop, self.colour_at.stop + 6 * shapes)
         self.level_at = slice(self.shape_at.stop, self.shape_at.stop + ROWS.size)
@@ -156,9 +157,8 @@ class SpectralModel:
         return np.asarray(np.linalg.inv(dynamic), dtype=np.complex128)
 
     def measured(self, response: ComplexArray, w: FloatArray) -> ComplexArray:
-        """Measured states of the responses of all coordinates, shape (n_frequencies, n, …), in the scale's units."""
-        factor = np.where(self._is_rate, 1j * w[:, None], 1.0) / self.scale
-        return np.asarray(response[:, self._dofs] * factor[:, :, None], dtype=np.complex128)
+        """Measured motions, each frequency by itself, of all coordinates' responses; shape (n_frequencies, n, …)."""
+        return np.asarray(response[:, self.motions.dofs] * self.motions.factor(w, w)[:, :, None], dtype=np.complex128)
 
     def levels(self, theta: FloatArray) -> FloatArray:
         """C = T Tᵀ, shape (6, 6)."""
@@ -179,7 +179,8 @@ class SpectralModel:
         colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
         unit = self.force_unit * colour[:, None, None, :]
         gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
-        G = self.measured(H, w).reshape(*shape, self.n, 6) * unit * np.sqrt(gain)[:, :, None, None]
+        seen = H[:, self.motions.dofs].reshape(*shape, self.n, 6) * self._factor[..., None]
+        G = seen * unit * np.sqrt(gain)[:, :, None, None]
         C = self.levels(theta)
         S = _summed(G @ C, G)
         diagonal = np.arange(self.n)
@@ -191,9 +192,15 @@ class SpectralModel:
         return float(np.exp(theta[self.cutoff_at])), float(np.exp(theta[self.order_at]))
 
     def noise(self, theta: FloatArray) -> FloatArray:
-        """d(f) of every measured state, shape (n_groups, n)."""
-        exponent = theta[self.noise_at] + self._noise_shape[:, None] * theta[self.colour_at]
-        return np.asarray(np.exp(exponent), dtype=np.float64)
+        """d(f) of every measured motion, shape (n_groups, n)."""
+        noise = np.zeros((self._share.shape[0], self.n))
+        np.add.at(noise.T, self._motion_of, self._noise_parts(theta).T)
+        return noise
+
+    def _noise_parts(self, theta: FloatArray) -> FloatArray:
+        """What each state brings into the noise of its motion, shape (n_groups, n_states)."""
+        exponent = theta[self.noise_at] + self._noise_shape[:, None] * theta[self.colour_at][self._motion_of]
+        return np.asarray(self._share * np.exp(exponent), dtype=np.float64)
 
     def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
         """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed; the last 21 are by the elements of C, not of T.
@@ -231,8 +238,8 @@ class SpectralModel:
             out[at] = packed(_summed(response * slope[:, :, None, None], whitened))
         columns = L_inverse.transpose(2, 0, 1)
         densities = packed(columns[:, :, :, None] * columns.conj()[:, :, None, :])
-        out[self.noise_at] = self.noise(theta).T[:, :, None] * densities
-        out[self.colour_at] = out[self.noise_at] * self._noise_shape[:, None]
+        out[self.noise_at] = self._noise_parts(theta).T[:, :, None] * densities[self._motion_of]
+        out[self.colour_at] = (self.noise(theta) * self._noise_shape[:, None]).T[:, :, None] * densities
         for dof in range(6):
             force = whitened[..., dof].transpose(0, 2, 1) @ response[..., dof].conj()
             slope = twice_packed(force) / 2

@@ -52,7 +52,7 @@ def estimate_unbalance(
         The model's spectra at the estimate.
     covariance : ndarray, shape (5, 5)
         Of the logarithmic ratios of the structural parameters.
-    synchronous : ndarray of complex, shape (n,)
+    synchronous : ndarray of complex, shape (n_states,)
         q, SI.
     speed_rad_s, duration_s : float
 
@@ -77,7 +77,7 @@ def estimate_unbalance(
         [response(structural + step * unit) - response(structural - step * unit) for unit in np.eye(len(STRUCTURAL))]
     ) / (2 * step)
     noise = 4 * _around_rotation(machine, model, point, speed_rad_s, duration_s) / duration_s
-    q = synchronous / model.scale
+    q = (model.motions.combine(w) @ synchronous)[0]
     e_ratio = float(np.real(np.vdot(g, np.linalg.solve(noise, q))) / np.real(np.vdot(g, np.linalg.solve(noise, g))))
     # Real representation: the structural uncertainty moves real and imaginary parts together.
     total = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
@@ -108,9 +108,9 @@ def _around_rotation(
     k = np.arange(max(1, round(edge_hz * duration_s))) + 0.5
     weights = np.tile((np.pi * k) ** -2.0, 2)
     nodes_hz = np.abs(np.concatenate([centre_hz - k / duration_s, centre_hz + k / duration_s]))
-    near = BinGroups(((0, 1),), np.ones(1), np.array([centre_hz]), nodes_hz[np.newaxis], weights[np.newaxis])
+    near = BinGroups(((0, 1),), np.ones(1), np.array([centre_hz]), nodes_hz[np.newaxis], weights[np.newaxis], np.eye(1))
     force_scale = float(model.force_unit[0])
-    at_speed = SpectralModel(machine, model.states, near, model.scale, force_scale, model.shapes)
+    at_speed = SpectralModel(machine, model.motions, near, force_scale, model.shapes)
     far = groups.bins * spacing_hz / (2 * np.pi**2 * duration_s * np.maximum(distance_hz, edge_hz) ** 2)
     seen = at_speed.at(point.theta, speed_rad_s).S[0] + np.tensordot(far, point.S, axes=1)
     return np.asarray(seen, dtype=np.complex128)
