@@ -241,7 +241,7 @@ def delay(
         int, typer.Option(min=2, help="Streams per change with independent sources, at the machine's own hop.")
     ] = 60,
     others: Annotated[
-        int, typer.Option(min=2, help="Streams per change with one source, and with independent ones at a hop of 2 s.")
+        int, typer.Option(min=2, help="Streams per change with one source, and with independent ones at half the hop.")
     ] = 20,
     seed: SeedOption = _SEED,
     processes: ProcessesOption = _CORES,

@@ -42,7 +42,8 @@ def time_detection(
 def _run(name: str, trials: int, others: int, seed: int, processes: int) -> DelayResult:
     machine = load_machine(name)
     own = machine.window.hop_s
-    plan = DelayPlan(machine, seed, trials, others, hops_s=(own,) if own <= 2.0 else (own, 2.0))
+    halved = (own / 2,) if (own / machine.window.segment_s).is_integer() else ()  # a hop holds whole half segments
+    plan = DelayPlan(machine, seed, trials, others, hops_s=(own, *halved))
     with labelled_bars() as progress:
         return run_delay_study(plan, processes, progress)
 

@@ -51,9 +51,9 @@ CHANGES: tuple[tuple[str, float], ...] = (("k_by", -0.05), ("c_by", -0.2), ("c_b
 
 GAUSSIAN: tuple[tuple[float, tuple[int, ...]], ...] = (
     (5.0, (2, 4)),
-    (2.0, (2, 4)),
-    (2.0, (2, 5, 12)),
-    (1.0, (4, 8, 16, 32)),
+    (5.0, (2, 4, 7)),
+    (2.5, (2, 4, 7)),
+    (2.5, (2, 4, 8, 14)),
 )
 """Hop lengths and short stretches that are compared on Gaussian hops."""
 
@@ -91,7 +91,7 @@ class DelayPlan:
     trials: int
     other_trials: int
     gaussian_trials: int = 200
-    hops_s: tuple[float, ...] = (5.0, 2.0)
+    hops_s: tuple[float, ...] = (5.0, 2.5)
     after_s: float = 120.0
     changes: tuple[tuple[str, float], ...] = CHANGES
 

@@ -35,9 +35,9 @@ def test_the_bounds_time_falls_with_the_square_of_the_change() -> None:
 
 
 def test_another_hop_keeps_the_window() -> None:
-    machine = with_hop(LAB, 2.0)
-    assert machine.window.hops == 30
-    assert settings_for(machine, 1.0).window_hops == 30
+    machine = with_hop(LAB, 2.5)
+    assert machine.window.hops == 24
+    assert settings_for(machine, 1.0).window_hops == 24
     with pytest.raises(ValueError, match="multiple of half of segment_s"):
         with_hop(LAB, 1.5)
 
@@ -67,7 +67,7 @@ def test_gaussian_hops_at_the_bound_are_found_sooner_with_a_shorter_hop(result: 
         for cell in result.cells
         if cell.source == "bound" and cell.rate == "machine file"
     }
-    assert at_bound[2.0, (2, 4)] < at_bound[5.0, (2, 4)] <= 15.0
+    assert at_bound[2.5, (2, 4, 7)] < at_bound[5.0, (2, 4, 7)] <= 15.0
 
 
 def test_numbers_can_be_read_back_and_drawn(result: DelayResult, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ are held as information: matrix J (the inverse covariance) and vector J x. Indep
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -80,10 +80,6 @@ class Stretch:
         covariance = np.linalg.inv(self.information[np.ix_(known, known)])
         covariance = (covariance + covariance.T) / 2
         return np.asarray(covariance @ self.vector[known], dtype=np.float64), covariance
-
-    def widened(self, factor: float) -> "Stretch":
-        """Return the same with all standard errors multiplied by a factor."""
-        return replace(self, vector=self.vector / factor**2, information=self.information / factor**2)
 
     def blurred(self, standard_error: float) -> "Stretch":
         """Return the same with an error added that further data does not remove.
