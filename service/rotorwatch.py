@@ -1,9 +1,6 @@
 """The command ``rotorwatch``: monitor machines, check settings, look at what monitors say."""
 
-import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from service.config import ServiceSettings
@@ -20,7 +18,6 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
 
 __all__ = ["app"]
 
-_ENDPOINT = "tcp/127.0.0.1:7447"
 _BAD_STATES = ("alert", "danger", "outside-model", "no-data")
 _STYLES = {
     "danger": "bold red",
@@ -39,14 +36,6 @@ app = typer.Typer(
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
 )
 
-_ConnectOption = Annotated[
-    list[str] | None,
-    typer.Option("--connect", metavar="ENDPOINT", help="Zenoh endpoint to connect to, as a client. Repeatable."),
-]
-_ListenOption = Annotated[
-    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Zenoh endpoint to listen on. Repeatable.")
-]
-
 
 @app.command()
 def run(
@@ -62,8 +51,8 @@ def run(
             "networks, if any. Repeatable.",
         ),
     ] = None,
-    listen: _ListenOption = None,
-    connect: _ConnectOption = None,
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
     http_port: Annotated[
         int | None, typer.Option("--http-port", min=0, max=65535, help="Port of the HTTP API; 0 takes a free one.")
     ] = None,
@@ -89,8 +78,8 @@ def run(
     A simulation as fast as this computer can, started with [cyan]rotorsim publish k_by --pace max[/cyan] elsewhere:
     [cyan]rotorwatch run --when-full wait[/cyan]
     """
-    with _exit_codes():
-        _one_blas_thread()
+    with exit_codes():
+        one_blas_thread()
         from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
         from service.logs import configure_logging  # noqa: PLC0415
         from service.runtime import running, stop_request  # noqa: PLC0415  # must see the variables set above
@@ -138,7 +127,7 @@ def watch(
     machine: Annotated[
         str, typer.Option("--machine", metavar="SITE/MACHINE", help="Which machine; * stands for any.")
     ] = "*/*",
-    connect: _ConnectOption = None,
+    connect: ConnectOption = None,
     windows: Annotated[bool, typer.Option("--windows", help="One line per evaluated window as well.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per line: topic and message.")] = False,
 ) -> None:
@@ -157,7 +146,7 @@ def watch(
     For another program:
     [cyan]rotorwatch watch --json | jq .message.data.text[/cyan]
     """
-    with _exit_codes():
+    with exit_codes():
         if machine.count("/") != 1:
             raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
         from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
@@ -165,7 +154,7 @@ def watch(
         from service.transport import follow  # noqa: PLC0415
 
         topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
-        link = LinkSettings(mode="client", connect=tuple(connect) if connect else (_ENDPOINT,))
+        link = LinkSettings(mode="client", connect=tuple(connect) if connect else (ENDPOINT,))
         show = _JsonLines() if as_json else _Lines()
         with stop_request() as stop, follow(link, machine, topics, show) as connected:
             there = True
@@ -188,7 +177,7 @@ def status(
 
     [cyan]rotorwatch status || echo "look at the machines"[/cyan]
     """
-    with _exit_codes():
+    with exit_codes():
         healths = _fetch_healths(url.rstrip("/"))
         table = Table("machine", "state", "window", "raised alarms", "data age", "refused", "gaps", "why")
         for health in healths:
@@ -210,7 +199,7 @@ def status(
 
 
 @app.command()
-def router(listen: _ListenOption = None, connect: _ConnectOption = None) -> None:
+def router(listen: ListenOption = None, connect: ConnectOption = None) -> None:
     """Run a Zenoh router until Ctrl-C, for networks in which monitors and sensors cannot reach each other directly.
 
     Everybody who connects to it must do so as a client: rotorwatch run --connect, rotorsim publish --mode client.
@@ -219,11 +208,11 @@ def router(listen: _ListenOption = None, connect: _ConnectOption = None) -> None
 
     [cyan]rotorwatch router --listen tcp/0.0.0.0:7447[/cyan]
     """
-    with _exit_codes():
+    with exit_codes():
         from service.runtime import stop_request  # noqa: PLC0415  # keeps --help quick
         from service.transport import route  # noqa: PLC0415
 
-        endpoints = tuple(listen) if listen else (_ENDPOINT,)
+        endpoints = tuple(listen) if listen else (ENDPOINT,)
         with stop_request() as stop, route(endpoints, tuple(connect or ())):
             typer.echo(f"router listening on {', '.join(endpoints)}")
             sys.stdout.flush()
@@ -250,8 +239,8 @@ def demo(
 
     [cyan]rotorwatch demo --fault c_by --once[/cyan]
     """
-    with _exit_codes():
-        _one_blas_thread()
+    with exit_codes():
+        one_blas_thread()
         from service.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
 
         code = run_demo(DemoOptions(scenario=fault, seed=seed, pace=pace, once=once, http_port=http_port))
@@ -365,28 +354,6 @@ def _fetch_healths(url: str) -> "list[Health]":
         raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
     except (ValidationError, ValueError, KeyError, TypeError) as error:
         raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor") from error
-
-
-def _one_blas_thread() -> None:
-    """Let numpy compute in one thread: results do not depend on the number of cores, and workers do not compete.
-
-    Works only before numpy is imported.
-    """
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ[variable] = "1"
-
-
-@contextmanager
-def _exit_codes() -> Iterator[None]:
-    """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
-    try:
-        yield
-    except (MachineFileError, BundleError) as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(2) from error
-    except RotorwatchError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(1) from error
 
 
 if __name__ == "__main__":

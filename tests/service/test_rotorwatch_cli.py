@@ -64,7 +64,7 @@ def test_the_service_never_imports_torch() -> None:
 def test_numpy_computes_in_one_thread() -> None:
     code = (
         "import os, sys\nfrom service import rotorwatch\nassert 'numpy' not in sys.modules\n"
-        "rotorwatch._one_blas_thread()\nimport numpy as np\n"
+        "rotorwatch.one_blas_thread()\nimport numpy as np\n"
         "a = np.ones((800, 800))\na @ a\nprint(len(os.listdir('/proc/self/task')))"
     )
     found = subprocess.run(

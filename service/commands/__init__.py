@@ -1,0 +1,1 @@
+"""The commands of ``rotorwatch`` by subject; each module has ``register(app)``."""

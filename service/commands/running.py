@@ -1,0 +1,45 @@
+"""What the commands share: exit codes, one thread for linear algebra, common options."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated
+
+import typer
+
+from models.errors import BundleError, MachineFileError, RotorwatchError
+
+__all__ = ["ENDPOINT", "ConnectOption", "ListenOption", "exit_codes", "one_blas_thread"]
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+"""Where a monitor listens unless it is told otherwise."""
+
+ConnectOption = Annotated[
+    list[str] | None,
+    typer.Option("--connect", metavar="ENDPOINT", help="Zenoh endpoint to connect to, as a client. Repeatable."),
+]
+ListenOption = Annotated[
+    list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Zenoh endpoint to listen on. Repeatable.")
+]
+
+
+def one_blas_thread() -> None:
+    """Let numpy compute in one thread: results do not depend on the number of cores, and workers do not compete.
+
+    Works only before numpy is imported.
+    """
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
+
+
+@contextmanager
+def exit_codes() -> Iterator[None]:
+    """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
+    try:
+        yield
+    except (MachineFileError, BundleError) as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(2) from error
+    except RotorwatchError as error:
+        typer.echo(str(error), err=True)
+        raise typer.Exit(1) from error

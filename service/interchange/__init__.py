@@ -1,0 +1,1 @@
+"""Recordings from and to the files of other programs."""

@@ -1,0 +1,1 @@
+"""Capturing messages into rotating files, keeping and dropping them, finding them again."""

@@ -1,0 +1,1 @@
+"""Recordings fed back: straight into a monitor, or onto the network."""
