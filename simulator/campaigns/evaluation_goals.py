@@ -1,10 +1,14 @@
 """The declared goals, and what was measured of each: computed from the summaries, never typed in."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
+from models.diagnosis.verdict.calibration import window_thresholds
+from models.diagnosis.verdict.stretch import to_scale
+from models.physics.parameters import PARAMETERS
 from simulator.campaigns.draws import Anomaly, Excitation, Layout
 from simulator.campaigns.evaluation import RATES
 from simulator.campaigns.evaluation_cells import Topic
@@ -143,9 +147,12 @@ def _detection(summary: Summary, by: str) -> Iterator[Goal]:
             alone = [cell for cell in cells if len(cell.truth or {}) == 1]
             cells = alone or [cell for cell in cells if cell.topic is Topic.SMALL]
             rate = pooled(one.found[0] for _, one in _read(cells, by, name))
-            yield _at_least(
+            goal = _at_least(
                 summary, f"{by}: {name} {truth:+.0%} detected at 1 % false alarms, {LAYOUT_TEXT[layout]}", rate, least
             )
+            possible = _found_at_bound(summary, layout, name, truth)
+            at_bound = "" if possible is None else f"; at the bound {percent(possible)}"
+            yield replace(goal, measured=goal.measured + at_bound)
     for layout in Layout:
         opinions = [cell.opinions[by] for cell in summary.of(Topic.PAPER, layout=layout) if by in cell.opinions]
         text = f"the paper's conditions, {LAYOUT_TEXT[layout]}"
@@ -154,6 +161,20 @@ def _detection(summary: Summary, by: str) -> Iterator[Goal]:
         if by == "likelihood":
             wrong = pooled(one.wrong[0] for one in opinions)
             yield _at_most(summary, f"{by}: a parameter named that did not change, {text}", wrong, 0.005)
+
+
+def _found_at_bound(summary: Summary, layout: Layout, name: str, truth: float) -> float | None:
+    """Share of windows in which a normal reading with the bound's standard error would cross the same threshold.
+
+    Over the conditions of the healthy windows, which are drawn as those of the changed ones are.
+    """
+    read = [one for _, one in _read(summary.of(Topic.HEALTHY, layout=layout), "likelihood", name)]
+    bounds = np.array([bound for one in read for bound in one.bound_quantiles])
+    if not bounds.size:
+        return None
+    threshold = window_thresholds(RATES[0], len(PARAMETERS)).first
+    z = abs(to_scale(name, truth)) / bounds
+    return float(np.mean(ndtr(z - threshold) + ndtr(-z - threshold)))
 
 
 def _bounds(summary: Summary, by: str) -> Iterator[Goal]:

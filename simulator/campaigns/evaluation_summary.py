@@ -37,6 +37,7 @@ _Z95 = 1.959964
 _RESAMPLINGS = 400
 _RESAMPLING_SEED = 20261
 _SHAFT = "EI"
+_STEPS = (np.arange(40) + 0.5) / 40
 _FEWEST = 4
 """A spread of fewer windows says nothing."""
 
@@ -85,6 +86,8 @@ class ParameterSummary(BaseModel):
         Robust standard deviation of (reading - truth) / standard error: 1 where errors are stated rightly.
     bound : float or None
         Median Cramér-Rao bound of the windows that have one.
+    bound_quantiles : tuple of float
+        Of those bounds, in equal steps: their mean over any function of the bound is its mean over the windows.
     spread_in_bounds : Interval or None
         Robust standard deviation of (reading - truth) / bound.
     covered : Rate
@@ -108,6 +111,7 @@ class ParameterSummary(BaseModel):
     standard_error: float
     spread_in_errors: Interval | None = None
     bound: float | None = None
+    bound_quantiles: tuple[float, ...] = ()
     spread_in_bounds: Interval | None = None
     covered: Rate
     found: tuple[Rate, ...] = ()
@@ -373,6 +377,7 @@ def _parameter(name: str, asked: Sequence[tuple[WindowRecord, Opinion]]) -> Para
         standard_error=float(np.median(error)),
         spread_in_errors=_spread(deviation / error),
         bound=float(np.median(bound)) if bounded else None,
+        bound_quantiles=tuple(np.quantile(bound, _STEPS).tolist()) if bounded else (),
         spread_in_bounds=_spread(deviation[bounded] / bound) if bounded else None,
         covered=Rate.of_counts(int(np.sum(np.abs(deviation) <= _Z95 * error)), len(read)),
         found=_named_rates(name, altered),

@@ -26,7 +26,9 @@ _READING = (
     "parameters together. Intervals in parentheses are at 95 %: Clopper–Pearson for rates, resampled windows for",
     "spreads. A refused window counts as one in which nothing is named. *Within chance* in the table of goals means",
     "that the interval reaches across the goal: more windows could turn the verdict. A row about several parameters",
-    "shows the one farthest off, which chance alone drives outwards when there are many.",
+    "shows the one farthest off, which chance alone drives outwards when there are many. *At the bound* is the share",
+    "of windows in which an unbiased reading as sharp as the Cramér–Rao bound would cross the same threshold: a goal",
+    "above it asks for more than the windows hold.",
 )
 _FAILS = (
     "Simulation is not a machine: the rotor that makes the windows and the rotor that reads them have the same",
