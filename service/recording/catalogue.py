@@ -1,0 +1,219 @@
+"""What recordings a directory holds, and finding one of them by its id.
+
+::
+
+    <directory>/<site>/<machine>/20261121T142530Z.mcap         complete
+    <directory>/<site>/<machine>/20261121T143030Z.mcap.part    being written, or left by a crash
+    <directory>/<site>/<machine>/kept.json                     which files an alarm keeps, and which alarm
+
+Names sort by time. The files' own indexes say everything else, so that files may be copied in and out by hand.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from models.errors import RecordingError
+from models.signals.recording import summarize_recording
+
+__all__ = ["KEPT", "PART", "SUFFIX", "Catalogue", "Recording", "kept_reasons", "name_of", "start_of"]
+
+SUFFIX = ".mcap"
+PART = ".part"
+KEPT = "kept.json"
+_PLACE = r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
+_PLACE_ONLY = re.compile(_PLACE)
+_FILE = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap(\.part)?")
+_ID = re.compile(rf"(?P<site>{_PLACE})/(?P<machine>{_PLACE})/(?P<file>{_FILE.pattern})")
+_STAMP = re.compile(r"(\d{8}T\d{6}Z)")
+_STAMP_FORMAT = "%Y%m%dT%H%M%SZ"
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One recording of a directory.
+
+    Attributes
+    ----------
+    id : str
+        ``<site>/<machine>/<file name>``, as `Catalogue.find` takes it.
+    site, machine : str
+    path : Path
+        The file.
+    start_ns, end_ns : int
+        Earliest and latest log time, nanoseconds since 1970-01-01 UTC; of an incomplete file the start that its name
+        states and the time at which it was last written.
+    messages : int or None
+        Number of messages; None if the file is incomplete or damaged.
+    size_bytes : int
+        Size of the file.
+    complete : bool
+        Whether it was closed in order. A file being written, or left by a crash, is not.
+    kept_because : str
+        Which alarm keeps the file beyond its ordinary time; empty if none.
+    problem : str
+        Why a complete file cannot be read; empty if it can.
+    """
+
+    id: str
+    site: str
+    machine: str
+    path: Path
+    start_ns: int
+    end_ns: int
+    messages: int | None
+    size_bytes: int
+    complete: bool
+    kept_because: str = ""
+    problem: str = ""
+
+
+class Catalogue:
+    """Recordings below a directory.
+
+    What a file's index says is read once and remembered until the file changes. May be asked from several threads.
+
+    Parameters
+    ----------
+    directory : Path
+        As `rotorwatch record --out`; need not exist yet.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self._read: dict[Path, tuple[int, int, Recording]] = {}
+
+    def recordings(self, site: str | None = None, machine: str | None = None) -> tuple[Recording, ...]:
+        """List recordings, sorted by site, machine and file name, which is by time.
+
+        Parameters
+        ----------
+        site, machine : str, optional
+            Only these; without one, all.
+        """
+        found: list[Recording] = []
+        for folder in self._folders(site, machine):
+            kept = kept_reasons(folder)
+            for path in sorted(folder.iterdir()):
+                recording = self._recording(path) if _FILE.fullmatch(path.name) else None
+                if recording is not None:
+                    found.append(replace(recording, kept_because=kept.get(path.name, "")))
+        return tuple(found)
+
+    def find(self, recording_id: str) -> Recording | None:
+        """Find a recording by its id; None if there is none, or if the id does not name a file of this directory.
+
+        Parameters
+        ----------
+        recording_id : str
+            As in `Recording.id`. Only names made of letters, digits, ``_``, ``-`` and ``.`` are looked up, and symbolic
+            links are not followed, so that no id reaches a file outside the directory.
+        """
+        match = _ID.fullmatch(recording_id)
+        if match is None:
+            return None
+        folder = self.directory / match["site"] / match["machine"]
+        recording = self._recording(folder / match["file"])
+        if recording is None:
+            return None
+        return replace(recording, kept_because=kept_reasons(folder).get(match["file"], ""))
+
+    def _folders(self, site: str | None, machine: str | None) -> Iterator[Path]:
+        for upper in _subfolders(self.directory, site):
+            yield from _subfolders(upper, machine)
+
+    def _recording(self, path: Path) -> Recording | None:
+        """Describe a file; None if it is none of this directory's own, or gone."""
+        machine, site = path.parent.name, path.parent.parent.name
+        try:
+            if path.resolve() != self.directory.resolve() / site / machine / path.name or not path.is_file():
+                return None
+            stat = path.stat()
+        except OSError:  # dropped between listing and looking
+            self._read.pop(path, None)
+            return None
+        known = self._read.get(path)
+        if known is not None and known[:2] == (stat.st_mtime_ns, stat.st_size):
+            return known[2]
+        start_ns = start_of(path.name)
+        recording = Recording(
+            id=f"{site}/{machine}/{path.name}",
+            site=site,
+            machine=machine,
+            path=path,
+            start_ns=stat.st_mtime_ns if start_ns is None else start_ns,
+            end_ns=stat.st_mtime_ns,
+            messages=None,
+            size_bytes=stat.st_size,
+            complete=path.suffix == SUFFIX,
+        )
+        if recording.complete:
+            try:
+                summary = summarize_recording(path)
+            except RecordingError as error:
+                recording = replace(recording, problem=str(error))
+            else:
+                count = sum(summary.messages.values())
+                recording = replace(recording, start_ns=summary.start_ns, end_ns=summary.end_ns, messages=count)
+        self._read[path] = (stat.st_mtime_ns, stat.st_size, recording)
+        return recording
+
+
+def name_of(start_ns: int, number: int = 1) -> str:
+    """File name for a recording that starts at a time, UTC to the second.
+
+    Parameters
+    ----------
+    start_ns : int
+        Nanoseconds since 1970-01-01 UTC.
+    number : int
+        2 and more for further files of the same second; the names still sort in the order of writing.
+
+    Examples
+    --------
+    >>> name_of(1_767_225_600_000_000_000), name_of(1_767_225_600_000_000_000, 2)
+    ('20260101T000000Z.mcap', '20260101T000000Z_002.mcap')
+    """
+    stamp = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime(_STAMP_FORMAT)
+    return stamp + (f"_{number:03d}" if number > 1 else "") + SUFFIX
+
+
+def start_of(name: str) -> int | None:
+    """Start that a file name states, nanoseconds since 1970-01-01 UTC, or None if it states none.
+
+    Examples
+    --------
+    >>> start_of("20260101T000000Z_002.mcap.part"), start_of("import.mcap")
+    (1767225600000000000, None)
+    """
+    match = _STAMP.match(name)
+    if match is None:
+        return None
+    try:
+        stamp = datetime.strptime(match[1], _STAMP_FORMAT).replace(tzinfo=UTC)
+    except ValueError:
+        return None
+    return int(stamp.timestamp()) * 1_000_000_000
+
+
+def kept_reasons(folder: Path) -> dict[str, str]:
+    """File names that an alarm keeps, with the reason; empty if the folder's ``kept.json`` is missing or unreadable."""
+    try:
+        kept = json.loads((folder / KEPT).read_text(encoding="utf-8"))["kept"]
+        return {str(name): str(reason) for name, reason in kept.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _subfolders(folder: Path, name: str | None) -> list[Path]:
+    """Folders that may be a site or a machine, sorted; symbolic links are none."""
+    if name is not None and not _PLACE_ONLY.fullmatch(name):
+        return []
+    try:
+        entries = [folder / name] if name is not None else sorted(folder.iterdir())
+        return [e for e in entries if _PLACE_ONLY.fullmatch(e.name) and e.is_dir() and not e.is_symlink()]
+    except OSError:
+        return []
