@@ -106,11 +106,11 @@ def test_reports_are_cut_by_time_and_number(client: httpx.Client) -> None:
     every = get(client, f"{PLACE}/reports", ReportList)
     ends = [report.end_ns for report in every.reports]
     assert ends == sorted(ends, reverse=True)
-    # The first hop ends after its own history (a second) and its own five seconds.
-    assert ends[-1] == START_NS + 6_000_000_000
-    assert len(ends) == 18
+    # The first hop ends after its own history (half a segment) and its own five seconds.
+    assert ends[-1] == START_NS + 7_500_000_000
+    assert len(ends) == 17
     assert every.next_until_ns is None
-    assert [report.state for report in reversed(every.reports)] == ["warming"] * 11 + ["healthy"] * 2 + ["alert"] * 5
+    assert [report.state for report in reversed(every.reports)] == ["warming"] * 11 + ["healthy"] * 2 + ["alert"] * 4
     some = get(client, f"{PLACE}/reports?since_ns={ends[10]}&until_ns={ends[3]}", ReportList)
     assert [report.end_ns for report in some.reports] == ends[4:11]
     first = get(client, f"{PLACE}/reports?limit=10", ReportList)
@@ -133,8 +133,8 @@ def test_alarms_and_their_events(client: httpx.Client) -> None:
     assert event.subject == event.data.parameter == "k_by"
     assert event.id == f"demo/lab/k_by/1/raised/{event.data.time_ns}"
     assert int(event.sequence) == event.data.sequence == 0
-    assert event.data.time_ns == active.raised_ns == START_NS + 71_000_000_000
-    assert event.time == "2026-01-01T00:01:11.000000Z"
+    assert event.data.time_ns == active.raised_ns == START_NS + 72_500_000_000
+    assert event.time == "2026-01-01T00:01:12.500000Z"
     assert event.data.text.startswith("ALERT: bearing stiffness, horizontal (k_by) changed by -3")
     later = get(client, f"{PLACE}/alarms/events?since_ns={event.data.time_ns + 1}", AlarmEventList)
     assert later.events == ()

@@ -171,8 +171,8 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
         send(address, scenario_blocks(77.0, parse_fault("k_bz=-0.3@0")), worker.machine)
         text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by -")
         until(lambda: "org.rotorwatch.alarm.raised" in lines.output(), "alarm event as JSON")
-        until(lambda: "00:01:16  lab  alert" in text.output(), "line of the last window")
-        assert "00:01:01  lab  healthy        k_by " in text.output()
+        until(lambda: "00:01:12  lab  alert" in text.output(), "line of the last window")
+        assert "00:01:02  lab  healthy        k_by " in text.output()
 
         late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
         with late as joined:
