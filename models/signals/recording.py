@@ -9,14 +9,18 @@ MCAP (https://mcap.dev) has a topic, bytes, two times and per-channel metadata f
   endian), the attachment, the payload.
 
 A recording is written to ``NAME.part`` and gets its name when it is closed, so that a name without ``.part`` is always
-a complete file. What a crash left behind is a ``.part`` file, which `recover_recording` turns into a complete one.
+a complete file. What a crash left behind is a ``.part`` file, which `models.signals.salvage` turns into a complete one.
+
+Messages are collected in chunks of 256 KiB, compressed with zstd. A chunk reaches the operating system when it is
+complete, or with `RecordingWriter.flush`; from then on its messages survive the end of the process, and after
+`RecordingWriter.sync` that of the computer.
 """
 
+import os
 import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -25,18 +29,21 @@ import zstandard
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
-from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.stream_reader import CRCValidationError
 from mcap.writer import CompressionType, Writer
 
 from models.errors import RecordingError
 
 __all__ = [
+    "DAMAGE",
     "RecordedMessage",
     "RecordingSummary",
     "RecordingWriter",
     "read_recording",
-    "recover_recording",
+    "reading",
     "summarize_recording",
+    "unpacked",
+    "writing",
 ]
 
 _CHUNK_BYTES = 256 * 1024
@@ -45,7 +52,7 @@ _PLAIN, _PREFIXED = "none", "attachment-1"
 _LIBRARY = "rotorwatch"
 _PROFILE = "rotorwatch-1"
 # What the mcap library lets through when a file is cut off or overwritten.
-_DAMAGE = (
+DAMAGE = (
     McapError,
     CRCValidationError,
     struct.error,
@@ -121,17 +128,39 @@ class RecordingWriter:
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
         self.path = path
+        self._overwrite = overwrite
         self.part = path.with_name(path.name + ".part")
         for existing in (self.path, self.part):
             if existing.exists() and not overwrite:
                 raise RecordingError(f"{existing}: exists already and is not overwritten")
         self._channels: dict[tuple[str, str, str], int] = {}
         self._counts: dict[int, int] = {}
-        with _writing(self.part):
+        self._messages = self._flushed = self._size = 0
+        with writing(self.part):
             self._file = self.part.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             self._writer.start(profile=_PROFILE, library=_LIBRARY)
             self._json_schema = self._writer.register_schema("json", "jsonschema", b'{"type":"object"}')
+
+    @property
+    def messages(self) -> int:
+        """Messages taken."""
+        return self._messages
+
+    @property
+    def flushed(self) -> int:
+        """Messages that are in complete chunks and with the operating system: they survive the end of the process."""
+        return self._flushed
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file, without the chunk in progress."""
+        return self._size
+
+    @property
+    def channels(self) -> int:
+        """Different combinations of key and encoding; a file holds at most 65535."""
+        return len(self._channels)
 
     def write(self, message: RecordedMessage) -> None:
         """Append a message.
@@ -145,26 +174,64 @@ class RecordingWriter:
         data = message.payload
         if message.attachment:
             data = _LENGTH.pack(len(message.attachment)) + message.attachment + message.payload
-        with _writing(self.part):
+        with writing(self.part):
             channel = self._channel(message.key, message.encoding, framing)
             sequence = self._counts[channel]
             self._counts[channel] = sequence + 1
             self._writer.add_message(channel, message.log_time_ns, data, message.publish_time_ns, sequence & 0xFFFFFFFF)
-            self._file.flush()  # a finished chunk reaches the operating system and survives this process
+            self._messages += 1
+            if self._file.tell() != self._size:  # the library writes when a chunk is complete, and only then
+                self._hand_over()
 
-    def close(self) -> None:
-        """Complete the file and give it its name.
+    def flush(self) -> None:
+        """Complete the chunk in progress and hand it to the operating system.
 
         Raises
         ------
         RecordingError
-            If the file cannot be completed or renamed.
+            If the file cannot be written.
+        """
+        with writing(self.part):
+            self._writer.flush()  # type: ignore[no-untyped-call]  # the library's stub
+            self._hand_over()
+
+    def sync(self) -> None:
+        """`flush`, and wait until the file is on the disk.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be written.
+        """
+        self.flush()
+        with writing(self.part):
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Complete the file, wait until it is on the disk, and give it its name.
+
+        Raises
+        ------
+        RecordingError
+            If the file cannot be completed or renamed, or something has taken its name meanwhile.
         """
         if self._file.closed:
             return
         self._complete()
-        with _writing(self.path):
+        if self.path.exists() and not self._overwrite:
+            raise RecordingError(f"{self.path}: exists already and is not overwritten; see {self.part.name}")
+        with writing(self.path):
             self.part.replace(self.path)
+
+    def abandon(self) -> None:
+        """Let go of a file that cannot be written any more: it stays ``NAME.part`` with its complete chunks."""
+        with suppress(OSError):  # closing tries once more to write what could not be written
+            self._file.close()
+
+    def _hand_over(self) -> None:
+        self._file.flush()
+        self._size = self._file.tell()
+        self._flushed = self._messages
 
     def __enter__(self) -> Self:
         return self
@@ -178,9 +245,11 @@ class RecordingWriter:
             self._complete()
 
     def _complete(self) -> None:
-        with _writing(self.part):
+        with writing(self.part):
             try:
                 self._writer.finish()  # type: ignore[no-untyped-call]  # the library's stub
+                self._hand_over()
+                os.fsync(self._file.fileno())
             finally:
                 self._file.close()
 
@@ -218,14 +287,14 @@ def read_recording(
     RecordingError
         If the file is missing, not a recording, incomplete or damaged; raised where the damage is met.
     """
-    with _reading(path), path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         _ = reader.get_summary()
         messages = reader.iter_messages(
             topics=None if keys is None else list(keys), starting_at=from_ns, ending_before=to_ns, log_time_order=False
         )
         for _, channel, message in messages:
-            yield _unpacked(channel, message)
+            yield unpacked(channel, message)
 
 
 def summarize_recording(path: Path) -> RecordingSummary:
@@ -236,7 +305,7 @@ def summarize_recording(path: Path) -> RecordingSummary:
     RecordingError
         If the file is missing, not a recording, incomplete or damaged.
     """
-    with _reading(path), path.open("rb") as file:
+    with reading(path), path.open("rb") as file:
         summary = make_reader(file, validate_crcs=True).get_summary()
         if summary is None or summary.statistics is None:
             raise RecordingError(f"{path}: the recording has no index")
@@ -247,55 +316,14 @@ def summarize_recording(path: Path) -> RecordingSummary:
         return RecordingSummary(summary.statistics.message_start_time, summary.statistics.message_end_time, counts)
 
 
-def recover_recording(damaged: Path, target: Path) -> int:
-    """Copy what can be read of an interrupted recording into a complete one.
-
-    Parameters
-    ----------
-    damaged : Path
-        Usually the ``.part`` file of a program that was killed; it stays.
-    target : Path
-        Must not exist; may be the name that `damaged` was to get.
-
-    Returns
-    -------
-    int
-        Number of messages recovered.
+def unpacked(channel: Channel, message: Message) -> RecordedMessage:
+    """Take a message out of the form in which the file keeps it.
 
     Raises
     ------
-    RecordingError
-        If `damaged` is missing or nothing of it can be read, or `target` exists.
+    ValueError
+        If it is not in that form.
     """
-    messages = _salvaged(damaged)
-    first = next(messages, None)
-    if first is None:
-        raise RecordingError(f"{damaged}: nothing to recover: not a recording, or no part of it was completed")
-    if target.exists():
-        raise RecordingError(f"{target}: exists already and is not overwritten")
-    # Not under target's own .part name, which is what the damaged file usually has.
-    with RecordingWriter(target.with_name(target.name + ".recovered"), overwrite=True) as writer:
-        count = 0
-        for message in chain([first], messages):
-            writer.write(message)
-            count += 1
-    with _writing(target):
-        writer.path.replace(target)
-    return count
-
-
-def _salvaged(damaged: Path) -> Iterator[RecordedMessage]:
-    """Messages in the order in which they were written, up to the damage."""
-    channels: dict[int, Channel] = {}
-    with _reading(damaged), damaged.open("rb") as file, suppress(*_DAMAGE):
-        for record in StreamReader(file, validate_crcs=True).records:
-            if isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                yield _unpacked(channels[record.channel_id], record)
-
-
-def _unpacked(channel: Channel, message: Message) -> RecordedMessage:
     framing = channel.metadata.get("framing", _PLAIN)
     encoding = channel.metadata.get("encoding", "")
     attachment, payload = b"", message.data
@@ -313,7 +341,8 @@ def _unpacked(channel: Channel, message: Message) -> RecordedMessage:
 
 
 @contextmanager
-def _writing(path: Path) -> Iterator[None]:
+def writing(path: Path) -> Iterator[None]:
+    """Turn trouble in writing a file into a `RecordingError` that names it."""
     try:
         yield
     except OSError as error:
@@ -321,12 +350,13 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
+def reading(path: Path) -> Iterator[None]:
+    """Turn trouble in reading a file, damage included, into a `RecordingError` that names it."""
     try:
         yield
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror or error})") from error
     except EndOfFile as error:
         raise RecordingError(f"{path}: the recording is incomplete; recover it from what is there") from error
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise RecordingError(f"{path}: not a complete recording: {error}") from error

@@ -14,9 +14,9 @@ from models.signals.recording import (
     RecordedMessage,
     RecordingWriter,
     read_recording,
-    recover_recording,
     summarize_recording,
 )
+from models.signals.salvage import salvage_recording
 
 messages = st.builds(
     RecordedMessage,
@@ -145,7 +145,7 @@ def test_another_kind_of_file_is_named(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match=r"photo\.mcap: not a complete recording"):
             read(path)
     with pytest.raises(RecordingError, match=r"photo\.mcap: nothing to recover"):
-        recover_recording(path, tmp_path / "new.mcap")
+        salvage_recording(path, tmp_path / "new.mcap")
     assert list(tmp_path.iterdir()) == [path]
 
 
@@ -160,9 +160,9 @@ def test_a_cut_off_recording_is_refused_and_can_be_recovered(tmp_path: Path, par
         list(read_recording(cut))
     if part < 0.01:  # not one chunk is left
         with pytest.raises(RecordingError, match=r"cut\.mcap: nothing to recover"):
-            recover_recording(cut, new)
+            salvage_recording(cut, new)
         return
-    count = recover_recording(cut, new)
+    count = salvage_recording(cut, new).count
     # Chunks are 256 KiB, so at most that many messages are lost.
     assert part * len(content) - 256 * 1024 / 7200 - 1 <= count <= len(content)
     assert list(read_recording(new)) == content[:count]
@@ -175,13 +175,13 @@ def test_what_a_crash_left_is_kept_and_recovered_to_its_name(tmp_path: Path) -> 
     part.write_bytes(part.read_bytes()[:-1000])
     with pytest.raises(RecordingError, match=r"run\.mcap\.part: exists already"):
         RecordingWriter(path)
-    assert recover_recording(part, path) == 400
+    assert salvage_recording(part, path).count == 400
     assert list(read_recording(path)) == _some(400)
     assert sorted(tmp_path.iterdir()) == [path, part]
     with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
-        recover_recording(part, path)
+        salvage_recording(part, path)
     with pytest.raises(RecordingError, match=r"none\.part: cannot be read"):
-        recover_recording(tmp_path / "none.part", tmp_path / "none")
+        salvage_recording(tmp_path / "none.part", tmp_path / "none")
 
 
 def test_a_flipped_byte_is_noticed(tmp_path: Path) -> None:
@@ -205,6 +205,6 @@ def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
         while part.stat().st_size == begin:
             writer.write(content[count])
             count += 1
-        assert recover_recording(part, new) == count
+        assert salvage_recording(part, new).count == count
         assert 30 < count < 50  # 256 KiB
     assert list(read_recording(new)) == content[:count]

@@ -1,0 +1,161 @@
+"""Recovery: what can still be read of a recording whose writer was killed, or that was damaged later."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, McapRecord, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from models.errors import RecordingError
+from models.signals.recording import DAMAGE, RecordedMessage, RecordingWriter, reading, unpacked, writing
+
+__all__ = ["Salvage", "salvage_recording"]
+
+
+@dataclass(slots=True)
+class Salvage:
+    """What came out of a damaged recording, and what did not.
+
+    Attributes
+    ----------
+    messages : dict of str to int
+        Number of messages recovered, by key.
+    start_ns, end_ns : int
+        Earliest and latest log time recovered; both 0 if nothing was.
+    size_bytes : int
+        Size of the damaged file.
+    lost_bytes : int
+        Bytes of it that could not be read; what was still in the writer's memory is not among them.
+    damaged_chunks : int
+        Chunks before the end that could not be read and were passed over.
+    unnamed_messages : int
+        Messages that were lost because the chunk that names their key is damaged.
+    complete : bool
+        Whether the file had been closed in order and nothing of it was lost.
+    written_ns : int
+        When the damaged file was last written.
+    """
+
+    messages: dict[str, int] = field(default_factory=dict)
+    start_ns: int = 0
+    end_ns: int = 0
+    size_bytes: int = 0
+    lost_bytes: int = 0
+    damaged_chunks: int = 0
+    unnamed_messages: int = 0
+    complete: bool = False
+    written_ns: int = 0
+
+    @property
+    def count(self) -> int:
+        """Number of messages recovered."""
+        return sum(self.messages.values())
+
+    @property
+    def unaccounted_s(self) -> float:
+        """Seconds from the latest message recovered to the time at which the file was last written."""
+        return max(0.0, (self.written_ns - self.end_ns) * 1e-9) if self.messages else 0.0
+
+
+def salvage_recording(damaged: Path, target: Path) -> Salvage:
+    """Copy what can be read of an interrupted or damaged recording into a complete one.
+
+    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost.
+
+    Parameters
+    ----------
+    damaged : Path
+        Usually the ``.part`` file of a program that was killed; it stays as it is.
+    target : Path
+        Must not exist; may be the name that `damaged` was to get.
+
+    Returns
+    -------
+    Salvage
+        What was recovered and what was not.
+
+    Raises
+    ------
+    RecordingError
+        If `damaged` is missing or nothing of it can be read, or `target` exists or cannot be written.
+    """
+    with reading(damaged):
+        stat = damaged.stat()
+    salvage = Salvage(size_bytes=stat.st_size, lost_bytes=stat.st_size, written_ns=stat.st_mtime_ns)
+    messages = _salvaged(damaged, salvage)
+    first = next(messages, None)
+    if first is None:
+        raise RecordingError(f"{damaged}: nothing to recover: not a recording, or no part of it was completed")
+    if target.exists():
+        raise RecordingError(f"{target}: exists already and is not overwritten")
+    # Not under target's own .part name, which is what the damaged file usually has.
+    writer = RecordingWriter(target.with_name(target.name + ".recovered"), overwrite=True)
+    try:
+        while first is not None:
+            writer.write(first)
+            first = next(messages, None)
+        writer.close()
+        with writing(target):
+            writer.path.replace(target)
+    except BaseException:
+        writer.abandon()
+        writer.part.unlink(missing_ok=True)
+        raise
+    return salvage
+
+
+def _salvaged(damaged: Path, salvage: Salvage) -> Iterator[RecordedMessage]:
+    """Messages in the order in which they were written; what is found is entered into `salvage` as it goes."""
+    with reading(damaged), damaged.open("rb") as file, suppress(*DAMAGE):
+        channels = _listed_channels(file)
+        begin = file.seek(0)
+        for record in StreamReader(file, emit_chunks=True).records:
+            end = file.tell()
+            content = _content(record)
+            if content is None:
+                salvage.damaged_chunks += 1
+            else:
+                salvage.lost_bytes -= end - begin
+            begin = end
+            for inner in content or ():
+                if isinstance(inner, Channel):
+                    channels[inner.id] = inner
+                elif isinstance(inner, Message):
+                    if inner.channel_id not in channels:
+                        salvage.unnamed_messages += 1
+                        continue
+                    message = unpacked(channels[inner.channel_id], inner)
+                    _enter(message, salvage)
+                    yield message
+        salvage.lost_bytes -= file.tell() - begin
+        salvage.complete = not salvage.damaged_chunks
+
+
+def _listed_channels(file: BinaryIO) -> dict[int, Channel]:
+    """Channels as the index lists them; none in a file that is cut off, whose chunks introduce them one by one."""
+    with suppress(*DAMAGE, StopIteration):
+        summary = make_reader(file).get_summary()
+        if summary is not None:
+            return dict(summary.channels)
+    return {}
+
+
+def _content(record: McapRecord) -> list[McapRecord] | None:
+    """Records of a chunk, or the record itself; None if the chunk is damaged."""
+    if not isinstance(record, Chunk):
+        return [record]
+    try:
+        return breakup_chunk(record, validate_crc=True)
+    except DAMAGE:
+        return None
+
+
+def _enter(message: RecordedMessage, salvage: Salvage) -> None:
+    time_ns = message.log_time_ns
+    salvage.start_ns = min(salvage.start_ns, time_ns) if salvage.messages else time_ns
+    salvage.end_ns = max(salvage.end_ns, time_ns)
+    salvage.messages[message.key] = salvage.messages.get(message.key, 0) + 1
