@@ -18,13 +18,12 @@ from models.physics.parameters import PARAMETERS
 from simulator.campaigns.draws import Anomaly, Excitation
 from simulator.campaigns.evaluation import RATES, WindowRecord, evaluate_cells, read_records
 from simulator.campaigns.evaluation_cells import EvaluationCell, Topic, cells_for
-from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, anomaly_text, excitation_text, goals, percent, rate_text
+from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, anomaly_text, excitation_text, goals, percent
 from simulator.campaigns.evaluation_summary import Campaign, Summary, summarise
 from simulator.campaigns.progress import bars
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.results_page import page as results_page
 from simulator.campaigns.results_plots import draw_results
-from simulator.campaigns.results_tables import paragraph, table
 from simulator.campaigns.written import read_numbers, writing
 
 __all__ = ["evaluate", "read_summaries", "write_page"]
@@ -130,7 +129,9 @@ def write_page(out: Path, page: Path) -> list[Path]:
         drawn = [path for summary in summaries for path in draw_results(summary, figures)]
         sections = [path.read_text(encoding="utf-8") for path in sorted(out.glob("*.md"))]
         if (out / _PEERS).exists():
-            section, figure = _peers_section(out / _PEERS, figures)
+            from simulator.campaigns.results_peers import peers_section  # noqa: PLC0415  # the peers are an extra of their own
+
+            section, figure = peers_section(out / _PEERS, figures)
             sections.insert(0, section)
             drawn.append(figure)
         page.write_text(results_page(summaries, sections), encoding="utf-8")
@@ -260,34 +261,3 @@ def _overview(summary: Summary) -> Table:
 
 def _short(rate: Rate) -> str:
     return f"{100 * rate.rate:.3g} ({100 * rate.low:.3g}–{100 * rate.high:.3g}) %"
-
-
-def _peers_section(path: Path, figures: Path) -> tuple[str, Path]:
-    from simulator.campaigns.peers_campaign import SETTINGS, Comparison  # noqa: PLC0415  # the peers are an extra of their own
-    from simulator.campaigns.peers_command import draw_comparison  # noqa: PLC0415
-
-    comparison = read_numbers(Comparison, path)
-    figure = draw_comparison(comparison, figures / "results-peers.png")
-    methods = tuple(comparison.cells[0].methods)
-    lines = [
-        f"## Beside other methods ({comparison.machine})",
-        "",
-        *paragraph(
-            f"{comparison.windows} windows per change and setting, {comparison.healthy_windows} healthy windows to",
-            f"learn from and as many to set the limits, {100 * comparison.false_alarm_rate:g} % false alarms declared",
-            f"for every method, seed {comparison.seed}. *Something*: said to have changed; *exactly*: the right",
-            "parameters (for the printed networks: equations) are named, and no others.",
-        ),
-        "",
-        f"![Detected and named exactly](figures/{figure.name})",
-        "",
-    ]
-    for setting in SETTINGS:
-        rows = []
-        for cell in (cell for cell in comparison.cells if cell.setting == setting):
-            change = ", ".join(f"{name} {size:+.0%}" for name, size in cell.faults.items()) or "healthy"
-            rates = [cell.methods[method] for method in methods]
-            rows.append((change, "something", *(rate_text(one.detected) for one in rates)))
-            rows.append((change, "exactly", *(rate_text(one.exact) for one in rates)))
-        lines += [f"### In the setting “{setting}”", "", *table(("true change", "named", *methods), rows)]
-    return "\n".join(lines), figure
