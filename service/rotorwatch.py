@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
+from service.commands import interchange as interchange_commands
 from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
@@ -35,6 +36,8 @@ app = typer.Typer(
     help="Condition monitoring of rotating machines: which parameter changed, by how much, how sure.",
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
 )
+
+interchange_commands.register(app)
 
 
 @app.command()

@@ -1,0 +1,218 @@
+"""Pulses of a keyphasor or tachometer to shaft angle.
+
+Between two pulses the shaft is taken to turn uniformly. A pulse that is missing, or one too many, shows against the
+pulses around it; what cannot be told apart from a stop leaves the angle unknown there, which is said and not guessed.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import median_filter
+
+from models.signals.block import FloatArray
+
+__all__ = ["EdgeDetector", "PulseTrain", "pulse_train", "shaft_angle"]
+
+_NEIGHBOURS = 9
+_MOST_MISSING = 3
+_TOO_SHORT = 0.5
+_WHOLE = 0.25
+
+
+class EdgeDetector:
+    """Finds the pulses in a sampled tachometer signal, piece by piece.
+
+    Parameters
+    ----------
+    threshold : float
+        Level at which a pulse begins, in the signal's unit.
+    hysteresis : float
+        How far the signal must fall below the threshold (rise above it for falling edges) before the next pulse
+        counts; 0 counts every crossing.
+    rising : bool
+        Whether pulses begin with a rising edge.
+    """
+
+    def __init__(self, threshold: float, hysteresis: float, *, rising: bool) -> None:
+        self._sign = 1.0 if rising else -1.0
+        self._threshold = self._sign * threshold
+        self._rearm = self._threshold - hysteresis
+        self._last: tuple[float, float] | None = None
+        self._armed = False
+
+    def interrupt(self) -> None:
+        """Tell that the next piece does not continue the last one: no pulse lies between them."""
+        self._last, self._armed = None, False
+
+    def feed(self, time: FloatArray, signal: FloatArray) -> FloatArray:
+        """Times of the pulses in the next piece, interpolated between samples.
+
+        Parameters
+        ----------
+        time, signal : ndarray, shape (n,)
+            Ascending times, and the signal at them.
+
+        Returns
+        -------
+        ndarray, shape (n_pulses,)
+            In the unit of `time`.
+        """
+        if time.size == 0:
+            return np.empty(0)
+        value = self._sign * signal
+        if self._last is not None:
+            time = np.concatenate([[self._last[0]], time])
+            value = np.concatenate([[self._last[1]], value])
+        low = value < self._rearm if self._rearm < self._threshold else value < self._threshold
+        lows = np.cumsum(low) + int(self._armed)
+        crossings = np.flatnonzero((value[:-1] < self._threshold) & (value[1:] >= self._threshold))
+        before = np.concatenate([[0], lows[crossings[:-1]]]) if crossings.size else lows[:0]
+        counted = crossings[lows[crossings] > before]
+        since = crossings[-1] + 1 if crossings.size else 0
+        self._armed = bool(low[since:].any()) or (not crossings.size and self._armed)
+        self._last = (float(time[-1]), float(value[-1]))
+        step = value[counted + 1] - value[counted]
+        return np.asarray(
+            time[counted] + (self._threshold - value[counted]) / step * (time[counted + 1] - time[counted])
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PulseTrain:
+    """Pulses after repair.
+
+    Attributes
+    ----------
+    times : ndarray, shape (n,)
+        Ascending.
+    counts : ndarray of int, shape (n,)
+        Number of each pulse, with the missing ones counted.
+    known : ndarray of bool, shape (n - 1,)
+        Whether the shaft turned without doubt from this pulse to the next.
+    pulses_per_turn : int
+    missing, extra : int
+        Pulses that were missing and are bridged; pulses too many, which are left out.
+    """
+
+    times: FloatArray
+    counts: npt.NDArray[np.int64]
+    known: npt.NDArray[np.bool_]
+    pulses_per_turn: int
+    missing: int
+    extra: int
+
+    @property
+    def interruptions(self) -> int:
+        """Intervals in which the angle is unknown."""
+        return int(np.count_nonzero(~self.known))
+
+
+def pulse_train(times: FloatArray, pulses_per_turn: int = 1) -> PulseTrain:
+    """Judge each interval between pulses by the median of the nine around it.
+
+    An interval below half of it has a pulse too many. One within a quarter of 2, 3 or 4 times the median has that many
+    pulses missing. What is longer, or in between, is an interruption.
+
+    Parameters
+    ----------
+    times : ndarray, shape (n,)
+        Times of the pulses, ascending, at least two.
+    pulses_per_turn : int
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two pulses or their times do not ascend; the message names the first that does not.
+    """
+    if times.size < 2:
+        raise ValueError(f"{times.size} pulses, expected at least two to tell the speed")
+    if not np.isfinite(times).all():
+        raise ValueError(f"pulse {int(np.flatnonzero(~np.isfinite(times))[0]) + 1} has no finite time")
+    backwards = np.flatnonzero(np.diff(times) <= 0)
+    if backwards.size:
+        first = int(backwards[0])
+        raise ValueError(f"pulse {first + 2} at {times[first + 1]:.9g} is not later than the one before it")
+    kept = _without_extra(times)
+    intervals = np.diff(kept)
+    ratio = intervals / _usual(intervals)
+    turns = np.maximum(np.rint(ratio), 1).astype(np.int64)
+    known = (ratio < 1.5) | ((np.abs(ratio - turns) <= _WHOLE) & (turns <= _MOST_MISSING + 1))
+    steps = np.where(known, turns, pulses_per_turn)
+    counts = np.concatenate([[0], np.cumsum(steps)])
+    # After an interruption the next pulse is number 0 of a turn again.
+    for gap in np.flatnonzero(~known):
+        counts[gap + 1 :] += -counts[gap + 1] % pulses_per_turn
+    missing = int(np.sum(turns[known] - 1))
+    return PulseTrain(kept, counts, known, pulses_per_turn, missing, times.size - kept.size)
+
+
+def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> FloatArray:
+    """Shaft angle in [0, 2π), 0 at the (first) pulse of each turn.
+
+    Before the first pulse, after the last and around an interruption the angle is carried on at the neighbouring
+    interval's speed for one interval at most.
+
+    Parameters
+    ----------
+    train : PulseTrain
+    at : ndarray, shape (n,)
+        In the unit of the train's times.
+    reverse : bool
+        Whether the shaft turns from z to y, so that the angle falls.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        rad; nan where the angle is unknown.
+    """
+    times, counts = train.times, train.counts
+    speed = np.where(train.known, np.diff(counts) / np.diff(times), np.nan)  # pulses per unit of time
+    before = np.searchsorted(times, at, side="right") - 1
+    inside = (before >= 0) & (before < speed.size)
+    number = np.full(at.shape, np.nan)
+    number[inside] = counts[before[inside]] + speed[before[inside]] * (at[inside] - times[before[inside]])
+    lost = np.isnan(number)
+    # Carried on from the pulse before, then back from the pulse after.
+    for pulse, interval in ((before, before - 1), (before + 1, before + 1)):
+        usable = lost & (pulse >= 0) & (pulse < times.size) & (interval >= 0) & (interval < speed.size)
+        onwards = speed[interval[usable]] * (at[usable] - times[pulse[usable]])
+        carried = np.where(np.abs(onwards) <= 1 + 1e-9, counts[pulse[usable]] + onwards, np.nan)
+        number[usable] = np.where(np.isnan(number[usable]), carried, number[usable])
+    turns = number / train.pulses_per_turn
+    angle = 2 * np.pi * np.mod(-turns if reverse else turns, 1.0)
+    return np.asarray(np.where(angle >= 2 * np.pi, 0.0, angle))
+
+
+def _usual(intervals: FloatArray) -> FloatArray:
+    """Median of the intervals around each one."""
+    return np.asarray(median_filter(intervals, size=min(_NEIGHBOURS, intervals.size), mode="nearest"))
+
+
+def _without_extra(times: FloatArray) -> FloatArray:
+    """Leave out pulses that come less than half an interval after another."""
+    kept = times
+    while kept.size > 2:
+        intervals = np.diff(kept)
+        usual = _usual(intervals)
+        doubtful: list[int] = []
+        for interval in np.flatnonzero(intervals < _TOO_SHORT * usual):
+            if not doubtful or interval - doubtful[-1] > 3:  # neighbours wait for the next round
+                doubtful.append(int(interval))
+        if not doubtful:
+            break
+        kept = np.delete(kept, [_extra_of(kept, interval, float(usual[interval])) for interval in doubtful])
+    return kept
+
+
+def _extra_of(times: FloatArray, interval: int, usual: float) -> int:
+    """Of the two pulses around a short interval, the one without which the neighbours are the more even."""
+    candidates = [pulse for pulse in (interval, interval + 1) if 0 < pulse < times.size - 1] or [interval + 1]
+    first = max(interval - 2, 0)
+    near = times[first : interval + 4]
+
+    def unevenness(pulse: int) -> float:
+        ratio = np.diff(np.delete(near, pulse - first)) / usual
+        return float(np.sum(np.abs(ratio - np.maximum(np.rint(ratio), 1))))
+
+    return min(candidates, key=unevenness)

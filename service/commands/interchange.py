@@ -1,0 +1,108 @@
+"""Commands for recordings from and to the files of other programs: ``import`` and ``export``."""
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from service.commands.running import exit_codes, one_blas_thread
+
+__all__ = ["register"]
+
+_LISTED = 5
+_TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command("import")(import_)
+    app.command("export")(export)
+
+
+def import_(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="SOURCE", help="CSV, Parquet, NumPy .npz, MATLAB .mat, WAV, UFF 58, TDMS or MF4 file."),
+    ],
+    mapping: Annotated[
+        Path, typer.Option("--mapping", metavar="FILE", help="Which column is which channel, in which unit (TOML).")
+    ],
+    machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file, or name of a shipped one.")],
+    out: Annotated[Path, typer.Option("--out", metavar="RECORDING", help="Recording to write (.mcap).")],
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a recording that is there already.")] = False,
+) -> None:
+    """Turn measurements from another program into a recording.
+
+    Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch import run7.csv --mapping run7.toml --machine pump-7.toml --out run7.mcap[/cyan]
+    """
+    with exit_codes():
+        one_blas_thread()
+        from models.machine import load_machine  # noqa: PLC0415  # keeps --help quick
+        from service.interchange.importing import import_file  # noqa: PLC0415
+        from service.interchange.mapping import load_mapping  # noqa: PLC0415
+        from service.interchange.summary import summary_lines  # noqa: PLC0415
+
+        described = load_machine(machine)
+        done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)
+        for line in summary_lines(done):
+            typer.echo(line)
+
+
+def export(
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (.mcap); several are joined in time.")
+    ],
+    to: Annotated[Literal["parquet", "csv", "mat"], typer.Option("--to", help="Format.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File to write.")],
+    what: Annotated[
+        Literal["stream", "reports", "alarms"], typer.Option("--what", help="Samples, reports or alarm events.")
+    ] = "stream",
+    machine: Annotated[
+        str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Which one, if there are several.")
+    ] = None,
+    from_: Annotated[
+        datetime | None, typer.Option("--from", formats=_TIMES, metavar="TIME", help="Data from this time (UTC) on.")
+    ] = None,
+    to_time: Annotated[
+        datetime | None, typer.Option("--to-time", formats=_TIMES, metavar="TIME", help="Data up to this time (UTC).")
+    ] = None,
+    si: Annotated[bool, typer.Option("--si", help="Samples in SI units instead of those of the channels.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a file that is there already.")] = False,
+) -> None:
+    """Write samples, reports or alarms of recordings for MATLAB, pandas, Excel and others.
+
+    Units go with the columns, times are nanoseconds since 1970 (UTC), gaps stay gaps.
+
+    [bold]Examples[/bold]
+
+    [cyan]rotorwatch export run7.mcap --to parquet --out run7.parquet[/cyan]
+
+    One minute as text, in m and m/s:
+    [cyan]rotorwatch export run7.mcap --to csv --out minute.csv --si --from 2026-01-31T12:00:00 --to-time
+    2026-01-31T12:01:00[/cyan]
+    """
+    with exit_codes():
+        one_blas_thread()
+        from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
+        from service.interchange.exporting import export as write  # noqa: PLC0415
+
+        selection = Selection(tuple(recordings), machine, _nanoseconds(from_), _nanoseconds(to_time), si)
+        table = write(selection, what, to, out, overwrite=overwrite)
+        typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
+        for text in table.skipped[:_LISTED]:
+            typer.echo(f"left out: {text}", err=True)
+        if len(table.skipped) > _LISTED:
+            typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
+
+
+def _nanoseconds(time: datetime | None) -> int | None:
+    """A time without a zone is UTC."""
+    if time is None:
+        return None
+    since = (time if time.tzinfo else time.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since // timedelta(microseconds=1)) * 1000

@@ -1,0 +1,105 @@
+"""The shaft angle of an imported file: from a keyphasor's pulses, or from a column of angles."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.machine import Machine
+from models.signals.block import FloatArray
+from models.signals.channels import Quantity
+from models.signals.keyphasor import EdgeDetector, PulseTrain, pulse_train, shaft_angle
+from models.signals.units import time_unit_ns
+from service.interchange.clock import Clock
+from service.interchange.mapping import Keyphasor, Mapping
+from service.interchange.samples import Piece, Read, Signal, pieces
+from service.interchange.source import Reference, Source, SourceError
+
+__all__ = ["AngleColumn", "read_pulses"]
+
+_TURN = 2 * np.pi
+
+
+def read_pulses(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> PulseTrain:
+    """Read all pulses of a file; a sampled signal is gone through for that alone.
+
+    Returns
+    -------
+    PulseTrain
+        Nanoseconds since the first row of the file.
+
+    Raises
+    ------
+    SourceError
+        If there are too few, or their times do not ascend.
+    """
+    if keyphasor.pulse_times is not None:
+        what = keyphasor.pulse_times
+        entries = source.values(what)
+        if entries.dtype.kind not in "fiu":
+            raise SourceError(f"{source.path}: {what} holds {entries.dtype}, expected times of pulses")
+        times = clock.pulse_times(entries, time_unit_ns(keyphasor.unit))
+    else:
+        what = f"column {keyphasor.column}"
+        times = _edges(source, keyphasor, clock, mapping)
+    try:
+        return pulse_train(times, keyphasor.pulses_per_revolution)
+    except ValueError as error:
+        raise SourceError(f"{source.path}: keyphasor {what}: {error}") from error
+
+
+def _edges(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> FloatArray:
+    signal = Signal("keyphasor", Reference(keyphasor.column or "", keyphasor.index), 1.0, 0.0, 0, False)
+    detector = EdgeDetector(keyphasor.threshold or 0.0, keyphasor.hysteresis, rising=keyphasor.edge == "rising")
+    found = [np.empty(0)]
+    for piece in pieces(source, [signal], clock, mapping, Read()):
+        if piece.begins:
+            detector.interrupt()
+        found.append(detector.feed(piece.time_ns, piece.samples[:, 0]))
+    return np.concatenate(found)
+
+
+@dataclass(slots=True)
+class AngleColumn:
+    """Puts the shaft angle where the machine file has it, and brings angles into [0, 2π).
+
+    Rows whose angle is not known are left out; they make a gap.
+
+    Attributes
+    ----------
+    machine : Machine
+    pulses : PulseTrain or None
+    reverse : bool
+        Whether the shaft turns from z to y.
+    unknown : int
+        Rows left out.
+    """
+
+    machine: Machine
+    pulses: PulseTrain | None
+    reverse: bool
+    unknown: int = 0
+
+    def feed(self, parts: Iterator[Piece]) -> Iterator[Piece]:
+        """Complete a file's pieces."""
+        column = next((n for n, c in enumerate(self.machine.sensors) if c.quantity is Quantity.SHAFT_ANGLE), None)
+        pending = False
+        for piece in parts:
+            pending = pending or piece.begins
+            if column is None:
+                yield piece
+                continue
+            if self.pulses is None:
+                samples = piece.samples.copy()
+                samples[:, column] = np.mod(samples[:, column], _TURN)
+                yield Piece(piece.begins, piece.time_ns, samples)
+                continue
+            angle = shaft_angle(self.pulses, piece.time_ns, reverse=self.reverse)
+            samples = np.insert(piece.samples, column, angle, axis=1)
+            known = np.isfinite(angle)
+            self.unknown += int(np.count_nonzero(~known))
+            edges = np.flatnonzero(np.diff(known)) + 1
+            for rows in np.split(np.arange(angle.size), edges):
+                if known[rows[0]]:
+                    yield Piece(pending, piece.time_ns[rows], samples[rows])
+                pending = not known[rows[0]]

@@ -1,0 +1,234 @@
+"""Sources that hold named arrays: NumPy .npz, MATLAB .mat, WAV.
+
+What the three have in common: an array is a set of columns, samples run along its longer side, and rows are cut from
+memory (or from the file, where it is mapped).
+"""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+
+__all__ = ["MatlabSource", "NumpySource", "WavSource", "columns_of", "equally_long"]
+
+
+def columns_of(path: Path, array: Any, reference: Reference) -> Any:  # an ndarray, or a data set that slices like one
+    """One column of an array, still in the file if the array is: a function of a slice.
+
+    Raises
+    ------
+    SourceError
+        If the array has another shape than `reference` says.
+    """
+    shape = tuple(int(size) for size in array.shape)
+    if len(shape) == 1 and reference.index in (None, 0):
+        return lambda rows: array[rows]
+    if len(shape) != 2:
+        raise SourceError(f"{path}: {reference.column} has shape {shape}, expected one column or a table of columns")
+    along_first = shape[0] >= shape[1]
+    width = min(shape)
+    index = reference.index if reference.index is not None else 0 if width == 1 else -1
+    if not 0 <= index < width:
+        raise SourceError(
+            f"{path}: {reference.column} has {width} columns of {max(shape)} samples, "
+            f"expected index = 0 to {width - 1}" + ("" if reference.index is None else f" (found {reference.index})")
+        )
+    return (lambda rows: array[rows, index]) if along_first else (lambda rows: array[index, rows])
+
+
+def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int]) -> int:
+    """Length of columns that belong together.
+
+    Raises
+    ------
+    SourceError
+        Naming two whose lengths differ.
+    """
+    for reference, length in zip(columns, lengths, strict=True):
+        if length != lengths[0]:
+            raise SourceError(
+                f"{path}: column {reference} has {length} rows, column {columns[0]} has {lengths[0]}; expected the same"
+            )
+    return lengths[0] if lengths else 0
+
+
+class _Arrays:
+    """Columns of named arrays."""
+
+    path: Path
+
+    def __init__(self, path: Path, arrays: Mapping[str, Any]) -> None:
+        self.path = path
+        self._arrays = arrays
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the arrays."""
+        return tuple(self._arrays)
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # others need them
+        """Nothing: bare arrays know no time."""
+        return Timing()
+
+    def unit(self, column: Reference) -> str:  # noqa: ARG002  # others need it
+        """Nothing: bare arrays know no units."""
+        return ""
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, `CHUNK_ROWS` at a time."""
+        arrays = [self._arrays[named(self.path, reference.column, self.names())] for reference in columns]
+        reads = [columns_of(self.path, *pair) for pair in zip(arrays, columns, strict=True)]
+        count = equally_long(self.path, columns, [max(array.shape) for array in arrays])
+        for first in range(0, count, CHUNK_ROWS):
+            rows = slice(first, min(first + CHUNK_ROWS, count))
+            yield tuple(np.asarray(read(rows)) for read in reads)
+
+    def values(self, column: str) -> Array:
+        """Read the whole array, flat."""
+        return np.ravel(np.asarray(self._arrays[named(self.path, column, self.names())]))
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class NumpySource(_Arrays):
+    """A NumPy .npz file, read whole. Pickled objects are refused: they could run code.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If it is not one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with readable(path, "NumPy .npz"):
+            with np.load(path, allow_pickle=False) as archive:
+                if not isinstance(archive, np.lib.npyio.NpzFile):
+                    raise SourceError(f"{path}: a single array, expected an archive of named arrays (.npz)")
+                arrays = {}
+                for name in archive.files:
+                    try:
+                        arrays[name] = archive[name]
+                    except ValueError as error:
+                        if "allow_pickle" not in str(error):
+                            raise
+                        # Objects are nobody's samples; without them the rest may be used.
+            super().__init__(path, arrays)
+
+
+class MatlabSource(_Arrays):
+    """A MATLAB .mat file: version 4 to 7 read whole, version 7.3 (HDF5) column by column.
+
+    Fields of structs are named ``struct.field``.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If it is not one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file: Any = None
+        with readable(path, "MATLAB", "h5py"):
+            with path.open("rb") as file:
+                head = file.read(520)
+            if b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:520]):
+                import h5py  # noqa: PLC0415  # an extra; only for these files
+
+                self._file = h5py.File(path, "r")
+                found: dict[str, Any] = {}
+                self._file.visititems(lambda name, item: _collect_hdf5(found, name, item))
+                super().__init__(path, found)
+            else:
+                from scipy.io import loadmat  # noqa: PLC0415  # slow to import; only for these files
+
+                content = loadmat(path, simplify_cells=True)
+                super().__init__(path, dict(_flattened(content)))
+
+    def close(self) -> None:
+        """Close the file, if it is still open."""
+        if self._file is not None:
+            self._file.close()
+
+
+class WavSource(_Arrays):
+    """A WAV file; its channels are named ``1``, ``2`` and so on. Mapped, not read, where its number format allows.
+
+    Whole numbers come as fractions of full scale, so that `scale` in the mapping is the unit's value at full scale.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If it is not one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from scipy.io import wavfile  # noqa: PLC0415  # slow to import; only for these files
+
+        with readable(path, "WAV"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", wavfile.WavFileWarning)  # chunks of other programs that it skips
+            try:
+                rate, samples = wavfile.read(path, mmap=True)
+            except ValueError:  # 24 bits cannot be mapped
+                rate, samples = wavfile.read(path)
+        table = samples[:, None] if samples.ndim == 1 else samples
+        self._rate_hz = float(rate)
+        super().__init__(path, {str(number + 1): table[:, number] for number in range(table.shape[1])})
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
+        """Return the rate in the header; WAV knows no start time."""
+        return Timing(rate_hz=self._rate_hz)
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, `CHUNK_ROWS` at a time, whole numbers over full scale."""
+        for chunk in super().chunks(columns):
+            yield tuple(_over_full_scale(column) for column in chunk)
+
+
+def _over_full_scale(column: Array) -> Array:
+    if column.dtype.kind == "u":
+        return np.asarray((column.astype(np.float64) - 128) / 128)
+    if column.dtype.kind == "i":
+        return np.asarray(column / float(2 ** (8 * column.dtype.itemsize - 1)))
+    return column
+
+
+def _flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Array]]:
+    """Numeric arrays of nested structs."""
+    for name, value in content.items():
+        if name.startswith("__"):
+            continue
+        if isinstance(value, dict):
+            yield from _flattened(value, f"{prefix}{name}.")
+        else:
+            array = np.asarray(value)
+            if array.dtype.kind in "fiub":
+                yield f"{prefix}{name}", np.atleast_1d(array)
+
+
+def _collect_hdf5(found: dict[str, Any], name: str, item: Any) -> None:
+    """Take numeric data sets; MATLAB's table (n, m) is stored as (m, n), which the longer side settles."""
+    is_array = hasattr(item, "shape") and item.ndim in (1, 2) and item.size > 0 and item.dtype.kind in "fiu"
+    if is_array and item.attrs.get("MATLAB_class", b"") != b"char" and not name.startswith("#"):
+        found[name.replace("/", ".")] = item

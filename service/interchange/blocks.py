@@ -1,0 +1,119 @@
+"""Pieces of samples to the messages of a recording."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.machine import Machine
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.channels import Quantity
+from models.signals.recording import RecordedMessage
+from models.signals.wire import encode_block
+from service.interchange.samples import Piece
+
+__all__ = ["BlockMaker", "Written"]
+
+_BLOCK_S = 0.1
+_TURN = 2 * np.pi
+
+
+@dataclass(slots=True)
+class Written:
+    """What went into the recording.
+
+    Attributes
+    ----------
+    blocks, samples : int
+    stretches : int
+        Contiguous stretches.
+    too_short : int
+        Samples in stretches too short for a block, left out.
+    start_ns, end_ns : int
+        Time of the first sample, and of the one after the last.
+    """
+
+    blocks: int = 0
+    samples: int = 0
+    stretches: int = 0
+    too_short: int = 0
+    start_ns: int = 0
+    end_ns: int = 0
+
+
+class BlockMaker:
+    """Cuts pieces into blocks of 0.1 s, as a publisher would have sent them.
+
+    A block's time is the mean of its rows' times, each less its place in the block: jitter of single rows averages out
+    and a clock that runs a little fast or slow is followed.
+
+    Parameters
+    ----------
+    machine : Machine
+    origin_ns : int
+        Time of the first row of the file.
+    """
+
+    def __init__(self, machine: Machine, origin_ns: int) -> None:
+        self._machine, self._origin_ns = machine, origin_ns
+        ingest, rate_hz = machine.ingest, machine.rate_hz
+        self._least = max(1, int(np.ceil(ingest.block_from_s * rate_hz - 1e-9)))
+        most = max(self._least, int(ingest.block_to_s * rate_hz + 1e-9))
+        self._length = min(max(round(_BLOCK_S * rate_hz), self._least), most)
+        self._hash = machine.descriptor.schema_hash
+        self._angles = [n for n, channel in enumerate(machine.sensors) if channel.quantity is Quantity.SHAFT_ANGLE]
+        self._sequence = 0
+        self._expected_ns = 0.0
+        self._new = True
+        self.written = Written()
+
+    def feed(self, pieces: Iterator[Piece]) -> Iterator[RecordedMessage]:
+        """Descriptor and blocks of a file's pieces, to the end."""
+        time_ns, samples = np.empty(0), np.empty((0, len(self._machine.sensors)))
+        for piece in pieces:
+            if piece.begins:
+                yield from self._rest(time_ns, samples)
+                time_ns, samples, self._new = piece.time_ns, piece.samples, True
+            else:
+                time_ns = np.concatenate([time_ns, piece.time_ns])
+                samples = np.concatenate([samples, piece.samples])
+            # What remains is always long enough for a block of its own.
+            whole = max(0, (time_ns.size - self._least) // self._length)
+            for first in range(0, whole * self._length, self._length):
+                rows = slice(first, first + self._length)
+                yield from self._block(time_ns[rows], samples[rows])
+            time_ns, samples = time_ns[whole * self._length :], samples[whole * self._length :]
+        yield from self._rest(time_ns, samples)
+
+    def _rest(self, time_ns: FloatArray, samples: FloatArray) -> Iterator[RecordedMessage]:
+        """End of a stretch: one block, or two if that would be too long."""
+        if time_ns.size < self._least:
+            self.written.too_short += time_ns.size
+            return
+        parts = 2 if time_ns.size > self._length and time_ns.size >= 2 * self._least else 1
+        for rows in np.array_split(np.arange(time_ns.size), parts):
+            yield from self._block(time_ns[rows], samples[rows])
+
+    def _block(self, time_ns: FloatArray, samples: FloatArray) -> Iterator[RecordedMessage]:
+        keys, rate_hz = self._machine.keys, self._machine.rate_hz
+        since_ns = float(np.mean(time_ns - np.arange(time_ns.size) * (1e9 / rate_hz)))
+        block_ns = self._origin_ns + round(since_ns)
+        if self.written.blocks == 0:
+            self.written.start_ns = block_ns
+            descriptor = self._machine.descriptor.model_dump_json().encode()
+            yield RecordedMessage(keys.descriptor, descriptor, b"", "application/json", block_ns, block_ns)
+        elif self._new:  # the blocks that would have filled the gap are missing in the count too
+            self._sequence += max(1, round((since_ns - self._expected_ns) * rate_hz / 1e9 / self._length))
+        if self._new:
+            self.written.stretches += 1
+        self._expected_ns = since_ns + time_ns.size * 1e9 / rate_hz
+        columns = samples.astype(np.dtype(self._machine.dtype))
+        for number in self._angles:  # rounding may reach 2π, which is 0
+            columns[:, number] = np.where(columns[:, number] >= _TURN, 0.0, columns[:, number])
+        block = SampleBlock(block_ns, self._sequence, 1, rate_hz, columns)
+        payload, attachment, encoding = encode_block(block, self._hash)
+        yield RecordedMessage(keys.stream, payload, attachment, encoding, block.end_ns, block.end_ns)
+        self._sequence, self._new = self._sequence + 1, False
+        self.written.blocks += 1
+        self.written.samples += time_ns.size
+        self.written.end_ns = block.end_ns

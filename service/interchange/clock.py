@@ -1,0 +1,214 @@
+"""Time of each row: from a column, or from a rate. Rates, order and gaps are judged here, for all formats."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+
+from models.machine import Machine
+from models.signals.block import FloatArray
+from models.signals.units import time_unit_ns
+from service.interchange.mapping import TimeBase
+from service.interchange.source import Array, Reference, Source, SourceError, Timing
+
+__all__ = ["Clock", "check_order", "clock_for"]
+
+_MOST_RATIO = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """How times are read, and how fast the rows come.
+
+    Attributes
+    ----------
+    path : Path
+        The file, for messages.
+    column : Reference or None
+        Column with the times; without one, rows are equally spaced.
+    unit_ns : float
+        Nanoseconds per unit of that column.
+    origin_ns : int
+        Time of the first row, nanoseconds since 1970-01-01 UTC.
+    first : Array
+        The first row's entry in the column, shape (1,); times are counted from it.
+    rate_hz : float
+        Rows per second.
+    ratio : Fraction
+        The machine's rate over `rate_hz`; other than 1 if the file is to be resampled.
+    """
+
+    path: Path
+    column: Reference | None
+    unit_ns: float
+    origin_ns: int
+    first: Array
+    rate_hz: float
+    ratio: Fraction
+
+    def times(self, entries: Array | None, first_row: int, count: int) -> FloatArray:
+        """Times of rows, nanoseconds since the first row of the file; nan where there is none.
+
+        Parameters
+        ----------
+        entries : ndarray or None
+            The time column of these rows.
+        first_row, count : int
+            Number of the first of them, and how many they are.
+        """
+        if entries is None:
+            return np.asarray((first_row + np.arange(count)) * (1e9 / self.rate_hz))
+        return _since(entries, self.first, self.unit_ns)
+
+    def pulse_times(self, entries: Array, unit_ns: float) -> FloatArray:
+        """Times of pulses, which are counted from the same zero as the rows."""
+        zero = self.first.astype(np.float64)[0] * self.unit_ns if self.column is not None else 0.0
+        return np.asarray(entries.astype(np.float64) * unit_ns - zero)
+
+
+def clock_for(source: Source, columns: list[Reference], base: TimeBase, machine: Machine) -> Clock:
+    """Find out how fast the rows come, and check it against the machine.
+
+    Raises
+    ------
+    SourceError
+        If the file and the mapping do not tell, contradict each other, or the rate is not the machine's.
+    """
+    path, timing = source.path, source.timing(columns)
+    column, unit_ns = _time_column(base, timing)
+    declared = _declared_rate(source, base, timing)
+    if column is None:
+        if declared is None:
+            raise SourceError(f"{path}: nothing tells the rate; give time.column or time.rate_hz in the mapping")
+        first, measured, tolerance = np.zeros(1), declared, 0.0
+        origin_ns = _start_ns(path, base, timing)
+    else:
+        entries = _first_times(source, column, columns)
+        first = entries[:1]
+        measured, tolerance = _measured_rate(path, column, _since(entries, first, unit_ns))
+        if first.dtype.kind == "M":
+            origin_ns = int(first.astype("datetime64[ns]").astype(np.int64)[0])
+        else:
+            origin_ns = _start_ns(path, base, timing) + _nanoseconds(first[0], unit_ns)
+    tolerance += machine.ingest.rate_tolerance
+    if declared is not None and abs(measured / declared - 1) > tolerance:
+        raise SourceError(
+            f"{path}: column {column} has {measured:.9g} rows per second, but {declared:.9g} are declared; "
+            "expected the same"
+        )
+    rate_hz = declared if declared is not None else measured
+    ratio = _ratio(path, rate_hz, tolerance, base, machine)
+    return Clock(path, column, unit_ns, origin_ns, first, rate_hz, ratio)
+
+
+def _time_column(base: TimeBase, timing: Timing) -> tuple[Reference | None, float]:
+    if base.column is not None:
+        return Reference(base.column, base.index), 1.0 if base.is_datetime else time_unit_ns(base.unit)
+    return timing.time, 1e9
+
+
+def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | None:
+    """Rate that the mapping or the file states; both together must agree."""
+    told = base.rate_hz
+    if base.rate_from is not None:
+        found = np.ravel(source.values(base.rate_from)).astype(np.float64)
+        if found.size != 1 or not 0 < found[0] <= 1e6:
+            raise SourceError(
+                f"{source.path}: {base.rate_from} is {found[:5]}, expected one rate above 0 and at most 1e6 Hz"
+            )
+        told = float(found[0])
+    if told is not None and timing.rate_hz is not None and abs(told / timing.rate_hz - 1) > 1e-6:
+        raise SourceError(
+            f"{source.path}: the file says {timing.rate_hz:.9g} samples per second, the mapping {told:.9g}; expected "
+            "the same"
+        )
+    return told if told is not None else timing.rate_hz
+
+
+def _start_ns(path: Path, base: TimeBase, timing: Timing) -> int:
+    start_ns = base.start_ns if base.start_ns is not None else timing.start_ns
+    if start_ns is None:
+        raise SourceError(
+            f"{path}: nothing tells when the first row was sampled; give time.start in the mapping, such as "
+            'start = "2026-01-31T12:00:00Z"'
+        )
+    return start_ns
+
+
+def _first_times(source: Source, column: Reference, columns: list[Reference]) -> Array:
+    pieces: Iterator[tuple[Array, ...]] = source.chunks([column, *columns[:1]])
+    entries = next(pieces, (np.empty(0),))[0]
+    if entries.dtype.kind not in "fiuM":
+        raise SourceError(f"{source.path}: column {column} holds {entries.dtype}, expected times")
+    if entries.size < 2:
+        raise SourceError(f"{source.path}: has {entries.size} rows, expected at least two to tell the rate")
+    missing = np.flatnonzero(np.isnat(entries) if entries.dtype.kind == "M" else ~np.isfinite(entries))
+    if missing.size:
+        raise SourceError(
+            f"{source.path}: row {int(missing[0]) + 1}, column {column}: found {entries[missing[0]]}, expected a time"
+        )
+    return entries
+
+
+def _measured_rate(path: Path, column: Reference, times: FloatArray) -> tuple[float, float]:
+    """Rate of a time column, gaps left out, and how uncertain the column's jitter makes it."""
+    steps = np.diff(times)
+    check_order(path, column, times, 0)
+    usual = float(np.median(steps))
+    within = steps[np.abs(steps - usual) <= 0.5 * usual]
+    step = float(within.mean())
+    return 1e9 / step, 2 * float(np.abs(within - step).max()) / (step * within.size)
+
+
+def check_order(path: Path, column: Reference | None, times: FloatArray, first_row: int) -> None:
+    """Check that times ascend.
+
+    Raises
+    ------
+    SourceError
+        Naming the first row whose time repeats or goes back.
+    """
+    wrong = np.flatnonzero(np.diff(times) <= 0)
+    if wrong.size:
+        at = int(wrong[0]) + 1
+        back_ns = times[at - 1] - times[at]
+        what = "repeats the time of the row before" if back_ns == 0 else f"goes back by {back_ns / 1e9:.9g} s"
+        hint = (
+            "; times written with too few decimals? Leave the column out and give time.rate_hz" if back_ns == 0 else ""
+        )
+        raise SourceError(f"{path}: row {first_row + at + 1}, column {column}: {what}, expected ascending times{hint}")
+
+
+def _ratio(path: Path, rate_hz: float, tolerance: float, base: TimeBase, machine: Machine) -> Fraction:
+    if abs(rate_hz / machine.rate_hz - 1) <= tolerance:
+        return Fraction(1)
+    if not base.resample:
+        raise SourceError(
+            f"{path}: has {rate_hz:.9g} samples per second, the machine file says rate_hz = {machine.rate_hz:.9g}; "
+            "expected the same, or time.resample = true in the mapping"
+        )
+    ratio = Fraction(machine.rate_hz / rate_hz).limit_denominator(_MOST_RATIO)
+    if ratio.numerator > _MOST_RATIO or abs(float(ratio) * rate_hz / machine.rate_hz - 1) > tolerance:
+        raise SourceError(
+            f"{path}: {rate_hz:.9g} and {machine.rate_hz:.9g} samples per second are not in a ratio of whole numbers "
+            f"up to {_MOST_RATIO}, so the file cannot be resampled; is time.rate_hz exact?"
+        )
+    return ratio
+
+
+def _since(entries: Array, first: Array, unit_ns: float) -> FloatArray:
+    """Nanoseconds from the first entry; differences of whole numbers are taken before they are rounded to floats."""
+    if entries.dtype.kind == "M":
+        since = (entries.astype("datetime64[ns]") - first.astype("datetime64[ns]")).astype(np.int64)
+        return np.where(np.isnat(entries), np.nan, since.astype(np.float64))
+    if entries.dtype.kind in "iu":
+        return np.asarray((entries.astype(np.int64) - first.astype(np.int64)) * unit_ns, dtype=np.float64)
+    return np.asarray((entries.astype(np.float64) - first.astype(np.float64)) * unit_ns)
+
+
+def _nanoseconds(entry: np.generic, unit_ns: float) -> int:
+    if entry.dtype.kind in "iu":
+        return round(int(entry) * Fraction(unit_ns))
+    return round(Fraction(float(entry)) * Fraction(unit_ns))

@@ -1,0 +1,321 @@
+"""What can be taken out of recordings as a table: the stream, the reports, the alarms.
+
+A table is a schema, whose fields carry ``unit`` and ``description`` in their metadata, and batches of rows.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+from pydantic import ValidationError
+
+from models.errors import RecordingError, WireError
+from models.physics.parameters import PARAMETER_TEXT
+from models.signals.block import SampleBlock
+from models.signals.channels import ChannelDescriptor, Quantity
+from models.signals.keys import PREFIX
+from models.signals.recording import RecordedMessage, read_recording, summarize_recording
+from models.signals.wire import decode_block
+from service.schemas import AlarmCloudEvent, Report
+
+__all__ = ["Selection", "Table", "alarm_table", "report_table", "stream_table"]
+
+_ROWS = 65536
+_MESSAGES = 1000
+_Row = dict[str, object]
+_SI_UNITS = {
+    Quantity.DISPLACEMENT: "m",
+    Quantity.VELOCITY: "m/s",
+    Quantity.TILT: "rad",
+    Quantity.TILT_RATE: "rad/s",
+    Quantity.SHAFT_ANGLE: "rad",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What to take of which recordings.
+
+    Attributes
+    ----------
+    recordings : tuple of Path
+        In any order; they are read in the order of their beginnings.
+    machine : str or None
+        ``site/machine``; may be left out where the recordings hold only one.
+    from_ns, to_ns : int or None
+        Data time, from the first to without the last.
+    si : bool
+        Whether samples are converted to SI units.
+    """
+
+    recordings: tuple[Path, ...]
+    machine: str | None = None
+    from_ns: int | None = None
+    to_ns: int | None = None
+    si: bool = False
+
+    def ordered(self) -> list[Path]:
+        """Recordings by the time they begin."""
+        return sorted(self.recordings, key=lambda path: (summarize_recording(path).start_ns, path))
+
+    def root(self) -> str:
+        """What the machine's keys start with.
+
+        Raises
+        ------
+        RecordingError
+            If the recordings hold several machines and none is chosen, or not the chosen one.
+        """
+        keys = {key for path in self.recordings for key in summarize_recording(path).messages}
+        parts = {tuple(key.split("/")[:3]) for key in keys if key.startswith(f"{PREFIX}/") and key.count("/") >= 3}
+        machines = sorted("/".join(part[1:]) for part in parts)
+        names = ", ".join(str(path) for path in self.recordings)
+        if self.machine is not None and self.machine not in machines:
+            raise RecordingError(f"{names}: no machine {self.machine}; there are {', '.join(machines) or 'none'}")
+        if self.machine is None and len(machines) != 1:
+            raise RecordingError(
+                f"{names}: expected one machine, there are {', '.join(machines) or 'none'}; choose one with --machine"
+            )
+        return f"{PREFIX}/{self.machine or machines[0]}"
+
+    def wants(self, time_ns: int) -> bool:
+        """Whether a time is within the limits."""
+        return (self.from_ns is None or time_ns >= self.from_ns) and (self.to_ns is None or time_ns < self.to_ns)
+
+
+@dataclass(slots=True)
+class Table:
+    """Columns with units, and rows.
+
+    Attributes
+    ----------
+    schema : pyarrow.Schema
+    batches : iterator of pyarrow.RecordBatch
+    rows : int
+        Rows that were taken so far.
+    skipped : list of str
+        Messages that could not be used, and why.
+    """
+
+    schema: pa.Schema
+    batches: Iterator[pa.RecordBatch]
+    rows: int = 0
+    skipped: list[str] = field(default_factory=list)
+
+
+def stream_table(selection: Selection) -> Table:
+    """Samples, one row per instant: ``time_ns`` and a column per channel, gaps kept.
+
+    Raises
+    ------
+    RecordingError
+        If there is no stream or no descriptor, or the channels change on the way.
+    """
+    root = selection.root()
+    descriptor = _descriptor(selection, f"{root}/descriptor")
+    fields = [_field("time_ns", pa.int64(), "ns", "acquisition time since 1970-01-01 UTC")]
+    factors = []
+    for channel in descriptor.channels:
+        factors.append(channel.to_si if selection.si else 1.0)
+        kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
+        unit = _SI_UNITS[channel.quantity] if selection.si else channel.unit
+        place = f"{channel.quantity}, {channel.location}, {channel.direction}"
+        fields.append(_field(channel.name, kind, unit, place))
+    metadata = {
+        "site": descriptor.site,
+        "machine": descriptor.machine,
+        "rate_hz": repr(descriptor.rate_hz),
+        "descriptor": descriptor.model_dump_json(),
+    }
+    table = Table(pa.schema(fields, metadata=metadata), iter(()))
+    table.batches = _stream_batches(selection, f"{root}/stream", descriptor, factors, table)
+    return table
+
+
+def report_table(selection: Selection) -> Table:
+    """Reports, one row per window."""
+    fields = [
+        _field("start_ns", pa.int64(), "ns", "oldest data in the window"),
+        _field("end_ns", pa.int64(), "ns", "end of the newest data in the window"),
+        _field("state", pa.string(), "", "health after this window"),
+        _field("filled", pa.float64(), "1", "fraction of a full window"),
+        _field("speed_rad_s", pa.float64(), "rad/s", "mean speed"),
+        _field("misfit_z", pa.float64(), "1", "distance from the model in standard deviations"),
+        _field("suspect", pa.string(), "", "what explains the misfit best"),
+        _field("verdict", pa.string(), "", "what has changed, in words"),
+        _field("changed", pa.string(), "", "parameters that have changed"),
+        _field("confidence", pa.float64(), "1", "that it is exactly these"),
+        _field("low_confidence", pa.bool_(), "", "whether it was found in data outside the model"),
+        _field("reason", pa.string(), "", "why the window was not evaluated"),
+    ]
+    for name, text in PARAMETER_TEXT.items():
+        fields += [
+            _field(f"{name}.relative_change", pa.float64(), "1", f"{text}: relative change"),
+            _field(f"{name}.standard_error", pa.float64(), "1", f"{text}: standard error of the relative change"),
+            _field(f"{name}.z", pa.float64(), "1", f"{text}: change over its standard error"),
+        ]
+    return _message_table(selection, "report", fields, _report_row, "end_ns")
+
+
+def alarm_table(selection: Selection) -> Table:
+    """Alarm events, one row each."""
+    fields = [
+        _field("time_ns", pa.int64(), "ns", "data time of the event"),
+        _field("parameter", pa.string(), "", "parameter, or model"),
+        _field("kind", pa.string(), "", "raised, escalated or cleared"),
+        _field("severity", pa.string(), "", "alert or danger"),
+        _field("text", pa.string(), "", "the event in a sentence"),
+        _field("relative_change", pa.float64(), "1", "relative change that decided"),
+        _field("standard_error", pa.float64(), "1", "its standard error"),
+        _field("low_confidence", pa.bool_(), "", "whether it was found in data outside the model"),
+        _field("raised_ns", pa.int64(), "ns", "when this occurrence was raised"),
+        _field("occurrence", pa.int64(), "1", "how often it was raised"),
+        _field("sequence", pa.int64(), "1", "counts the machine's events"),
+        _field("id", pa.string(), "", "the same however often the event is delivered"),
+    ]
+    return _message_table(selection, "alarm/event", fields, _alarm_row, "time_ns")
+
+
+def _field(name: str, kind: pa.DataType, unit: str, description: str) -> pa.Field:
+    return pa.field(name, kind, metadata={"unit": unit, "description": description})
+
+
+def _messages(selection: Selection, key: str) -> Iterator[tuple[Path, RecordedMessage]]:
+    for path in selection.ordered():
+        for message in read_recording(path, keys={key}):
+            yield path, message
+
+
+def _descriptor(selection: Selection, key: str) -> ChannelDescriptor:
+    """The channel descriptor; all of them must be the same."""
+    found: ChannelDescriptor | None = None
+    for path, message in _messages(selection, key):
+        try:
+            descriptor = ChannelDescriptor.model_validate_json(message.payload)
+        except ValidationError as error:
+            raise RecordingError(f"{path}: the channel descriptor on {key} cannot be read: {error}") from error
+        if found is not None and descriptor != found:
+            raise RecordingError(
+                f"{path}: the channels on {key} are not those of before; export what belongs together by itself"
+            )
+        found = descriptor
+    if found is None:
+        names = ", ".join(str(path) for path in selection.recordings)
+        raise RecordingError(f"{names}: no channel descriptor on {key}, so the columns have no names and units")
+    return found
+
+
+def _stream_batches(
+    selection: Selection, key: str, descriptor: ChannelDescriptor, factors: Sequence[float], table: Table
+) -> Iterator[pa.RecordBatch]:
+    """Collect blocks to batches; what overlaps or cannot be decoded is left out and said."""
+    pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]] = []
+    count, last_ns = 0, -(2**63)
+    tolerance_ns = round(5e8 / descriptor.rate_hz)
+    for path, message in _messages(selection, key):
+        try:
+            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        except WireError as error:
+            table.skipped.append(f"{path}: {error}")
+            continue
+        if (schema_hash and schema_hash != descriptor.schema_hash) or block.samples.shape[1] != len(factors):
+            table.skipped.append(f"{path}: block {block.sequence} has other channels than the descriptor")
+            continue
+        if block.start_ns < last_ns - tolerance_ns:
+            table.skipped.append(f"{path}: block {block.sequence} starts before the end of the one before it")
+            continue
+        last_ns = block.end_ns
+        time_ns = block.start_ns + np.rint(np.arange(block.samples.shape[0]) * (1e9 / block.rate_hz)).astype(np.int64)
+        low = 0 if selection.from_ns is None else int(np.searchsorted(time_ns, selection.from_ns))
+        high = time_ns.size if selection.to_ns is None else int(np.searchsorted(time_ns, selection.to_ns))
+        if low < high:
+            pending.append((time_ns, block, slice(low, high)))
+            count += high - low
+        if count >= _ROWS:
+            yield _batch(pending, factors, table)
+            pending, count = [], 0
+    if pending:
+        yield _batch(pending, factors, table)
+
+
+def _batch(
+    pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]],
+    factors: Sequence[float],
+    table: Table,
+) -> pa.RecordBatch:
+    times = np.concatenate([time_ns[rows] for time_ns, _, rows in pending])
+    samples = np.concatenate([block.samples[rows] for _, block, rows in pending])
+    columns = [pa.array(times)]
+    for number, factor in enumerate(factors):
+        column = samples[:, number]
+        values = column if factor == 1.0 else column.astype(np.float64) * factor
+        kind = table.schema.field(number + 1).type.to_pandas_dtype()
+        columns.append(pa.array(np.ascontiguousarray(values, dtype=kind)))
+    table.rows += times.size
+    return pa.record_batch(columns, schema=table.schema)
+
+
+def _message_table(
+    selection: Selection, topic: str, fields: list[pa.Field], row: Callable[[bytes], _Row], time: str
+) -> Table:
+    """Rows from JSON messages; a message that does not follow its schema is left out and said."""
+    key = f"{selection.root()}/{topic}"
+    table = Table(pa.schema(fields, metadata={"key": key}), iter(()))
+    table.batches = _message_batches(selection, key, row, time, table)
+    return table
+
+
+def _message_batches(
+    selection: Selection, key: str, row: Callable[[bytes], _Row], time: str, table: Table
+) -> Iterator[pa.RecordBatch]:
+    pending: list[_Row] = []
+    for path, message in _messages(selection, key):
+        try:
+            found = row(message.payload)
+        except ValidationError as error:
+            table.skipped.append(f"{path}: a message on {key} cannot be read: {error}")
+            continue
+        when = found[time]
+        if isinstance(when, int) and selection.wants(when):
+            pending.append(found)
+        if len(pending) >= _MESSAGES:
+            yield pa.RecordBatch.from_pylist(pending, schema=table.schema)
+            table.rows += len(pending)
+            pending = []
+    if pending:
+        yield pa.RecordBatch.from_pylist(pending, schema=table.schema)
+        table.rows += len(pending)
+
+
+def _report_row(payload: bytes) -> _Row:
+    report = Report.model_validate_json(payload)
+    row: _Row = {
+        "start_ns": report.start_ns,
+        "end_ns": report.end_ns,
+        "state": report.state,
+        "filled": report.filled,
+        "speed_rad_s": report.speed_rad_s,
+        "misfit_z": report.misfit_z,
+        "suspect": report.suspect,
+        "reason": report.reason,
+    }
+    if report.verdict is not None:
+        row["verdict"] = report.verdict.text
+        row["changed"] = " ".join(finding.name for finding in report.verdict.changed)
+        row["confidence"] = report.verdict.confidence
+        row["low_confidence"] = report.verdict.low_confidence
+    for reading in report.parameters:
+        for value in ("relative_change", "standard_error", "z"):
+            row[f"{reading.name}.{value}"] = getattr(reading, value)
+    return row
+
+
+def _alarm_row(payload: bytes) -> _Row:
+    event = AlarmCloudEvent.model_validate_json(payload)
+    names = ("time_ns", "parameter", "kind", "severity", "text", "relative_change", "standard_error")
+    more = ("low_confidence", "raised_ns", "occurrence", "sequence")
+    row: _Row = {name: getattr(event.data, name) for name in (*names, *more)}
+    return {**row, "id": event.id}

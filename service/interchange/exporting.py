@@ -1,0 +1,146 @@
+"""Export: a table from recordings into a file of another program, with units."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from models.errors import RecordingError
+from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
+from service.interchange.source import Array
+
+__all__ = ["ExportFormat", "ExportSubject", "export"]
+
+ExportFormat = Literal["parquet", "csv", "mat"]
+ExportSubject = Literal["stream", "reports", "alarms"]
+
+_LARGEST_MATLAB = 2**31 - 1
+_TABLES = {"stream": stream_table, "reports": report_table, "alarms": alarm_table}
+
+
+def export(
+    selection: Selection, what: ExportSubject, kind: ExportFormat, out: Path, *, overwrite: bool = False
+) -> Table:
+    """Write a table.
+
+    Parquet has ``unit`` and ``description`` in the metadata of its fields; CSV has ``name [unit]`` in its header; .mat
+    has a struct per column with its samples, unit and description. Parquet and CSV are written as the recordings are
+    read; a .mat file is put together in memory.
+
+    Parameters
+    ----------
+    selection : Selection
+    what : {"stream", "reports", "alarms"}
+    kind : {"parquet", "csv", "mat"}
+    out : Path
+        What is written; nothing is left of it if that fails.
+    overwrite : bool
+        Replace a file that is already there.
+
+    Returns
+    -------
+    Table
+        Written to its end; says how many rows there were and what was left out.
+
+    Raises
+    ------
+    RecordingError
+        If the recordings cannot be read, have nothing of what is wanted, or the file cannot be written.
+    """
+    if out.exists() and not overwrite:
+        raise RecordingError(f"{out}: exists already and is not overwritten")
+    if any(path.exists() and out.exists() and path.samefile(out) for path in selection.recordings):
+        raise RecordingError(f"{out}: is one of the recordings")
+    table = _TABLES[what](selection)
+    with _completed(out) as part:
+        match kind:
+            case "parquet":
+                _write_parquet(table, part)
+            case "csv":
+                _write_csv(table, part)
+            case "mat":
+                _write_matlab(table, part)
+        if table.rows == 0:
+            names = ", ".join(str(path) for path in selection.recordings)
+            why = f" ({table.skipped[0]})" if table.skipped else ""
+            raise RecordingError(f"{names}: no {what} in the time that is wanted{why}")
+    return table
+
+
+@contextmanager
+def _completed(out: Path) -> Iterator[Path]:
+    """Give a file its name when it is complete."""
+    part = out.with_name(out.name + ".part")
+    try:
+        yield part
+        part.replace(out)
+    except OSError as error:
+        raise RecordingError(f"{out}: cannot be written ({error.strerror or error})") from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _write_parquet(table: Table, part: Path) -> None:
+    with pa.parquet.ParquetWriter(part, table.schema, compression="zstd") as writer:
+        for batch in table.batches:
+            writer.write_batch(batch)
+
+
+def _write_csv(table: Table, part: Path) -> None:
+    fields = []
+    for field in table.schema:
+        unit = field.metadata[b"unit"].decode()
+        label = f"{field.name} [{unit}]" if unit and not field.name.endswith("_ns") else field.name
+        fields.append(pa.field(label, field.type))
+    plain = pa.schema(fields)
+    with pa.csv.CSVWriter(part, plain, write_options=pa.csv.WriteOptions(quoting_style="needed")) as writer:
+        for batch in table.batches:
+            writer.write_batch(pa.record_batch(batch.columns, schema=plain))
+
+
+def _write_matlab(table: Table, part: Path) -> None:
+    from scipy.io import savemat  # noqa: PLC0415  # slow to import; only for these files
+
+    whole = pa.Table.from_batches(list(table.batches), schema=table.schema)
+    if whole.nbytes > _LARGEST_MATLAB:
+        raise RecordingError(
+            f"{part.with_suffix('')}: {whole.nbytes / 1e9:.2g} GB, but a .mat file of version 5 holds 2 GB at most; "
+            "export a part with --from and --to-time, or Parquet, which MATLAB reads"
+        )
+    columns, taken = {}, set[str]()
+    for field in table.schema:
+        name = _matlab_name(field.name, taken)
+        columns[name] = {
+            "samples": _matlab_column(whole.column(field.name)),
+            "name": field.name,
+            "unit": field.metadata[b"unit"].decode(),
+            "description": field.metadata[b"description"].decode(),
+        }
+    info = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+    savemat(part, {"data": columns, "info": info}, appendmat=False, oned_as="column", long_field_names=True)
+
+
+def _matlab_column(column: pa.ChunkedArray) -> Array:
+    if pa.types.is_string(column.type):
+        return np.array([text or "" for text in column.to_pylist()], dtype=object)
+    if column.null_count:
+        return np.array([np.nan if value is None else value for value in column.to_pylist()], dtype=np.float64)
+    return np.asarray(column.to_numpy())
+
+
+def _matlab_name(name: str, taken: set[str]) -> str:
+    """A field name that MATLAB accepts: letters, digits and _, beginning with a letter, at most 63."""
+    plain = re.sub(r"[^A-Za-z0-9_]", "_", name)
+    plain = (plain if plain[:1].isalpha() else f"x{plain}")[:60]
+    unique, number = plain, 1
+    while unique in taken:
+        number += 1
+        unique = f"{plain}_{number}"
+    taken.add(unique)
+    return unique

@@ -1,0 +1,133 @@
+"""Import: a file from another program becomes a recording.
+
+::
+
+    Source ─> pieces ──────> Integration ─> Resampling ──> AngleColumn ─> BlockMaker ─> RecordingWriter
+    (format)  (units, time,  (accelerometers) (other rate)  (keyphasor)    (0.1 s)
+               gaps)
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from models.machine import Machine
+from models.signals.keyphasor import PulseTrain
+from models.signals.recording import RecordingWriter
+from service.interchange.angle import AngleColumn, read_pulses
+from service.interchange.blocks import BlockMaker, Written
+from service.interchange.clock import Clock, clock_for
+from service.interchange.formats import open_source
+from service.interchange.mapping import Mapping
+from service.interchange.overlap import Integration, Overlap, Resampling
+from service.interchange.samples import Piece, Read, pieces, signals_of
+from service.interchange.source import Reference, SourceError
+
+__all__ = ["Imported", "import_file"]
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What an import did.
+
+    Attributes
+    ----------
+    source : Path
+    recording : Path
+    machine : Machine
+    mapping : Mapping
+    clock : Clock
+    read : Read
+        What was met in the file.
+    written : Written
+        What went into the recording.
+    pulses : PulseTrain or None
+    cut_rows : int
+        Rows at the ends of stretches where filters are not settled.
+    unknown_angle : int
+        Rows left out because the shaft angle is not known.
+    """
+
+    source: Path
+    recording: Path
+    machine: Machine
+    mapping: Mapping
+    clock: Clock
+    read: Read
+    written: Written
+    pulses: PulseTrain | None
+    cut_rows: int
+    unknown_angle: int
+
+
+def import_file(
+    path: Path, mapping: Mapping, machine: Machine, recording: Path, *, overwrite: bool = False
+) -> Imported:
+    """Import a file.
+
+    Parameters
+    ----------
+    path : Path
+        CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4.
+    mapping : Mapping
+        Which column is which channel.
+    machine : Machine
+        Whose stream it becomes.
+    recording : Path
+        What is written; nothing is left of it if the import fails.
+    overwrite : bool
+        Replace a recording that is already there.
+
+    Raises
+    ------
+    SourceError
+        If the file cannot be used, naming row and column where it is about one.
+    RecordingError
+        If the recording cannot be written.
+    """
+    with open_source(path, mapping) as source:
+        signals = signals_of(source, mapping, machine)
+        columns = [signal.reference for signal in signals]
+        keyphasor = mapping.keyphasor
+        if keyphasor is not None and keyphasor.column is not None:
+            columns = [*columns, *_sampled(keyphasor.column, keyphasor.index, columns)]
+        clock = clock_for(source, columns, mapping.time, machine)
+        pulses = None if keyphasor is None else read_pulses(source, keyphasor, clock, mapping)
+        read = Read()
+        parts: Iterator[Piece] = pieces(source, signals, clock, mapping, read)
+        overlaps = []
+        if mapping.acceleration is not None:
+            overlaps.append(Overlap(Integration(signals, clock.rate_hz, mapping.acceleration.high_pass_hz)))
+        if clock.ratio != 1:
+            angles = [number for number, signal in enumerate(signals) if signal.is_angle]
+            overlaps.append(Overlap(Resampling(clock.ratio, angles)))
+        for overlap in overlaps:
+            parts = overlap.feed(parts)
+        angle = AngleColumn(machine, pulses, keyphasor is not None and keyphasor.direction == "reverse")
+        maker = BlockMaker(machine, clock.origin_ns)
+        writer = RecordingWriter(recording, overwrite=overwrite)
+        try:
+            with writer:
+                for message in maker.feed(angle.feed(parts)):
+                    writer.write(message)
+                if maker.written.blocks == 0:
+                    raise SourceError(_nothing(path, machine, read, sum(overlap.cut_rows for overlap in overlaps)))
+        except BaseException:
+            writer.part.unlink(missing_ok=True)
+            raise
+    cut_rows = sum(overlap.cut_rows for overlap in overlaps)
+    return Imported(path, recording, machine, mapping, clock, read, maker.written, pulses, cut_rows, angle.unknown)
+
+
+def _sampled(column: str, index: int | None, columns: list[Reference]) -> list[Reference]:
+    """The keyphasor's own signal, if it is not one of the others."""
+    reference = Reference(column, index)
+    return [] if reference in columns else [reference]
+
+
+def _nothing(path: Path, machine: Machine, read: Read, cut_rows: int) -> str:
+    ends = f", {cut_rows} of them at the ends where filters settle" if cut_rows else ""
+    return (
+        f"{path}: {read.rows} rows, {len(read.gaps)} gaps: no stretch is long enough{ends}; expected at least "
+        f"{machine.ingest.block_from_s:g} s of the machine's samples"
+    )

@@ -1,0 +1,235 @@
+"""The mapping: which column of a foreign file is which channel of the machine, in which unit, at which time.
+
+One TOML file; ``docs/interchange.md`` explains each field.
+"""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from models.errors import MachineFileError
+from models.machine import Machine, read_toml, validation_text
+from models.signals.channels import Channel, Quantity
+from models.signals.units import ACCELERATION, time_unit_ns, unit_factor
+
+__all__ = ["Column", "CsvFormat", "Keyphasor", "Mapping", "TimeBase", "load_mapping"]
+
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+_DATETIME = "datetime"
+
+
+def _text(value: object) -> object:
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+_Name = Annotated[str, BeforeValidator(_text), Field(min_length=1)]
+"""Name of a column; columns without names are numbered from 1."""
+
+
+class CsvFormat(BaseModel):
+    """How a text table is written."""
+
+    model_config = _STRICT
+
+    delimiter: str = Field(default=",", min_length=1, max_length=1, description="between cells")
+    decimal: Literal[".", ","] = Field(default=".", description="decimal sign")
+    header: bool = Field(default=True, description="whether the first line has names")
+    skip_lines: int = Field(default=0, ge=0, description="lines before the table")
+    skip_lines_after_header: int = Field(default=0, ge=0, description="lines between names and numbers, such as units")
+    encoding: str = Field(default="utf-8", description="such as latin-1 for a µ from an old program")
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Self:
+        if self.delimiter == self.decimal:
+            raise ValueError(f"delimiter and decimal are both {self.decimal!r}, expected different signs")
+        return self
+
+
+class TimeBase(BaseModel):
+    """When the rows were sampled."""
+
+    model_config = _STRICT
+
+    column: _Name | None = Field(default=None, description="column with the time of each row")
+    index: int | None = Field(default=None, ge=0, description="its column, in a table within an array file")
+    unit: str = Field(default="s", description="of that column: s, ms, us, ns, min, h; datetime for dates and times")
+    start: datetime | Literal["unix"] | None = Field(
+        default=None, description="time of the first row, or of 0 in the time column; unix if that counts from 1970"
+    )
+    rate_hz: float | None = Field(default=None, gt=0, le=1e6, description="samples per second where no column says so")
+    rate_from: _Name | None = Field(default=None, description="array of the file with the rate, Hz")
+    resample: bool = Field(default=False, description="whether a file at another rate than the machine's is resampled")
+    jitter: float = Field(
+        default=0.4, gt=0, le=0.5, description="how far a time step may be from the usual one, in steps"
+    )
+    fill_gaps_up_to_s: float = Field(
+        default=0.0, ge=0, le=1, description="gaps up to this length are filled with straight lines"
+    )
+    not_finite: Literal["refuse", "gap"] = Field(
+        default="refuse", description="what to make of empty cells, NaN and infinities"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if isinstance(self.start, datetime) and self.start.tzinfo is None:
+            raise ValueError(f"start {self.start.isoformat()} has no time zone, expected UTC such as {self.start}Z")
+        if self.rate_hz is not None and self.rate_from is not None:
+            raise ValueError("rate_hz and rate_from are both given, expected one of them")
+        if self.unit == _DATETIME:
+            if self.start is not None:
+                raise ValueError("start is given although the time column has dates, expected no start")
+        else:
+            time_unit_ns(self.unit)
+        return self
+
+    @property
+    def is_datetime(self) -> bool:
+        """Whether the time column has dates and times by itself."""
+        return self.column is not None and self.unit == _DATETIME
+
+    @property
+    def start_ns(self) -> int | None:
+        """Start in nanoseconds since 1970, if it is given."""
+        if self.start is None:
+            return None
+        if self.start == "unix":
+            return 0
+        since = self.start - datetime(1970, 1, 1, tzinfo=UTC)
+        return ((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
+
+
+class Column(BaseModel):
+    """Where a channel's samples are: sample = sign · (number · scale + offset) in `unit`."""
+
+    model_config = _STRICT
+
+    column: _Name = Field(description="column, array, channel or data set")
+    index: int | None = Field(default=None, ge=0, description="column of a table within an array file, from 0")
+    unit: str | None = Field(default=None, description="unit of the samples; may be left out where the file states it")
+    scale: float = Field(default=1.0, description="units per number in the file")
+    scale_from: _Name | None = Field(default=None, description="array of the file with the scale, of each index or one")
+    offset: float = Field(default=0.0, description="added after scaling, in `unit`")
+    sign: Literal[1, -1] = Field(default=1, description="-1 turns the direction round")
+
+    @model_validator(mode="after")
+    def _effective(self) -> Self:
+        if self.scale == 0:
+            raise ValueError("scale is 0, expected another number")
+        return self
+
+
+class Acceleration(BaseModel):
+    """Channels that are integrated from accelerometers."""
+
+    model_config = _STRICT
+
+    high_pass_hz: float = Field(gt=0, le=1e4, description="corner of the high-pass; valid from twice that frequency")
+    channels: dict[str, Column] = Field(min_length=1, description="channel of the machine to accelerometer")
+
+
+class Keyphasor(BaseModel):
+    """Shaft angle from pulses: their times, or a sampled signal that has them."""
+
+    model_config = _STRICT
+
+    pulse_times: _Name | None = Field(default=None, description="array of the times of all pulses")
+    unit: str = Field(default="s", description="unit of these times, counted like the rows")
+    column: _Name | None = Field(default=None, description="sampled signal with the pulses")
+    index: int | None = Field(default=None, ge=0, description="its column, in a table within an array file")
+    threshold: float | None = Field(default=None, description="level at which a pulse begins, as numbers in the file")
+    hysteresis: float = Field(default=0.0, ge=0, description="how far it must fall back before the next pulse")
+    edge: Literal["rising", "falling"] = "rising"
+    pulses_per_revolution: int = Field(default=1, ge=1, le=10000)
+    direction: Literal["forward", "reverse"] = Field(default="forward", description="forward turns from y to z")
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.pulse_times is None) == (self.column is None):
+            raise ValueError("expected either pulse_times or column")
+        if self.column is not None and self.threshold is None:
+            raise ValueError("column needs a threshold")
+        time_unit_ns(self.unit)
+        return self
+
+
+class Mapping(BaseModel):
+    """All of it."""
+
+    model_config = _STRICT
+
+    format: Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"] | None = Field(
+        default=None, description="format of the file where its name does not say"
+    )
+    csv: CsvFormat = CsvFormat()
+    time: TimeBase = TimeBase()
+    channels: dict[str, Column] = Field(default={}, description="channel of the machine to column")
+    acceleration: Acceleration | None = None
+    keyphasor: Keyphasor | None = None
+
+    @property
+    def accelerations(self) -> dict[str, Column]:
+        """Channels to integrate."""
+        return {} if self.acceleration is None else self.acceleration.channels
+
+    def check_against(self, machine: Machine) -> None:
+        """Check that every channel of the machine is mapped, once, and in a unit of its quantity.
+
+        Raises
+        ------
+        ValueError
+            Naming the field.
+        """
+        known = {channel.name: channel for channel in machine.sensors}
+        for table, columns in (("channels", self.channels), ("acceleration.channels", self.accelerations)):
+            for name in columns:
+                if name not in known:
+                    raise ValueError(f"{table}.{name}: not a channel of the machine, which has {', '.join(known)}")
+        for name, channel in known.items():
+            self._check_channel(name, channel)
+        angle = next((name for name, channel in known.items() if channel.quantity is Quantity.SHAFT_ANGLE), None)
+        if self.keyphasor is not None and angle is None:
+            raise ValueError("keyphasor: the machine has no shaft_angle channel for it")
+
+    def _check_channel(self, name: str, channel: Channel) -> None:
+        is_angle = channel.quantity is Quantity.SHAFT_ANGLE
+        ways = [name in self.channels, name in self.accelerations, is_angle and self.keyphasor is not None]
+        if sum(ways) != 1:
+            how = "nothing" if not any(ways) else "more than one of them"
+            angle = ", or a [keyphasor]" if is_angle else f" or [acceleration.channels.{name}]"
+            raise ValueError(f"channels.{name}: expected [channels.{name}]{angle}, found {how}")
+        if name in self.accelerations:
+            if channel.quantity not in (Quantity.DISPLACEMENT, Quantity.VELOCITY):
+                raise ValueError(
+                    f"acceleration.channels.{name}: a {channel.quantity} is not what acceleration integrates to"
+                )
+            self._check_unit(f"acceleration.channels.{name}", ACCELERATION, self.accelerations[name])
+        elif name in self.channels:
+            self._check_unit(f"channels.{name}", channel.quantity, self.channels[name])
+
+    def _check_unit(self, field: str, quantity: str, column: Column) -> None:
+        if column.unit is not None:
+            try:
+                unit_factor(quantity, column.unit)
+            except ValueError as error:
+                raise ValueError(f"{field}.unit: {error}") from error
+
+
+def load_mapping(path: Path, machine: Machine) -> Mapping:
+    """Load a mapping for a machine.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
+    """
+    try:
+        mapping = Mapping.model_validate(read_toml(path))
+    except ValidationError as error:
+        raise MachineFileError(validation_text(path, error)) from error
+    try:
+        mapping.check_against(machine)
+    except ValueError as error:
+        raise MachineFileError(f"{path}: {error}") from error
+    return mapping

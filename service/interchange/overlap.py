@@ -1,0 +1,156 @@
+"""Filters over pieces of any length: a stretch is cut into overlapping windows, so that memory stays flat.
+
+Each window has context before and after the rows whose result is kept. The beginning and the end of a stretch have
+none; there the result is not valid and is left out.
+"""
+
+from collections.abc import Iterator
+from fractions import Fraction
+from typing import Protocol
+
+import numpy as np
+from scipy.signal import resample_poly
+
+from models.signals.block import FloatArray
+from models.signals.integration import integrated, settling_s
+from service.interchange.samples import Piece, Signal
+
+__all__ = ["Integration", "Overlap", "Resampling", "WindowFilter"]
+
+_CORE_ROWS = 65536
+
+
+class WindowFilter(Protocol):
+    """What is computed in a window."""
+
+    multiple: int
+    """Windows begin at multiples of this many rows of a stretch."""
+    context: int
+    """Rows of context, before and after."""
+
+    def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Times and samples of the rows between the contexts.
+
+        Parameters
+        ----------
+        time_ns : ndarray, shape (context + n + context,)
+        samples : ndarray, shape (context + n + context, n_columns)
+        level : ndarray, shape (n_columns,)
+            The first row of the stretch.
+        """
+        ...
+
+
+class Overlap:
+    """Runs a filter over pieces; remembers what the next window needs.
+
+    Parameters
+    ----------
+    window_filter : WindowFilter
+    """
+
+    def __init__(self, window_filter: WindowFilter) -> None:
+        self._filter = window_filter
+        self._context = window_filter.context
+        self._core = -(-max(_CORE_ROWS, self._context) // window_filter.multiple) * window_filter.multiple
+        self._time_ns: list[FloatArray] = []
+        self._samples: list[FloatArray] = []
+        self._rows = 0
+        self._level = np.empty(0)
+        self._begins = False
+        self.cut_rows = 0
+
+    def feed(self, pieces: Iterator[Piece]) -> Iterator[Piece]:
+        """Filter a file's pieces, to the end."""
+        for piece in pieces:
+            if piece.begins:
+                yield from self._finish()
+                self._begins, self._level = True, piece.samples[0].copy()
+            self._time_ns.append(piece.time_ns)
+            self._samples.append(piece.samples)
+            self._rows += piece.time_ns.size
+            while self._rows >= self._core + 2 * self._context:
+                yield from self._window(self._core + 2 * self._context, self._core)
+        yield from self._finish()
+
+    def _finish(self) -> Iterator[Piece]:
+        """End of a stretch."""
+        if self._rows > 2 * self._context:
+            yield from self._window(self._rows, self._rows)
+            self.cut_rows += 2 * self._context
+        else:
+            self.cut_rows += self._rows
+        self._time_ns, self._samples, self._rows = [], [], 0
+
+    def _window(self, length: int, advance: int) -> Iterator[Piece]:
+        time_ns, samples = np.concatenate(self._time_ns), np.concatenate(self._samples)
+        result = self._filter(time_ns[:length], samples[:length], self._level)
+        if result[0].size:
+            yield Piece(self._begins, *result)
+            self._begins = False
+        self._time_ns, self._samples = [time_ns[advance:]], [samples[advance:]]
+        self._rows -= advance
+
+
+class Integration:
+    """Integrates the accelerometers among the columns; the others pass.
+
+    Parameters
+    ----------
+    signals : list of Signal
+    rate_hz, high_pass_hz : float
+    """
+
+    multiple = 1
+
+    def __init__(self, signals: list[Signal], rate_hz: float, high_pass_hz: float) -> None:
+        self._signals, self._rate_hz, self._high_pass_hz = signals, rate_hz, high_pass_hz
+        self.context = int(np.ceil(settling_s(high_pass_hz) * rate_hz))
+
+    def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:  # noqa: ARG002
+        """See `WindowFilter`."""
+        inner = slice(self.context, time_ns.size - self.context)
+        result = samples[inner].copy()
+        for number, signal in enumerate(self._signals):
+            if signal.integrations:
+                whole = integrated(samples[:, number], self._rate_hz, signal.integrations, self._high_pass_hz)
+                result[:, number] = whole[inner]
+        return time_ns[inner], result
+
+
+class Resampling:
+    """Changes the rate by a ratio of whole numbers (`scipy.signal.resample_poly`, its Kaiser window 5.0).
+
+    Angles go as cosine and sine.
+
+    Parameters
+    ----------
+    ratio : Fraction
+        New rate over old.
+    angles : list of int
+        Columns with angles.
+    """
+
+    def __init__(self, ratio: Fraction, angles: list[int]) -> None:
+        self._up, self._down, self._angles = ratio.numerator, ratio.denominator, angles
+        self.multiple = self._down
+        widest = max(self._up, self._down)
+        # resample_poly's filter reaches ten samples of the lower rate to either side.
+        reach = -(-10 * widest // self._up) + 1
+        self.context = -(-reach // self._down) * self._down
+
+    def __call__(self, time_ns: FloatArray, samples: FloatArray, level: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `WindowFilter`."""
+        up, down = self._up, self._down
+        plain = samples - level
+        circles = [part(samples[:, self._angles]) for part in (np.cos, np.sin)]
+        table = np.hstack([plain, *circles])
+        count = -(-(time_ns.size - 2 * self.context) * up // down)
+        first = self.context * up // down
+        resampled = np.asarray(resample_poly(table, up, down, axis=0, window=("kaiser", 5.0)))[first : first + count]
+        width = samples.shape[1]
+        result = resampled[:, :width] + level
+        cosine, sine = np.split(resampled[:, width:], 2, axis=1)
+        result[:, self._angles] = np.mod(np.arctan2(sine, cosine), 2 * np.pi)
+        at = self.context + np.arange(count) * (down / up)
+        return np.interp(at, np.arange(time_ns.size), time_ns), result

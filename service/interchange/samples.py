@@ -1,0 +1,282 @@
+"""Rows of a file as samples of the machine's channels, in pieces without a gap."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from models.machine import Machine
+from models.signals.block import FloatArray
+from models.signals.channels import Quantity
+from models.signals.units import ACCELERATION, same_unit, unit_factor
+from service.interchange.clock import Clock, check_order
+from service.interchange.mapping import Column, Mapping
+from service.interchange.source import Array, Reference, Source, SourceError, as_numbers
+
+__all__ = ["Gap", "Piece", "Read", "Signal", "pieces", "signals_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """How a column becomes a channel: sample = number · factor + offset, in the channel's unit.
+
+    Attributes
+    ----------
+    name : str
+        Channel of the machine.
+    reference : Reference
+        Where its numbers are.
+    factor, offset : float
+    integrations : int
+        How often it is integrated: 0, or 1 or 2 for an accelerometer.
+    is_angle : bool
+        Whether it runs in circles.
+    """
+
+    name: str
+    reference: Reference
+    factor: float
+    offset: float
+    integrations: int
+    is_angle: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Rows without a gap.
+
+    Attributes
+    ----------
+    begins : bool
+        Whether there is a gap before it, or nothing; otherwise it continues the last piece.
+    time_ns : ndarray, shape (n,)
+        Nanoseconds since the first row of the file.
+    samples : ndarray, shape (n, n_channels)
+        In the units of the channels.
+    """
+
+    begins: bool
+    time_ns: FloatArray
+    samples: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Time without rows, nanoseconds since the first row: from where the next row should have come to where it came."""
+
+    from_ns: float
+    to_ns: float
+    row: int
+
+
+@dataclass(slots=True)
+class Read:
+    """What was met on the way.
+
+    Attributes
+    ----------
+    rows : int
+        Rows of the file.
+    gaps : list of Gap
+    filled : int
+        Rows that were put into short gaps.
+    left_out : int
+        Rows left out for an empty cell, NaN or infinity.
+    """
+
+    rows: int = 0
+    gaps: list[Gap] = field(default_factory=list)
+    filled: int = 0
+    left_out: int = 0
+
+
+def signals_of(source: Source, mapping: Mapping, machine: Machine) -> list[Signal]:
+    """Columns of the machine's channels, in the order of the machine file; the keyphasor's channel is not among them.
+
+    Raises
+    ------
+    SourceError
+        If a column is missing, or its unit is missing, wrong or contradicts what the file says.
+    """
+    found = []
+    for channel in machine.sensors:
+        integrated = channel.name in mapping.accelerations
+        column = mapping.accelerations.get(channel.name) or mapping.channels.get(channel.name)
+        if column is None:
+            continue
+        reference = Reference(column.column, column.index)
+        quantity = ACCELERATION if integrated else channel.quantity
+        unit = _unit(source, reference, column, channel.name, quantity)
+        si = unit_factor(quantity, unit) / channel.to_si
+        found.append(
+            Signal(
+                channel.name,
+                reference,
+                column.sign * _scale(source, column) * si,
+                column.sign * column.offset * si,
+                (1 if channel.quantity is Quantity.VELOCITY else 2) if integrated else 0,
+                channel.quantity is Quantity.SHAFT_ANGLE,
+            )
+        )
+    return found
+
+
+def pieces(source: Source, signals: Sequence[Signal], clock: Clock, mapping: Mapping, read: Read) -> Iterator[Piece]:
+    """Read the file once, cut at its gaps.
+
+    Parameters
+    ----------
+    source : Source
+    signals : sequence of Signal
+    clock : Clock
+    mapping : Mapping
+    read : Read
+        Is kept up to date.
+
+    Raises
+    ------
+    SourceError
+        For times that do not ascend and cells that are no numbers, naming row and column.
+    """
+    splitter = _Splitter(clock, mapping, signals, read)
+    columns = [signal.reference for signal in signals]
+    asked = columns if clock.column is None else [clock.column, *columns]
+    for chunk in source.chunks(asked):
+        entries, numbers = (None, chunk) if clock.column is None else (chunk[0], chunk[1:])
+        samples = np.empty((numbers[0].size, len(signals)))
+        for number, signal in enumerate(signals):
+            values = as_numbers(source.path, signal.reference, numbers[number], read.rows)
+            samples[:, number] = values * signal.factor + signal.offset
+        yield from splitter.cut(entries, samples)
+
+
+class _Splitter:
+    """Cuts rows at gaps; remembers the last row."""
+
+    def __init__(self, clock: Clock, mapping: Mapping, signals: Sequence[Signal], read: Read) -> None:
+        self._clock, self._base, self._signals, self._read = clock, mapping.time, signals, read
+        self._step_ns = 1e9 / clock.rate_hz
+        self._angles = [number for number, signal in enumerate(signals) if signal.is_angle]
+        self._last: Piece | None = None
+
+    def cut(self, entries: Array | None, samples: FloatArray) -> Iterator[Piece]:
+        """Take the next rows of the file."""
+        first_row = self._read.rows
+        time_ns = self._clock.times(entries, first_row, samples.shape[0])
+        self._read.rows += samples.shape[0]
+        rows = np.arange(first_row, self._read.rows)
+        self._check_times(time_ns, entries, first_row)
+        finite = np.isfinite(samples).all(axis=1)
+        if not finite.all():
+            self._judge_missing(samples, first_row)
+            self._read.left_out += int(np.count_nonzero(~finite))
+            time_ns, samples, rows = time_ns[finite], samples[finite], rows[finite]
+        if not time_ns.size:
+            return
+        steps = self._steps(time_ns, rows)
+        cuts = np.flatnonzero(steps > 1)
+        for begin, end in zip([0, *cuts], [*cuts, time_ns.size], strict=True):
+            if begin == end:
+                continue
+            piece = Piece(False, time_ns[begin:end], samples[begin:end])
+            yield from self._joined(piece, int(steps[begin]), int(rows[begin]))
+
+    def _check_times(self, time_ns: FloatArray, entries: Array | None, first_row: int) -> None:
+        path, column = self._clock.path, self._clock.column
+        lost = np.flatnonzero(~np.isfinite(time_ns))
+        if lost.size and entries is not None:
+            at = int(lost[0])
+            raise SourceError(
+                f"{path}: row {first_row + at + 1}, column {column}: found {entries[at]}, expected a time"
+            )
+        check_order(path, column, time_ns, first_row)
+        if self._last is not None and time_ns.size:
+            check_order(path, column, np.array([self._last.time_ns[-1], time_ns[0]]), first_row - 1)
+
+    def _judge_missing(self, samples: FloatArray, first_row: int) -> None:
+        if self._base.not_finite == "gap":
+            return
+        row, number = (int(where) for where in np.argwhere(~np.isfinite(samples))[0])
+        raise SourceError(
+            f"{self._clock.path}: row {first_row + row + 1}, column {self._signals[number].reference}: found "
+            f'{samples[row, number]}, expected a finite number (time.not_finite = "gap" leaves such rows out)'
+        )
+
+    def _steps(self, time_ns: FloatArray, rows: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
+        """Sampling steps from the row before to each row: 1 where they are contiguous; 2 and more after a gap."""
+        before = self._last.time_ns[-1] if self._last is not None else time_ns[0] - self._step_ns
+        passed = np.diff(time_ns, prepend=before) / self._step_ns
+        steps = np.rint(passed).astype(np.int64)
+        odd = np.flatnonzero(np.abs(passed - 1) > self._base.jitter)
+        for at in odd[passed[odd] < 1.5]:
+            raise SourceError(
+                f"{self._clock.path}: row {int(rows[at]) + 1}, column {self._clock.column}: comes {passed[at]:.3g} "
+                f"sampling steps after the row before, expected 1 within {self._base.jitter:g} (time.jitter)"
+            )
+        return steps
+
+    def _joined(self, piece: Piece, steps: int, row: int) -> Iterator[Piece]:
+        """Put a piece behind the last one; short gaps are filled."""
+        last, self._last = self._last, piece
+        if last is None:
+            yield replace(piece, begins=True)
+        elif steps == 1:
+            yield piece
+        elif (steps - 1) * self._step_ns <= self._base.fill_gaps_up_to_s * 1e9:
+            self._read.filled += steps - 1
+            yield self._bridge(last, piece, steps)
+            yield piece
+        else:
+            self._read.gaps.append(Gap(last.time_ns[-1] + self._step_ns, piece.time_ns[0], row))
+            yield replace(piece, begins=True)
+
+    def _bridge(self, last: Piece, piece: Piece, steps: int) -> Piece:
+        """Straight lines across a gap; angles turn on at the speed they had."""
+        part = np.arange(1, steps)[:, None] / steps
+        change = piece.samples[0] - last.samples[-1]
+        for number in self._angles:
+            turn = 2 * np.pi
+            history = last.samples[-2:, number]
+            speed = (np.diff(history)[0] + np.pi) % turn - np.pi if history.size == 2 else 0.0
+            expected = speed * steps
+            change[number] = (change[number] - expected + np.pi) % turn - np.pi + expected
+        time_ns = last.time_ns[-1] + part[:, 0] * (piece.time_ns[0] - last.time_ns[-1])
+        return Piece(False, time_ns, last.samples[-1] + part * change)
+
+
+def _unit(source: Source, reference: Reference, column: Column, name: str, quantity: str) -> str:
+    """Unit of a column; what the mapping says must not contradict what the file says."""
+    stated = source.unit(reference) if reference.column in source.names() else ""
+    if column.unit is None:
+        if not stated:
+            raise SourceError(
+                f"{source.path}: column {reference}: the file states no unit for channel {name}; give unit in the "
+                "mapping"
+            )
+        try:
+            unit_factor(quantity, stated)
+        except ValueError as error:
+            raise SourceError(f"{source.path}: column {reference}, channel {name}: {error}") from error
+        return stated
+    raw = column.scale == 1 and column.scale_from is None
+    if stated and raw and not same_unit(quantity, column.unit, stated):
+        raise SourceError(
+            f"{source.path}: column {reference} is in {stated!r} according to the file, but in {column.unit!r} "
+            f"according to the mapping of channel {name}"
+        )
+    return column.unit
+
+
+def _scale(source: Source, column: Column) -> float:
+    """Scale of a column; an array of scales is entered at the column's index."""
+    if column.scale_from is None:
+        return column.scale
+    scales = np.ravel(source.values(column.scale_from)).astype(np.float64)
+    place = 0 if scales.size == 1 else column.index
+    if place is None or place >= scales.size or not np.isfinite(scales[place]) or scales[place] == 0:
+        raise SourceError(
+            f"{source.path}: scale_from {column.scale_from} has {scales.size} scales, expected one, or one other "
+            f"than 0 for index {column.index}"
+        )
+    return column.scale * float(scales[place])

@@ -1,0 +1,169 @@
+"""What an importer asks of a file. A new format is one module with one class that does this.
+
+A source hands out columns as the file has them, in pieces, and what the file itself says of time and units. It checks
+nothing: units, times and numbers are judged in one place for all formats.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from models.errors import MachineFileError
+
+__all__ = [
+    "CHUNK_ROWS",
+    "Array",
+    "Reference",
+    "Source",
+    "SourceError",
+    "Timing",
+    "as_numbers",
+    "named",
+    "readable",
+]
+
+CHUNK_ROWS = 65536
+"""Rows that are read at a time."""
+
+Array = npt.NDArray[Any]
+
+
+class SourceError(MachineFileError):
+    """A file from another program cannot be imported; the message names file, column and, where there is one, row."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """A column of a file.
+
+    Attributes
+    ----------
+    column : str
+        Name of the column, array, channel or data set.
+    index : int or None
+        Which column of an array with two dimensions, counted from 0; samples run along its longer side.
+    """
+
+    column: str
+    index: int | None = None
+
+    def __str__(self) -> str:
+        return self.column if self.index is None else f"{self.column}[{self.index}]"
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """What a file says about the time of its rows.
+
+    Attributes
+    ----------
+    rate_hz : float or None
+        Samples per second.
+    start_ns : int or None
+        Time of the first row (or of time 0 in `time`), nanoseconds since 1970-01-01 UTC.
+    time : Reference or None
+        The column with the time of each row, in seconds from `start_ns`, where the format has one by itself.
+    """
+
+    rate_hz: float | None = None
+    start_ns: int | None = None
+    time: Reference | None = None
+
+
+class Source(Protocol):
+    """An open file of columns; a context manager."""
+
+    path: Path
+
+    def names(self) -> tuple[str, ...]:
+        """Columns that there are."""
+        ...
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:
+        """What the file says of the time of these columns; raises `SourceError` if they contradict each other."""
+        ...
+
+    def unit(self, column: Reference) -> str:
+        """Unit that the file states for a column, or an empty string."""
+        ...
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Go through the rows from the first one on; may be asked again.
+
+        Yields
+        ------
+        tuple of ndarray, shape (n_rows,)
+            One per column and of the same length, numbers or datetime64 as the file has them.
+        """
+        ...
+
+    def values(self, column: str) -> Array:
+        """Read an array that is no column of samples, such as scales or times of pulses, as the file has it."""
+        ...
+
+    def close(self) -> None:
+        """Close the file."""
+        ...
+
+    def __enter__(self) -> "Source": ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+
+def named(path: Path, name: str, names: Sequence[str], what: str = "column") -> str:
+    """Return `name` if it is one of `names`.
+
+    Raises
+    ------
+    SourceError
+        Naming those that there are.
+    """
+    if name not in names:
+        there = ", ".join(names[:40]) + (f" and {len(names) - 40} more" if len(names) > 40 else "")
+        raise SourceError(f"{path}: no {what} {name!r}; there are {there or 'none'}")
+    return name
+
+
+@contextmanager
+def readable(path: Path, kind: str, package: str = "") -> Iterator[None]:
+    """Say clearly that a file is damaged or not of this kind, or which package reads it.
+
+    Raises
+    ------
+    SourceError
+        For whatever a format's library raises on a bad file: most of them know no errors of their own.
+    """
+    try:
+        yield
+    except MachineFileError:
+        raise
+    except ModuleNotFoundError as error:
+        raise SourceError(
+            f"{path}: reading {kind} files needs the package {package}: pip install 'rotorwatch[io]'"
+        ) from error
+    except FileNotFoundError as error:
+        raise SourceError(f"{path}: no such file") from error
+    except OSError as error:
+        raise SourceError(f"{path}: cannot be read as a {kind} file ({error.strerror or error})") from error
+    except Exception as error:
+        raise SourceError(f"{path}: not a {kind} file, or damaged: {str(error) or type(error).__name__}") from error
+
+
+def as_numbers(path: Path, reference: Reference, column: Array, first_row: int) -> npt.NDArray[np.float64]:
+    """Samples of a column as float64.
+
+    Raises
+    ------
+    SourceError
+        If they are no numbers.
+    """
+    if column.dtype.kind not in "fiub":
+        raise SourceError(
+            f"{path}: column {reference} from row {first_row + 1} on holds {column.dtype}, expected real numbers"
+        )
+    return np.asarray(column, dtype=np.float64)

@@ -1,0 +1,110 @@
+"""What an import did, in sentences."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+from models.signals.integration import lowest_valid_hz, settling_s
+from service.interchange.importing import Imported
+from service.interchange.samples import Gap
+
+__all__ = ["summary_lines"]
+
+_LISTED = 10
+
+
+def summary_lines(done: Imported) -> list[str]:
+    """Describe an import; every gap, filled row, cut end and limit of validity is stated."""
+    machine, read, written = done.machine, done.read, done.written
+    lines = [
+        f"{done.source}: {read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
+        f"{len(machine.sensors)} channels of {machine.site}/{machine.name}",
+        f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {_when(written.start_ns)} to "
+        f"{_when(written.end_ns)}",
+        *_gap_lines(done),
+        *_filter_lines(done),
+        *_pulse_lines(done),
+    ]
+    if read.left_out:
+        lines.append(f"rows left out for an empty cell, NaN or infinity: {read.left_out}")
+    if written.too_short:
+        lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
+    length_s = written.samples / machine.rate_hz
+    if length_s < machine.window.length_s:
+        lines.append(
+            f"note: {length_s:.6g} s of data do not fill one window of {machine.window.length_s:g} s; reports will be "
+            "few or none"
+        )
+    return lines
+
+
+def _gap_lines(done: Imported) -> list[str]:
+    gaps = done.read.gaps
+    total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
+    lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
+    lines += [f"  {_gap_text(done, gap)}" for gap in gaps[:_LISTED]]
+    if len(gaps) > _LISTED:
+        lines.append(f"  and {len(gaps) - _LISTED} more")
+    if done.read.filled:
+        lines.append(
+            f"rows put into gaps of up to {done.mapping.time.fill_gaps_up_to_s:g} s by straight lines: "
+            f"{done.read.filled}"
+        )
+    return lines
+
+
+def _gap_text(done: Imported, gap: Gap) -> str:
+    begin = _when(done.clock.origin_ns + round(gap.from_ns))
+    return f"before row {gap.row + 1}: {(gap.to_ns - gap.from_ns) / 1e9:.6g} s from {begin}"
+
+
+def _filter_lines(done: Imported) -> list[str]:
+    lines = []
+    acceleration, machine = done.mapping.acceleration, done.machine
+    if acceleration is not None:
+        corner_hz = acceleration.high_pass_hz
+        lowest_hz = lowest_valid_hz(corner_hz)
+        lines.append(
+            f"integrated from acceleration: {', '.join(acceleration.channels)}; high-pass at {corner_hz:g} Hz, valid "
+            f"from {lowest_hz:g} Hz, not below; the first and last {settling_s(corner_hz):.6g} s of each stretch are "
+            "left out"
+        )
+        if lowest_hz > machine.window.band_hz[0]:
+            lines.append(
+                f"note: the machine file evaluates from window.band_hz = {machine.window.band_hz[0]:g} Hz on, which is "
+                f"below {lowest_hz:g} Hz"
+            )
+    if done.clock.ratio != 1:
+        ratio = done.clock.ratio
+        lowest_rate_hz = min(machine.rate_hz, done.clock.rate_hz)
+        lines.append(
+            f"resampled from {done.clock.rate_hz:.9g} to {machine.rate_hz:.9g} Hz by {ratio.numerator}/"
+            f"{ratio.denominator} (polyphase); flat up to {0.42 * lowest_rate_hz:.4g} Hz"
+        )
+    if done.cut_rows:
+        lines.append(f"rows left out at the ends of stretches, where filters settle: {done.cut_rows}")
+    return lines
+
+
+def _pulse_lines(done: Imported) -> list[str]:
+    train = done.pulses
+    if train is None:
+        return []
+    passed_ns = float(np.diff(train.times)[train.known].sum())
+    turns = float(np.diff(train.counts)[train.known].sum()) / train.pulses_per_turn
+    speed_rpm = turns / passed_ns * 60e9 if turns else float("nan")
+    lines = [
+        f"keyphasor: {train.times.size} pulses, {speed_rpm:.6g} rpm on average, {train.missing} missing ones bridged, "
+        f"{train.extra} extra ones left out, {train.interruptions} interruptions"
+    ]
+    if done.unknown_angle:
+        lines.append(f"rows left out because the shaft angle is not known: {done.unknown_angle}")
+    nominal_rpm = done.machine.operation.speed_rpm
+    if abs(speed_rpm / nominal_rpm - 1) > done.machine.operation.speed_tolerance:
+        lines.append(f"note: the machine file says speed_rpm = {nominal_rpm:g}; at this speed nothing is evaluated")
+    return lines
+
+
+def _when(time_ns: int) -> str:
+    whole = datetime.fromtimestamp(time_ns // 1_000_000_000, UTC)
+    return f"{whole:%Y-%m-%dT%H:%M:%S}.{time_ns % 1_000_000_000 // 1000:06d}Z"

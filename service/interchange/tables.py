@@ -1,0 +1,210 @@
+"""Sources that hold tables: CSV and Parquet, read piece by piece through Arrow."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv
+import pyarrow.parquet
+
+from service.interchange.mapping import CsvFormat
+from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+
+__all__ = ["CsvSource", "ParquetSource"]
+
+_BYTES = 4 << 20
+
+
+class _Table:
+    """What the two tables have in common."""
+
+    path: Path
+
+    def __init__(self, path: Path, names: Sequence[str]) -> None:
+        self.path = path
+        self._names = tuple(names)
+
+    def names(self) -> tuple[str, ...]:
+        """Names of the columns."""
+        return self._names
+
+    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
+        """Nothing: a table's time is a column that the mapping names."""
+        return Timing()
+
+    def close(self) -> None:
+        """Nothing stays open."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _checked(self, columns: Sequence[Reference]) -> list[str]:
+        for reference in columns:
+            named(self.path, reference.column, self._names)
+            if reference.index is not None:
+                raise SourceError(f"{self.path}: column {reference}: index is for tables within .npz and .mat files")
+            if self._names.count(reference.column) > 1:
+                raise SourceError(f"{self.path}: there are several columns named {reference.column!r}")
+        return [reference.column for reference in columns]
+
+
+class CsvSource(_Table):
+    """A text table. Columns without a header are named ``1``, ``2`` and so on.
+
+    Parameters
+    ----------
+    path : Path
+    form : CsvFormat
+        Delimiter, decimal sign and which lines to leave out.
+    times : frozenset of str
+        Columns with ISO 8601 times instead of numbers.
+
+    Raises
+    ------
+    SourceError
+        If the first lines are no table.
+    """
+
+    def __init__(self, path: Path, form: CsvFormat, times: frozenset[str]) -> None:
+        self._form, self._times = form, times
+        with readable(path, "CSV"), self._reader(path, None) as reader:
+            names = list(reader.schema.names)
+        if not form.header:
+            names = [str(number + 1) for number in range(len(names))]
+        super().__init__(path, [name.strip() for name in names])
+
+    def unit(self, column: Reference) -> str:
+        """Unit in brackets at the end of a column's name, as in ``y1 [um]``."""
+        name = column.column
+        return name[name.rindex("[") + 1 : -1].strip() if name.endswith("]") and "[" in name else ""
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, some megabytes of text at a time."""
+        wanted = self._checked(columns)
+        count = 0
+        with readable(self.path, "CSV"):
+            try:
+                with self._reader(self.path, wanted) as reader:
+                    for batch in reader:
+                        count += batch.num_rows
+                        yield tuple(_array(batch.column(self._label(name))) for name in wanted)
+            except pa.ArrowInvalid as error:
+                raise SourceError(self._fault(wanted) or f"{self.path}: after row {count}: {error}") from error
+
+    def values(self, column: str) -> Array:
+        """Read a column that may be shorter than the others; empty cells are left out."""
+        pieces = [piece for (piece,) in self.chunks([Reference(column)])]
+        joined = np.concatenate(pieces) if pieces else np.empty(0)
+        return np.asarray(joined[~np.isnan(joined)])
+
+    def _reader(self, path: Path, wanted: list[str] | None, *, as_text: bool = False) -> Any:
+        form = self._form
+        types: dict[str, Any] = {}
+        for name in wanted or ():
+            time = pa.timestamp("ns", tz="UTC") if name in self._times else pa.float64()
+            types[self._label(name)] = pa.string() if as_text else time
+        return pa.csv.open_csv(
+            path,
+            pa.csv.ReadOptions(
+                use_threads=False,
+                block_size=_BYTES,
+                skip_rows=form.skip_lines,
+                skip_rows_after_names=form.skip_lines_after_header,
+                autogenerate_column_names=not form.header,
+                encoding=form.encoding,
+            ),
+            pa.csv.ParseOptions(delimiter=form.delimiter),
+            pa.csv.ConvertOptions(
+                column_types=types,
+                include_columns=list(types) or None,
+                decimal_point=form.decimal,
+                null_values=["", "NaN", "nan", "NA", "N/A", "null"],
+                strings_can_be_null=as_text,
+            ),
+        )
+
+    def _label(self, name: str) -> str:
+        """Arrow's own name of a column."""
+        return name if self._form.header else f"f{int(name) - 1}"
+
+    def _fault(self, wanted: list[str]) -> str:
+        """Find the cell that is no number."""
+        row = 0
+        with self._reader(self.path, wanted, as_text=True) as reader:
+            try:
+                for batch in reader:
+                    for name in wanted:
+                        for offset, cell in enumerate(batch.column(self._label(name)).to_pylist()):
+                            if cell is not None and not self._is_value(name, cell):
+                                what = "an ISO 8601 time" if name in self._times else "a number"
+                                return (
+                                    f"{self.path}: row {row + offset + 1}, column {name!r}: found {cell!r}, "
+                                    f"expected {what}"
+                                )
+                    row += batch.num_rows
+            except pa.ArrowInvalid as error:
+                return f"{self.path}: after row {row}: {error}"
+        return ""
+
+    def _is_value(self, name: str, cell: str) -> bool:
+        try:
+            if name in self._times:
+                pa.scalar(cell).cast(pa.timestamp("ns", tz="UTC"))
+            else:
+                float(cell.strip().replace(self._form.decimal, "."))
+        except (ValueError, pa.ArrowInvalid):
+            return False
+        return True
+
+
+class ParquetSource(_Table):
+    """A Parquet file, read row group by row group.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    SourceError
+        If it is not one.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with readable(path, "Parquet"), pa.parquet.ParquetFile(path) as file:
+            self._schema = file.schema_arrow
+        super().__init__(path, self._schema.names)
+
+    def unit(self, column: Reference) -> str:
+        """Field metadata ``unit``, or ``units``."""
+        metadata = self._schema.field(column.column).metadata or {}
+        return (metadata.get(b"unit") or metadata.get(b"units") or b"").decode(errors="replace")
+
+    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
+        """Rows, `CHUNK_ROWS` at a time."""
+        wanted = self._checked(columns)
+        for name in wanted:
+            kind = self._schema.field(name).type
+            if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_timestamp(kind)):
+                raise SourceError(f"{self.path}: column {name!r} holds {kind}, expected numbers")
+        with readable(self.path, "Parquet"), pa.parquet.ParquetFile(self.path) as file:
+            for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
+                yield tuple(_array(batch.column(name)) for name in wanted)
+
+    def values(self, column: str) -> Array:
+        """Read a column whole; missing values are left out."""
+        pieces = [piece for (piece,) in self.chunks([Reference(column)])]
+        joined = np.concatenate(pieces) if pieces else np.empty(0)
+        return np.asarray(joined[~np.isnan(joined)])
+
+
+def _array(column: Any) -> Array:
+    """An Arrow column as numpy's: nan where a number is missing, NaT where a time is."""
+    if pa.types.is_timestamp(column.type):
+        return np.asarray(column.cast(pa.timestamp("ns")).to_numpy(zero_copy_only=False))
+    return np.asarray(column.to_numpy(zero_copy_only=False))
