@@ -1,12 +1,12 @@
 """What ``rotortrain train`` does: simulate, train, calibrate, write a bundle."""
 
 import platform
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress, TaskID
@@ -21,7 +21,8 @@ from models.diagnosis.networks.relation import EquationNetwork
 from models.diagnosis.networks.relation_training import calibrate, train_network
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
-from simulator.campaigns.draws import Draw, Purpose, draw_condition, windows, with_tilt
+from models.physics.parameters import PARAMETERS
+from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
 from simulator.campaigns.feature_draws import FeatureDraws, batches
 from simulator.campaigns.progress import bars
 from simulator.campaigns.spectral_draws import LOG_RATIO
@@ -29,6 +30,9 @@ from simulator.campaigns.spectral_draws import LOG_RATIO
 __all__ = ["train_bundle"]
 
 _CONDITIONS_PER_BATCH = 480
+_CALIBRATION_SHARE = 3
+"""Windows of either layout that calibrate the amortised networks, per training window of a relation network."""
+_CALIBRATION_STREAM = 20
 
 
 def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
@@ -53,7 +57,6 @@ def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, 
     """
     machine = load_machine(name)
     networks: list[EquationNetwork] = []
-    held_out: list[tuple[WindowStatistics, dict[str, float]]] = []
     with bars(remaining=True) as bar:
         for stream, equation in enumerate(EQUATIONS):
             # Tilt is simulated where it is not measured: the same bundle serves the machine once it has tilt probes.
@@ -74,17 +77,15 @@ def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, 
             fitting = bar.add_task(f"{label}: training", total=1.0)
             trained = train_network(equation, training, rig, seed, partial(_complete, bar, fitting))
             networks.append(calibrate(trained, calibration, rig))
-            drawn = Draw(rig, seed, Purpose.CALIBRATION, stream, equation.kept_nominal)
-            held_out += [(_slim(window), _changes(drawn, number)) for number, window in enumerate(calibration)]
         amortised = None
-        if not held_out or "theta" not in machine.descriptor.states:
+        if not networks or "theta" not in machine.descriptor.states:
             # Without a phase reference the rotation's line stays in the spectra, which the drawn ones do not have.
             bar.console.print(
                 "amortised networks: left out: they need a phase reference (theta) and a measured equation"
             )
         else:
             amortised = _train_amortised(machine, n_draws, seed, processes, bar)
-            amortised = calibrate_networks(machine, amortised, held_out)
+            amortised = _calibrate_amortised(machine, amortised, n_windows, seed, processes, bar)
     versions = {name: version(name) for name in ("rotorwatch", "numpy", "torch")} | {
         "python": platform.python_version()
     }
@@ -92,6 +93,7 @@ def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, 
         seed=seed,
         training_windows=n_windows,
         calibration_windows=n_windows // 2,
+        network_calibration_windows=_CALIBRATION_SHARE * n_windows * len(Layout),
         drawn_conditions=n_draws,
         versions=versions,
     )
@@ -127,6 +129,33 @@ def _train_amortised(machine: Machine, n_draws: int, seed: int, processes: int, 
     )
 
 
+def _calibrate_amortised(
+    machine: Machine, amortised: AmortisedNetworks, n_windows: int, seed: int, processes: int, bar: Progress
+) -> AmortisedNetworks:
+    """Calibrate on simulated windows of either layout, half of them healthy, half with everything changed."""
+    count = _CALIBRATION_SHARE * n_windows
+    task = bar.add_task("amortised: calibrating", total=count * len(Layout))
+    draws = [
+        [
+            Draw(machine, seed, Purpose.CALIBRATION, _CALIBRATION_STREAM + 2 * layout + varied, kept, layout=layout)
+            for varied, kept in enumerate((PARAMETERS, ()))
+        ]
+        for layout in Layout
+    ]
+    groups = [
+        chain.from_iterable(_held_out(draw, count // 2, processes, partial(bar.advance, task)) for draw in pair)
+        for pair in draws
+    ]
+    return calibrate_networks(machine, amortised, groups)
+
+
+def _held_out(
+    draw: Draw, count: int, processes: int, progress: Callable[[int], None]
+) -> Iterator[tuple[WindowStatistics, dict[str, float]]]:
+    for number, window in enumerate(windows(draw, range(count), processes, progress)):
+        yield window, _changes(draw, number)
+
+
 def _changes(draw: Draw, number: int) -> dict[str, float]:
     """True relative changes of a drawn window."""
     events = draw_condition(draw, number).events
@@ -135,12 +164,6 @@ def _changes(draw: Draw, number: int) -> dict[str, float]:
         for event in events
         if event.parameter is not None and event.relative_change is not None
     }
-
-
-def _slim(window: WindowStatistics) -> WindowStatistics:
-    """The window without its correlations by hop, which the amortised networks do not look at: hundreds are kept."""
-    nothing = np.empty(0)
-    return replace(window, hop_correlation=nothing, correlation=nothing)
 
 
 def _complete(bar: Progress, task: TaskID, done: float) -> None:

@@ -205,7 +205,7 @@ def test_tilt_sensors_beside_the_trained_ones_do_no_harm() -> None:
 
 
 def test_calibration_finds_the_true_size_of_the_errors() -> None:
-    held_out = [(window("", number, layout), dict[str, float]()) for number in range(8) for layout in Layout]
+    held_out = [[(window("", number, layout), dict[str, float]()) for number in range(8)] for layout in Layout]
     calibrated = calibrate_networks(LAB, replace(shipped(), calibration={}), held_out)
     assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
     assert all(0.3 < scale < 4 for one in calibrated.calibration.values() for scale in one.z_scale)

@@ -10,6 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from scipy.special import ndtri
 
 from models.diagnosis.networks.amortised import (
     LAYERS,
@@ -41,6 +42,9 @@ _USUAL = 0.3
 """Standard deviation of the drawn logarithmic ratios, about: the networks work in units of it."""
 _NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
 _KNOTS = 3
+_QUANTILES = (0.9, 0.95, 0.98)
+_FEWEST = 30
+"""Windows of one group from which a quantile is believed."""
 
 
 class _Learner:
@@ -196,7 +200,9 @@ class _Buffer:
 
 
 def calibrate_networks(
-    machine: Machine, trained: AmortisedNetworks, windows: Sequence[tuple[WindowStatistics, dict[str, float]]]
+    machine: Machine,
+    trained: AmortisedNetworks,
+    groups: Sequence[Iterable[tuple[WindowStatistics, dict[str, float]]]],
 ) -> AmortisedNetworks:
     """Measure bias and true size of the standard errors on windows simulated in time.
 
@@ -204,44 +210,57 @@ def calibrate_networks(
     ----------
     machine : Machine
     trained : AmortisedNetworks
-    windows : sequence of (WindowStatistics, relative changes)
-        From seeds of their own, in all layouts; parameters that are not named are nominal.
+    groups : sequence of iterables of (WindowStatistics, relative changes)
+        From seeds of their own, one group for every layout of the sources: no window says which one it is of, so the
+        group that needs the larger standard errors decides. Parameters that are not named are nominal.
     """
     reader = NetworkDiagnostician(machine, trained)
-    found: dict[str, list[tuple[float, float]]] = {}
-    for window, changes in windows:
-        inputs = reader.inputs(window)
-        if inputs is None:
-            continue
-        for network in trained.networks:
-            n_inputs = network.direct.shape[0]
-            if inputs.shape[1] < n_inputs:
+    found: dict[str, list[FloatArray]] = {}
+    for windows in groups:
+        errors: dict[str, list[tuple[float, float]]] = {}
+        for window, changes in windows:
+            inputs = reader.inputs(window)
+            if inputs is None:
                 continue
-            mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
-            deviation = np.sqrt(np.einsum("ij,ij->i", factor[0], factor[0]))
-            for position, name in enumerate(OWN[network.equation]):
-                error = float(mean[0, position] - np.log1p(changes.get(name, 0.0)))
-                found.setdefault(name, []).append((error, float(deviation[position])))
-    calibration = {name: _calibration(np.array(pairs)) for name, pairs in found.items()}
+            for network in trained.networks:
+                n_inputs = network.direct.shape[0]
+                if inputs.shape[1] < n_inputs:
+                    continue
+                mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
+                deviation = np.sqrt(np.einsum("ij,ij->i", factor[0], factor[0]))
+                for position, name in enumerate(OWN[network.equation]):
+                    error = float(mean[0, position] - np.log1p(changes.get(name, 0.0)))
+                    errors.setdefault(name, []).append((error, float(deviation[position])))
+        for name, pairs in errors.items():
+            found.setdefault(name, []).append(np.array(pairs))
+    calibration = {name: _calibration(pairs) for name, pairs in found.items()}
     return AmortisedNetworks(
         trained.states, trained.basis, trained.networks, calibration, trained.novelty_limit, trained.log_range
     )
 
 
-def _calibration(pairs: FloatArray) -> Calibration:
+def _calibration(groups: list[FloatArray]) -> Calibration:
     """Bias and scale of z in thirds of the stated standard error: what is easy to see and what is hard differ."""
+    pairs = np.concatenate(groups)
     error, deviation = pairs[:, 0], pairs[:, 1]
     # Weighted median: windows that see the parameter well decide.
     order, weight = np.argsort(error), 1 / deviation**2
     cumulated = np.cumsum(weight[order])
     bias = float(error[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
-    z = np.abs(error - bias) / deviation
     knots, scales = [], []
-    for part in np.array_split(np.argsort(deviation), _KNOTS):
-        knots.append(float(np.median(np.log(deviation[part]))))
-        # Two quantiles scatter less than one.
-        scales.append(float(np.mean(np.quantile(z[part], [0.9, 0.95]) / [1.644854, 1.959964])))
+    edges = np.quantile(deviation, np.linspace(0, 1, _KNOTS + 1))
+    for low, high in pairwise(edges):
+        parts = [part[(part[:, 1] >= low) & (part[:, 1] <= high)] for part in groups]
+        fewest = min(_FEWEST, max(len(part) for part in parts))
+        knots.append(float(np.median(np.log(np.concatenate(parts)[:, 1]))))
+        scales.append(max(_scale(part, bias) for part in parts if len(part) >= fewest))
     return Calibration(bias, tuple(knots), tuple(scales))
+
+
+def _scale(pairs: FloatArray, bias: float) -> float:
+    """Quantiles of |z| over the normal distribution's: several scatter less than one, and see the tail."""
+    z = np.abs(pairs[:, 0] - bias) / pairs[:, 1]
+    return float(np.mean(np.quantile(z, _QUANTILES) / ndtri((1 + np.array(_QUANTILES)) / 2)))
 
 
 def _array(part: torch.Tensor) -> Float32Array:

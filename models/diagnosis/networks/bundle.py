@@ -97,6 +97,7 @@ class Training(BaseModel):
     seed: int
     training_windows: int
     calibration_windows: int
+    network_calibration_windows: int = Field(default=0, description="the same for the amortised networks")
     drawn_conditions: int = Field(default=0, description="random machines and conditions of the amortised networks")
     versions: dict[str, str]
 
@@ -305,7 +306,7 @@ def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> Amorti
                 name: {"bias": one.bias, "log_deviation": one.log_deviation, "z_scale": one.z_scale}
                 for name, one in amortised.calibration.items()
             },
-            "calibration_windows": training.calibration_windows,
+            "calibration_windows": training.network_calibration_windows or training.calibration_windows,
             "novelty_limit": amortised.novelty_limit,
             "log_range": amortised.log_range,
         }
