@@ -1,35 +1,29 @@
-"""The HTTP API over what the service knows; read only. ``docs/api.md`` lists the routes."""
+"""The HTTP API over what the service knows; ``docs/api.md`` lists the routes. All but the replays is read only."""
 
-from collections.abc import Awaitable, Callable, Sequence
-from http import HTTPStatus
-from typing import Annotated, Any, Protocol
+from collections.abc import Sequence
+from typing import Annotated, Protocol
 
-from fastapi import FastAPI, HTTPException, Query, Request, Response
-from fastapi.exceptions import RequestValidationError
+from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
-from starlette.exceptions import HTTPException as StarletteHTTPException
-from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 
-from service.logs import logger
 from service.page import front_page
+from service.problems import add_problems, problem_answer, responses
+from service.recordings_api import RecordingIndex, add_recording_routes
+from service.replays_api import ReplayDesk, add_replay_routes
 from service.schemas import (
     AlarmCloudEvent,
     AlarmStates,
     DetectableChanges,
     Health,
     MachineDescription,
-    Problem,
     Readiness,
     Report,
-    example,
 )
 
 __all__ = ["AlarmEventList", "Alive", "MachineList", "MachineView", "ReportList", "ServiceView", "create_app"]
 
-_PROBLEM = "application/problem+json"
 _JSON = ConfigDict(extra="forbid", frozen=True)
-_log = logger(part="api")
 _CURSOR = "pass it as until_ns to get what is older; null if nothing older is kept"
 
 
@@ -66,6 +60,14 @@ class ServiceView(Protocol):
 
     def readiness(self) -> Readiness:
         """Whether the service can do its work."""
+
+    @property
+    def catalogue(self) -> RecordingIndex | None:
+        """Recordings, or None if no directory for them is set."""
+
+    @property
+    def replays(self) -> ReplayDesk:
+        """Where replays are started."""
 
 
 class MachineList(BaseModel):
@@ -120,35 +122,37 @@ def create_app(service: ServiceView) -> FastAPI:
     """
     app = FastAPI(
         title="rotorwatch",
-        description="Health of rotating machines: which parameter changed, by how much, how sure. Read only. "
-        "Errors are problem details (RFC 9457).",
+        description="Health of rotating machines: which parameter changed, by how much, how sure. Read only, "
+        "but for replays of recordings, which are kept apart from what is live. Errors are problem details (RFC 9457).",
         docs_url=None,  # the usual pages load their scripts from elsewhere
         redoc_url=None,
     )
-    _add_problems(app)
+    add_problems(app)
     _add_machine_routes(app, service)
     _add_history_routes(app, service)
+    add_recording_routes(app, service.catalogue)
+    add_replay_routes(app, service.replays)
     _add_service_routes(app, service)
     return app
 
 
 def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
-    @app.get("/api/v1/machines", tags=["machines"], responses=_responses(MachineList))
+    @app.get("/api/v1/machines", tags=["machines"], responses=responses(MachineList))
     def machines() -> MachineList:
         """Every monitored machine with its state."""
         return MachineList(machines=tuple(machine.description() for machine in service.machines()))
 
-    @app.get("/api/v1/machines/{site}/{machine}", tags=["machines"], responses=_responses(MachineDescription, 404, 422))
+    @app.get("/api/v1/machines/{site}/{machine}", tags=["machines"], responses=responses(MachineDescription, 404, 422))
     def machine(site: str, machine: str) -> MachineDescription:
         """One machine: stream, channels, keys, state."""
         return _find(service, site, machine).description()
 
-    @app.get("/api/v1/machines/{site}/{machine}/health", tags=["machines"], responses=_responses(Health, 404, 422))
+    @app.get("/api/v1/machines/{site}/{machine}/health", tags=["machines"], responses=responses(Health, 404, 422))
     def health(site: str, machine: str) -> Health:
         """Where a machine stands: state, parameters with intervals, equations, alarms, quality of the data."""
         return _find(service, site, machine).health()
 
-    @app.get("/api/v1/machines/{site}/{machine}/alarms", tags=["machines"], responses=_responses(AlarmStates, 404, 422))
+    @app.get("/api/v1/machines/{site}/{machine}/alarms", tags=["machines"], responses=responses(AlarmStates, 404, 422))
     def alarms(
         site: str,
         machine: str,
@@ -160,7 +164,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
     @app.get(
         "/api/v1/machines/{site}/{machine}/detectable",
         tags=["machines"],
-        responses=_responses(DetectableChanges, 404, 422),
+        responses=responses(DetectableChanges, 404, 422),
     )
     def detectable(site: str, machine: str, change: _Change = None) -> DetectableChanges:
         """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
@@ -168,7 +172,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
 
 
 def _add_history_routes(app: FastAPI, service: ServiceView) -> None:
-    @app.get("/api/v1/machines/{site}/{machine}/reports", tags=["history"], responses=_responses(ReportList, 404, 422))
+    @app.get("/api/v1/machines/{site}/{machine}/reports", tags=["history"], responses=responses(ReportList, 404, 422))
     def reports(
         site: str, machine: str, since_ns: _SinceNs = None, until_ns: _UntilNs = None, limit: _Limit = 100
     ) -> ReportList:
@@ -179,7 +183,7 @@ def _add_history_routes(app: FastAPI, service: ServiceView) -> None:
     @app.get(
         "/api/v1/machines/{site}/{machine}/alarms/events",
         tags=["history"],
-        responses=_responses(AlarmEventList, 404, 422),
+        responses=responses(AlarmEventList, 404, 422),
     )
     def alarm_events(
         site: str, machine: str, since_ns: _SinceNs = None, until_ns: _UntilNs = None, limit: _Limit = 100
@@ -190,18 +194,18 @@ def _add_history_routes(app: FastAPI, service: ServiceView) -> None:
 
 
 def _add_service_routes(app: FastAPI, service: ServiceView) -> None:
-    @app.get("/healthz", tags=["service"], responses=_responses(Alive))
+    @app.get("/healthz", tags=["service"], responses=responses(Alive))
     def healthz() -> Alive:
         """Whether the process answers."""
         return Alive(alive=True)
 
-    @app.get("/readyz", tags=["service"], responses=_responses(Readiness, 503), response_model=Readiness)
+    @app.get("/readyz", tags=["service"], responses=responses(Readiness, 503), response_model=Readiness)
     def readyz(request: Request) -> Readiness | JSONResponse:
         """Whether the session is open and every worker runs; a machine without data is listed, not counted."""
         readiness = service.readiness()
         if readiness.ready:
             return readiness
-        return _problem(
+        return problem_answer(
             request, 503, "the session is closed or a worker has stopped", readiness.model_dump(mode="json")
         )
 
@@ -217,57 +221,3 @@ def _find(service: ServiceView, site: str, name: str) -> MachineView:
         known = ", ".join(f"{d.site}/{d.machine}" for d in (view.description() for view in service.machines()))
         raise HTTPException(404, f"no machine {site}/{name}; there are: {known}")
     return machine
-
-
-def _responses(model: type[BaseModel], *problems: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries: an example of the answer, and the problems a request may meet."""
-    found: dict[int | str, dict[str, Any]] = {200: {"content": {"application/json": {"example": example(model)}}}}
-    for status in (*problems, 500):
-        phrase = HTTPStatus(status).phrase
-        shown = {**example(Problem), "title": phrase, "status": status}
-        found[status] = {
-            "description": phrase,
-            "content": {_PROBLEM: {"schema": Problem.model_json_schema(), "example": shown}},
-        }
-    return found
-
-
-def _problem(request: Request, status: int, detail: str, more: dict[str, Any] | None = None) -> JSONResponse:
-    problem = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, instance=request.url.path)
-    return JSONResponse({**problem.model_dump(), **(more or {})}, status, media_type=_PROBLEM)
-
-
-def _add_problems(app: FastAPI) -> None:
-    """Answer every error with problem details."""
-
-    async def on_http(request: Request, error: Exception) -> JSONResponse:
-        if not isinstance(error, StarletteHTTPException):
-            raise error
-        response = _problem(request, error.status_code, str(error.detail))
-        response.headers.update(error.headers or {})
-        return response
-
-    async def on_invalid(request: Request, error: Exception) -> JSONResponse:
-        if not isinstance(error, RequestValidationError):
-            raise error
-        faults = [{"field": str(fault["loc"][-1]), "message": str(fault["msg"])} for fault in error.errors()]
-        detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
-        return _problem(request, 422, detail, {"errors": faults})
-
-    async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
-        # A handler for Exception would let it through to the server after answering, which then drops the connection.
-        try:
-            return await call_next(request)
-        except Exception:
-            # Nothing narrower: refusals and invalid requests were answered further in, what arrives here is an error
-            # in any code behind any path. Each must be a 500 in problem details that tells nothing of the inside.
-            _log.exception("request failed", path=request.url.path)
-            return _problem(request, 500, "an error inside the service; its log says more")
-
-    handlers: dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]] = {
-        StarletteHTTPException: on_http,
-        RequestValidationError: on_invalid,
-    }
-    for kind, handler in handlers.items():
-        app.add_exception_handler(kind, handler)
-    app.add_middleware(BaseHTTPMiddleware, dispatch=guard)

@@ -23,6 +23,8 @@ __all__ = [
     "LogSettings",
     "MachineEntry",
     "QueueSettings",
+    "RecordingSettings",
+    "ReplaySettings",
     "ServiceSettings",
     "check_distinct",
     "load_settings",
@@ -92,6 +94,63 @@ class HistorySettings(BaseModel):
     alarm_events: int = Field(default=5_000, ge=1, le=10_000_000, description="alarm events")
 
 
+class RecordingSettings(BaseModel):
+    """Where everything under the machines' keys is recorded, and what is kept; per machine, as far as sizes go.
+
+    Whole files are kept or dropped. A file that reaches into the time around an alarm falls under the limits for alarms
+    instead of the ordinary ones.
+    """
+
+    model_config = _STRICT
+
+    directory: str | None = Field(
+        default=None, min_length=1, description="where recordings go, relative to the settings file; off without it"
+    )
+    rotate_s: float = Field(default=300.0, ge=1.0, le=86_400.0, description="longest time in one file, in seconds")
+    rotate_mb: float = Field(default=256.0, ge=0.1, le=65_536.0, description="size at which a file is closed, in MB")
+    keep_gb: float = Field(default=20.0, gt=0.0, le=1e6, description="most that is kept without an alarm, in GB")
+    keep_days: float = Field(default=7.0, gt=0.0, le=36_500.0, description="how long it is kept, in days")
+    alarm_before_s: float = Field(
+        default=600.0, ge=0.0, le=86_400.0, description="time before an alarm event that is kept with it, in seconds"
+    )
+    alarm_after_s: float = Field(default=600.0, ge=0.0, le=86_400.0, description="time after it, in seconds")
+    alarm_keep_gb: float = Field(default=40.0, gt=0.0, le=1e6, description="most that is kept for alarms, in GB")
+    alarm_keep_days: float = Field(default=365.0, gt=0.0, le=36_500.0, description="how long it is kept, in days")
+    queue_mb: float = Field(
+        default=64.0, ge=0.1, le=16_384.0, description="most that waits in memory for the disk, in MB"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.alarm_before_s > self.keep_days * 86_400.0:
+            raise ValueError(
+                f"alarm_before_s is {self.alarm_before_s:g}, longer than keep_days ({self.keep_days:g}): what came "
+                "before an alarm would be gone when it is raised"
+            )
+        if self.rotate_mb > 1000.0 * min(self.keep_gb, self.alarm_keep_gb):
+            raise ValueError(
+                f"rotate_mb is {self.rotate_mb:g}, more than keep_gb ({self.keep_gb:g}) or alarm_keep_gb "
+                f"({self.alarm_keep_gb:g}) allow in all: a file would be dropped as soon as it is closed"
+            )
+        return self
+
+
+class ReplaySettings(BaseModel):
+    """Replays of recordings that are started over HTTP; results are kept below the directory of the recordings."""
+
+    model_config = _STRICT
+
+    enabled: bool | None = Field(
+        default=None, description="whether they may be started; if left out, only if the HTTP API stays on loopback"
+    )
+    jobs: int = Field(default=1, ge=1, le=64, description="most that run at once")
+    nice: int = Field(default=10, ge=0, le=19, description="how far they give way to the monitor, 19 is most")
+    kept: int = Field(default=20, ge=1, le=10_000, description="latest replays whose results are kept")
+    hosts: tuple[str, ...] = Field(
+        default=(), description="names under which browsers reach the API, if not as localhost, the host or an address"
+    )
+
+
 class LogSettings(BaseModel):
     """What is logged to standard error, and how."""
 
@@ -118,6 +177,8 @@ class ServiceSettings(BaseSettings):
     )
     queue: QueueSettings = Field(default=QueueSettings(), description="blocks that wait for evaluation")
     history: HistorySettings = Field(default=HistorySettings(), description="what is kept for the HTTP API")
+    recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
+    replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
     log: LogSettings = Field(default=LogSettings(), description="log")
 
     @model_validator(mode="after")
@@ -168,7 +229,10 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         raise MachineFileError(f"environment: {error}") from error
     folder = Path() if path is None else path.parent
     entries = tuple(_resolved(entry, folder) for entry in settings.machines)
-    settings = settings.model_copy(update={"machines": entries})
+    recording = settings.recording
+    if recording.directory is not None:
+        recording = recording.model_copy(update={"directory": str(folder / recording.directory)})
+    settings = settings.model_copy(update={"machines": entries, "recording": recording})
     check_distinct(place, settings)
     return settings
 

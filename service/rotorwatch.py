@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -10,6 +10,8 @@ from rich.table import Table
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 from service.commands import interchange as interchange_commands
+from service.commands import replay as replay_commands
+from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
@@ -37,6 +39,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
 )
 
+replay_commands.register(app)
 interchange_commands.register(app)
 
 
@@ -67,6 +70,7 @@ def run(
             "sender wait (batch runs).",
         ),
     ] = None,
+    namespace: NamespaceOption = None,
 ) -> None:
     """Monitor machines until Ctrl-C.
 
@@ -87,12 +91,14 @@ def run(
         from service.logs import configure_logging  # noqa: PLC0415
         from service.runtime import running, stop_request  # noqa: PLC0415  # must see the variables set above
 
-        settings = _overridden(load_settings(config), machine, listen, connect, http_port, when_full)
+        settings = _overridden(load_settings(config), machine, listen, connect, http_port, when_full, namespace)
         configure_logging(settings.log)
         with stop_request() as stop, running(settings) as service:
             for worker in service.machines():
                 networks = worker.identity.bundle or "none: the equations are not evaluated"
                 typer.echo(f"machine {worker.identity.site}/{worker.identity.machine}, trained networks {networks}")
+            if settings.link.namespace:
+                typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing from outside it is heard")
             for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):
                 if ends:
                     typer.echo(f"Zenoh {what} {', '.join(ends)}")
@@ -133,6 +139,7 @@ def watch(
     connect: ConnectOption = None,
     windows: Annotated[bool, typer.Option("--windows", help="One line per evaluated window as well.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object per line: topic and message.")] = False,
+    namespace: NamespaceOption = None,
 ) -> None:
     """Show alarms and changes of state as they happen, until Ctrl-C.
 
@@ -158,6 +165,7 @@ def watch(
 
         topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
         link = LinkSettings(mode="client", connect=tuple(connect) if connect else (ENDPOINT,))
+        link = in_namespace(link, namespace)
         show = _JsonLines() if as_json else _Lines()
         with stop_request() as stop, follow(link, machine, topics, show) as connected:
             there = True
@@ -301,11 +309,12 @@ def _overridden(
     connect: list[str] | None,
     http_port: int | None,
     when_full: Literal["drop", "wait"] | None,
+    namespace: str | None,
 ) -> "ServiceSettings":
     """Put the command line over the settings; endpoints and role replace those of the settings altogether."""
     from service.config import MachineEntry, check_distinct  # noqa: PLC0415  # keeps --help quick
 
-    update: dict[str, object] = {}
+    update: dict[str, Any] = {}
     if machines:
         pairs = [text.partition("@") for text in machines]
         update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
@@ -314,6 +323,10 @@ def _overridden(
         mode = "peer" if listen else "client"
         ends = {"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())}
         update["link"] = settings.link.model_copy(update=ends)
+    if namespace is not None:
+        update["link"] = in_namespace(update.get("link", settings.link), namespace)
+        # What is replayed must not end up among the recordings of the live machine.
+        update["recording"] = settings.recording.model_copy(update={"directory": None})
     if http_port is not None:
         update["http"] = settings.http.model_copy(update={"port": http_port})
     if when_full is not None:

@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
 
 import uvicorn
@@ -32,6 +33,8 @@ from models.signals.keys import MachineKeys
 from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
 from service.logs import logger
+from service.recording.catalogue import Catalogue
+from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
 from service.transport import Link, MachineCallbacks, MachineLink
 from service.worker import MachineWorker
@@ -71,6 +74,9 @@ class Runtime:
             machine = entry.load()
             bundle = None if entry.bundle is None else load_bundle(entry.bundle, machine)
             self._workers.append(MachineWorker(machine, bundle, settings.queue, settings.history))
+        directory = settings.recording.directory
+        self.catalogue = None if directory is None else Catalogue(Path(directory))
+        self.replays = ReplayDesk(settings, self.catalogue)
         self._link: Link | None = None
         self._server: _HttpServer | None = None
         self._undo = ExitStack()
@@ -131,6 +137,7 @@ class Runtime:
             supervisor = _Supervisor(list(zip(self._workers, links, strict=True)))
             undo.callback(supervisor.stop)
             supervisor.start()
+            undo.callback(self.replays.close)
             self._server = server
             server.start(self)
             self._undo = undo.pop_all()

@@ -5,7 +5,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["LinkSettings"]
+__all__ = ["NAMESPACE_PATTERN", "LinkSettings"]
+
+NAMESPACE_PATTERN = r"^([A-Za-z0-9][A-Za-z0-9_.-]*(/[A-Za-z0-9][A-Za-z0-9_.-]*)*)?$"
+"""Key segments that could begin any key: no wildcards, no empty ones."""
 
 
 class LinkSettings(BaseModel):
@@ -20,10 +23,16 @@ class LinkSettings(BaseModel):
     listen: tuple[str, ...] = Field(default=(), description='endpoints to listen on, as "tcp/127.0.0.1:7447"')
     connect: tuple[str, ...] = Field(default=(), description='endpoints to connect to, as "tcp/127.0.0.1:7447"')
     shared_memory: bool = Field(default=False, description="let Zenoh move payloads through shared memory")
+    namespace: str = Field(
+        default="",
+        pattern=NAMESPACE_PATTERN,
+        description='what goes before every key, as "replay/monday"; the program then hears nothing from outside it, '
+        "and nobody outside hears the program",
+    )
 
     def zenoh_items(self) -> dict[str, str]:
         """Configuration paths and their JSON5 values, to be inserted one by one into a Zenoh configuration."""
-        return {
+        items = {
             "mode": json.dumps(self.mode),
             "listen/endpoints": json.dumps(list(self.listen)),
             "connect/endpoints": json.dumps(list(self.connect)),
@@ -32,3 +41,6 @@ class LinkSettings(BaseModel):
             "timestamping/enabled": "true",
             "transport/shared_memory/enabled": json.dumps(self.shared_memory),
         }
+        if self.namespace:
+            items["namespace"] = json.dumps(self.namespace)
+        return items

@@ -1,0 +1,344 @@
+"""``rotorwatch replay``: recordings through the monitor offline, or onto the network as they were."""
+
+import os
+import re
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from models.errors import MachineFileError, RecordingError, RotorwatchError
+from models.signals.link import NAMESPACE_PATTERN, LinkSettings
+from service.commands.running import ENDPOINT, exit_codes, one_blas_thread
+
+if TYPE_CHECKING:  # these import numpy and pyarrow, which --help must not wait for
+    from models.signals.keys import MachineKeys
+    from service.replay.control import Control
+    from service.replay.schemas import OfflineSummary
+    from service.replay.source import RecordingSource
+    from service.replay_link import NetworkPlan
+    from service.runtime import StopRequest
+
+__all__ = ["NamespaceOption", "in_namespace", "register", "summary_lines"]
+
+_SLOWEST, _FASTEST = 0.1, 1000.0
+
+NamespaceOption = Annotated[
+    str | None,
+    typer.Option("--namespace", metavar="PREFIX", help="Hear and publish only below this prefix: that of a replay."),
+]
+
+
+def in_namespace(link: LinkSettings, namespace: str | None) -> LinkSettings:
+    """Link settings with the namespace of the command line, if there is one.
+
+    Raises
+    ------
+    MachineFileError
+        If it cannot be the beginning of a key.
+    """
+    if namespace is None:
+        return link
+    _check_prefix("--namespace", namespace)
+    return link.model_copy(update={"namespace": namespace})
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(replay)
+
+
+def replay(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.")],
+    offline: Annotated[
+        bool, typer.Option("--offline", help="Evaluate at full speed, without a network; JSON lines come out.")
+    ] = False,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            "--machine",
+            metavar="FILE[@BUNDLE]",
+            help="Offline: evaluate with this machine file, and after @ its trained networks. If left out, the shipped "
+            "machine with the recorded site and name, with its networks.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Offline: write the lines here, not to the terminal.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Offline: replace the file of --out.")] = False,
+    key: Annotated[
+        str | None,
+        typer.Option("--key", metavar="SITE/MACHINE", help="Only this machine, if the recordings hold several."),
+    ] = None,
+    from_: Annotated[
+        str | None,
+        typer.Option("--from", metavar="TIME", help="Seconds after the start, or a time such as 2026-01-01T00:02:30Z."),
+    ] = None,
+    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same, without what comes then.")] = None,
+    prefix: Annotated[
+        str | None,
+        typer.Option(
+            "--prefix",
+            metavar="PREFIX",
+            help='Goes before every key; replay/<name of the first file> if left out. "" is the original keys, '
+            "which is refused while a publisher or monitor of the machine is alive.",
+        ),
+    ] = None,
+    pace: Annotated[
+        str, typer.Option("--pace", help="Recorded seconds per second, 0.1 to 1000, or max: as fast as it is taken.")
+    ] = "1",
+    loop: Annotated[
+        str, typer.Option("--loop", metavar="N", help="Passes, or forever; each has a prefix of its own: PREFIX/1, ...")
+    ] = "1",
+    everything: Annotated[
+        bool, typer.Option("--all", help="Every recorded key, not only stream, descriptor and truth.")
+    ] = False,
+    connect: Annotated[
+        list[str] | None,
+        typer.Option("--connect", metavar="ENDPOINT", help=f"Zenoh endpoint; {ENDPOINT} if left out. Repeatable."),
+    ] = None,
+    listen: Annotated[
+        list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Listen here instead. Repeatable.")
+    ] = None,
+    wait_s: Annotated[
+        float,
+        typer.Option("--wait-for-subscriber", metavar="S", min=0, help="Hold the first block back at most this long."),
+    ] = 0.0,
+    progress: Annotated[
+        Literal["auto", "json", "none"],
+        typer.Option("--progress", help="A bar if a terminal is there; or JSON lines on standard output; or nothing."),
+    ] = "auto",
+    control: Annotated[bool, typer.Option("--control", hidden=True, help="Take orders from standard input.")] = False,
+    nice: Annotated[int, typer.Option("--nice", min=0, max=19, hidden=True, help="Give way to others.")] = 0,
+) -> None:
+    """Replay recordings: offline through the monitor, or onto the network byte for byte.
+
+    On the network a replay stays apart from what is live: its keys begin with a prefix, and a monitor hears them
+    only as its namespace. In a terminal the space bar pauses and the arrow keys go 10 s back and forth.
+
+    [bold]Examples[/bold]
+
+    What the monitor says of a recording:
+    [cyan]rotorwatch replay 20260101T000000Z.mcap --offline --out reports.jsonl[/cyan]
+
+    What it would have said with other limits, of a whole day:
+    [cyan]rotorwatch replay day/*.mcap --offline --machine stricter.toml@lab --out stricter.jsonl[/cyan]
+
+    Ten times faster onto the network, for a monitor beside the live one:
+    [cyan]rotorwatch run --namespace replay/monday --listen tcp/127.0.0.1:7450 --http-port 8081[/cyan]
+    [cyan]rotorwatch replay monday.mcap --pace 10 --connect tcp/127.0.0.1:7450[/cyan]
+    """
+    with exit_codes():
+        if nice:
+            os.nice(nice)
+        one_blas_thread()
+        from service.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
+        from service.replay.control import Control  # noqa: PLC0415
+        from service.replay.source import RecordingSource, parse_moment  # noqa: PLC0415
+
+        try:
+            source = RecordingSource(files)
+        except RecordingError as error:
+            raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
+        from_ns = source.start_ns if from_ is None else parse_moment(from_, source.start_ns, "--from")
+        to_ns = source.end_ns + 1 if to is None else parse_moment(to, source.start_ns, "--to")
+        if from_ns >= to_ns or from_ns > source.end_ns or to_ns <= source.start_ns:
+            raise MachineFileError(f"--from {from_ or 0} --to {to or 'the end'}: nothing was recorded in between")
+        _check_options(offline, {"--machine": machine, "--out": out, "--overwrite": overwrite},
+                       {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything})  # fmt: skip
+        wishes = Control()
+        with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
+            if offline:
+                request = _Offline(source.machine(key), machine, from_ns, to_ns, out, overwrite, progress)
+                _evaluate(source, request, wishes)
+                return
+            from service.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
+
+            plan = NetworkPlan(
+                link=_link(connect, listen),
+                machines=source.machines if key is None else (source.machine(key),),
+                everything=everything,
+                prefix=_prefix(prefix, files[0]),
+                pace=_pace(pace),
+                passes=_passes(loop, prefix),
+                from_ns=from_ns,
+                to_ns=to_ns,
+                wait_for_subscriber_s=wait_s,
+            )
+            _announce(plan)
+            with show(progress) as bar:
+                count = replay_to_network(source, plan, wishes, bar)
+            typer.echo(f"{count} messages replayed", err=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Offline:
+    keys: "MachineKeys"
+    machine: str | None
+    from_ns: int
+    to_ns: int
+    out: Path | None
+    overwrite: bool
+    progress: Literal["auto", "json", "none"]
+
+
+def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") -> None:
+    from service.replay.choice import choose_machine  # noqa: PLC0415  # keeps --help quick
+    from service.replay.console import show  # noqa: PLC0415
+    from service.replay.offline import OfflineReplay  # noqa: PLC0415
+    from service.replay.schemas import ReplayLine  # noqa: PLC0415
+
+    as_json = request.progress == "json"
+    if as_json and request.out is None:
+        raise MachineFileError("--progress json writes to standard output: name a file for the results with --out")
+    machine, bundle = choose_machine(request.keys, request.machine)
+    with _lines(request.out, request.overwrite) as write:
+        run = OfflineReplay(
+            source, request.keys, machine, bundle, write, from_ns=request.from_ns, to_ns=request.to_ns
+        )  # fmt: skip
+        for text in run.descriptor_differences:
+            typer.echo(f"the recorded channel descriptor differs from the machine file: {text}", err=True)
+        # Lines and a bar in one terminal would spoil each other.
+        quiet = request.out is None and sys.stdout.isatty() and not as_json
+        with show("none" if quiet else request.progress) as bar:
+            summary = run.run(control, bar)
+    if as_json:
+        typer.echo(ReplayLine(kind="summary", summary=summary).model_dump_json())
+    else:
+        for line in summary_lines(summary):
+            typer.echo(line, err=True)
+    if summary.blocks == 0 and not summary.stopped:
+        raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")
+
+
+def summary_lines(summary: "OfflineSummary") -> list[str]:
+    """What an offline replay found, for people."""
+    refused = ", ".join(f"{count} {reason}" for reason, count in summary.refused_blocks.items())
+    lines = [
+        f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, "
+        f"trained networks {summary.bundle or 'none'}",
+        f"{summary.windows} windows, {summary.alarms} alarm events, raised at the end: "
+        f"{', '.join(summary.raised) or 'none'}",
+        f"{summary.data_s:.1f} s of data in {summary.elapsed_s:.1f} s: {summary.times_real_time:.0f} times real time",
+        f"{summary.blocks} blocks accepted, refused: {refused or 'none'}"
+        + (f"; latest reason: {summary.last_refusal}" if refused else ""),
+    ]
+    if summary.gaps:
+        lines.append(f"{summary.gaps} gaps, {summary.missing_s:.1f} s missing")
+    if summary.stopped:
+        lines.append("stopped before the end")
+    lines.append(f"SHA-256 of the lines {summary.sha256}")
+    return lines
+
+
+@contextmanager
+def _lines(out: Path | None, overwrite: bool) -> "Iterator[Callable[[str], None]]":
+    if out is None:
+
+        def to_terminal(line: str) -> None:
+            sys.stdout.write(line + "\n")
+
+        try:
+            yield to_terminal
+            sys.stdout.flush()
+        except BrokenPipeError:  # whoever read has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(1) from None
+        return
+    if out.exists() and not overwrite:
+        raise MachineFileError(f"{out}: exists already; --overwrite replaces it")
+    try:
+        with out.open("w", encoding="utf-8", newline="\n") as file:
+            yield lambda line: _discard(file.write(line + "\n"))
+    except OSError as error:
+        raise MachineFileError(f"{out}: cannot be written ({error.strerror or error})") from error
+
+
+def _discard(_: object) -> None:
+    pass
+
+
+@contextmanager
+def _stoppable(control: "Control") -> Iterator[None]:
+    """SIGINT and SIGTERM end the replay in order."""
+    from service.runtime import stop_request  # noqa: PLC0415  # keeps --help quick
+
+    over = threading.Event()
+
+    def watch(stop: "StopRequest") -> None:
+        while not over.is_set():
+            if stop.wait(0.25):
+                control.stop()
+                return
+
+    with stop_request() as stop:
+        thread = threading.Thread(target=watch, args=(stop,), name="signals", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+def _check_options(offline: bool, only_offline: dict[str, object], only_network: dict[str, object]) -> None:
+    wrong, instead = (only_network, "without") if offline else (only_offline, "with")
+    for name, value in wrong.items():
+        if value:
+            raise MachineFileError(f"{name} makes sense only {instead} --offline")
+
+
+def _pace(text: str) -> float | None:
+    if text == "max":
+        return None
+    try:
+        pace = float(text)
+    except ValueError:
+        pace = 0.0
+    if not _SLOWEST <= pace <= _FASTEST:
+        raise MachineFileError(f"--pace is {text!r}, expected {_SLOWEST:g} to {_FASTEST:g}, or max")
+    return pace
+
+
+def _passes(text: str, prefix: str | None) -> int | None:
+    passes = None if text == "forever" else int(text) if text.isascii() and text.isdigit() else 0
+    if passes == 0:
+        raise MachineFileError(f"--loop is {text!r}, expected a number from 1, or forever")
+    if passes != 1 and prefix == "":
+        raise MachineFileError("--loop needs a prefix: on the original keys there is room for one pass")
+    return passes
+
+
+def _prefix(prefix: str | None, first: Path) -> str:
+    named = f"replay/{re.sub('[^A-Za-z0-9_-]', '-', first.name.partition('.')[0])}" if prefix is None else prefix
+    _check_prefix("--prefix", named)
+    return named
+
+
+def _check_prefix(option: str, prefix: str) -> None:
+    if not re.fullmatch(NAMESPACE_PATTERN, prefix):
+        raise MachineFileError(
+            f"{option} is {prefix!r}, expected letters, digits, '_', '-' and '.', in parts separated by '/'"
+        )
+
+
+def _link(connect: list[str] | None, listen: list[str] | None) -> LinkSettings:
+    if listen:
+        return LinkSettings(mode="peer", listen=tuple(listen), connect=tuple(connect or ()))
+    return LinkSettings(mode="client", connect=tuple(connect or (ENDPOINT,)))
+
+
+def _announce(plan: "NetworkPlan") -> None:
+    names = ", ".join(f"{keys.site}/{keys.machine}" for keys in plan.machines)
+    if plan.passes != 1:
+        where = f"each pass under a prefix of its own: {plan.prefix_of(1)}, {plan.prefix_of(2)}, ..."
+    else:
+        where = f"under {plan.prefix}" if plan.prefix else "on the original keys"
+    typer.echo(f"replaying {names} {where}", err=True)
+    if plan.prefix:
+        typer.echo(f"a monitor hears it with: rotorwatch run --namespace {plan.prefix_of(1)}", err=True)

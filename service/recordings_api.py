@@ -1,0 +1,145 @@
+"""Recordings over HTTP: list, look at, download."""
+
+from pathlib import Path
+from typing import Annotated, Protocol
+
+from fastapi import FastAPI, HTTPException, Query
+from fastapi.responses import FileResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from models.signals.recording import summarize_recording
+from service.problems import problem_responses, responses
+from service.recording.catalogue import Recording
+
+__all__ = [
+    "RecordingDetail",
+    "RecordingEntry",
+    "RecordingIndex",
+    "RecordingList",
+    "add_recording_routes",
+    "found_recording",
+]
+
+_JSON = ConfigDict(extra="forbid", frozen=True)
+_NONE = "no recordings: the settings name no directory for them ([recording] directory)"
+
+
+class RecordingIndex(Protocol):
+    """What the API needs to know about recordings; `service.recording.catalogue.Catalogue` is one."""
+
+    @property
+    def directory(self) -> Path:
+        """Where they are."""
+
+    def recordings(self, site: str | None = None, machine: str | None = None) -> tuple[Recording, ...]:
+        """List recordings, sorted by site, machine and time."""
+
+    def find(self, recording_id: str) -> Recording | None:
+        """One recording, or None; reaches no file outside the directory."""
+
+
+class RecordingEntry(BaseModel):
+    """One recording."""
+
+    model_config = _JSON
+
+    id: str = Field(description="site, machine and file name", examples=["demo/lab/20260101T000000Z.mcap"])
+    site: str = Field(description="site of the machine", examples=["demo"])
+    machine: str = Field(description="name of the machine", examples=["lab"])
+    start_ns: int = Field(description="time of the first message", examples=[1767225600000000000])
+    end_ns: int = Field(description="time of the last message", examples=[1767225900000000000])
+    messages: int | None = Field(description="number of messages; null if incomplete or damaged", examples=[3001])
+    size_bytes: int = Field(description="size of the file", examples=[19231007])
+    complete: bool = Field(
+        description="false for a file that is being written, or was left by a crash", examples=[True]
+    )
+    kept_because: str = Field(description="which alarm keeps it beyond its time; empty if none", examples=[""])
+    problem: str = Field(description="why it cannot be read; empty if it can", examples=[""])
+
+
+class RecordingDetail(RecordingEntry):
+    """One recording with what is in it."""
+
+    keys: dict[str, int] = Field(
+        description="messages by key; empty if incomplete or damaged", examples=[{"rotorwatch/demo/lab/stream": 3000}]
+    )
+
+
+class RecordingList(BaseModel):
+    """Recordings by site, machine and time."""
+
+    model_config = _JSON
+
+    recordings: tuple[RecordingEntry, ...] = Field(description="by site, machine and time")
+
+
+_Site = Annotated[str | None, Query(description="only of this site")]
+_Machine = Annotated[str | None, Query(description="only of this machine")]
+_SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this time, ns since 1970-01-01 UTC")]
+_UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
+
+
+def add_recording_routes(app: FastAPI, index: RecordingIndex | None) -> None:
+    """Add the routes; without an index they answer with a problem that names the setting."""
+
+    @app.get("/api/v1/recordings", tags=["recordings"], responses=responses(RecordingList, 404, 422))
+    def recordings(
+        site: _Site = None, machine: _Machine = None, since_ns: _SinceNs = None, until_ns: _UntilNs = None
+    ) -> RecordingList:
+        """Recordings, by site, machine and time."""
+        listed = _present(index).recordings(site, machine)
+        kept = (
+            one
+            for one in listed
+            if (since_ns is None or one.end_ns >= since_ns) and (until_ns is None or one.start_ns < until_ns)
+        )
+        return RecordingList(recordings=tuple(RecordingEntry.model_validate(_fields(one)) for one in kept))
+
+    @app.get(
+        "/api/v1/recordings/{site}/{machine}/{name}",
+        tags=["recordings"],
+        responses=responses(RecordingDetail, 404, 422),
+    )
+    def recording(site: str, machine: str, name: str) -> RecordingDetail:
+        """One recording, with the keys in it."""
+        found = found_recording(index, f"{site}/{machine}/{name}")
+        readable = found.complete and not found.problem
+        keys = summarize_recording(found.path).messages if readable else {}
+        return RecordingDetail.model_validate({**_fields(found), "keys": keys})
+
+    @app.get(
+        "/api/v1/recordings/{site}/{machine}/{name}/download",
+        tags=["recordings"],
+        response_class=FileResponse,
+        responses={200: {"content": {"application/octet-stream": {}}}, **problem_responses(404, 409, 422)},
+    )
+    def download(site: str, machine: str, name: str) -> FileResponse:
+        """The file itself; ranges may be asked for."""
+        found = found_recording(index, f"{site}/{machine}/{name}")
+        if not found.complete:
+            raise HTTPException(409, f"{found.id} is incomplete: it is being written, or was left by a crash")
+        return FileResponse(found.path, media_type="application/octet-stream", filename=found.path.name)
+
+
+def found_recording(index: RecordingIndex | None, recording_id: str) -> Recording:
+    """Find a recording.
+
+    Raises
+    ------
+    HTTPException
+        404 if there is none, or no directory of recordings is set.
+    """
+    found = _present(index).find(recording_id)
+    if found is None:
+        raise HTTPException(404, f"no recording {recording_id}")
+    return found
+
+
+def _present(index: RecordingIndex | None) -> RecordingIndex:
+    if index is None:
+        raise HTTPException(404, _NONE)
+    return index
+
+
+def _fields(recording: Recording) -> dict[str, object]:
+    return {name: getattr(recording, name) for name in RecordingEntry.model_fields}

@@ -1,0 +1,59 @@
+"""Which machine file and trained networks a recording is evaluated with."""
+
+from importlib.resources import files
+from pathlib import Path
+
+from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.errors import MachineFileError
+from models.machine import Machine, load_machine
+from models.signals.keys import MachineKeys
+
+__all__ = ["choose_machine", "is_shipped_bundle", "is_shipped_machine"]
+
+
+def choose_machine(keys: MachineKeys, wanted: str | None) -> tuple[Machine, Bundle | None]:
+    """Load the machine file and networks for a recorded machine.
+
+    Parameters
+    ----------
+    keys : MachineKeys
+        The recorded machine.
+    wanted : str, optional
+        ``FILE`` or ``FILE@BUNDLE``, shipped names or paths. Without it, the shipped machine with the recorded site and
+        name is taken, with its shipped networks.
+
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be used, or none was named and no shipped machine fits.
+    BundleError
+        If the networks cannot be used.
+    """
+    if wanted is not None:
+        file, _, name = wanted.partition("@")
+        machine = load_machine(file)
+        return machine, load_bundle(name, machine) if name else None
+    for path in _shipped_files():
+        machine = load_machine(path)
+        if (machine.site, machine.name) == (keys.site, keys.machine):
+            return machine, load_bundle(path.stem, machine) if is_shipped_bundle(path.stem) else None
+    shipped = ", ".join(path.stem for path in _shipped_files())
+    raise MachineFileError(
+        f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({shipped}) has this site "
+        "and name: name its machine file, as --machine FILE or --machine FILE@BUNDLE"
+    )
+
+
+def is_shipped_machine(name: str) -> bool:
+    """Whether a machine file of this name is shipped."""
+    return name in {path.stem for path in _shipped_files()}
+
+
+def is_shipped_bundle(name: str) -> bool:
+    """Whether trained networks of this name are shipped."""
+    folder = Path(str(files("models"))) / "bundles"
+    return name in {path.name for path in folder.iterdir() if (path / "manifest.json").is_file()}
+
+
+def _shipped_files() -> list[Path]:
+    return sorted((Path(str(files("models"))) / "machines").glob("*.toml"))

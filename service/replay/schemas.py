@@ -1,0 +1,152 @@
+"""JSON about replays: how far one is, what it found, and how one is asked for."""
+
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+__all__ = ["OfflineSummary", "ReplayJob", "ReplayLine", "ReplayProgress", "ReplayRequest", "ReplaySeek"]
+
+_JSON = ConfigDict(extra="forbid", frozen=True)
+
+
+class ReplayProgress(BaseModel):
+    """How far a replay is."""
+
+    model_config = _JSON
+
+    fraction: float = Field(ge=0, le=1, description="of the recorded time to be replayed", examples=[0.5])
+    position_ns: int = Field(
+        description="time at which the latest message was recorded", examples=[1767225805000000000]
+    )
+    messages: int = Field(description="messages read so far", examples=[3000])
+    windows: int = Field(description="windows evaluated so far; 0 if the replay only publishes", examples=[60])
+    alarms: int = Field(description="alarm events so far; 0 if the replay only publishes", examples=[1])
+    pass_number: int = Field(description="which repetition this is, from 1", examples=[1])
+    paused: bool = Field(description="whether the replay is paused", examples=[False])
+
+
+class OfflineSummary(BaseModel):
+    """What an offline replay found."""
+
+    model_config = _JSON
+
+    site: str = Field(description="site of the machine whose file was used", examples=["demo"])
+    machine: str = Field(description="its name", examples=["lab"])
+    bundle: str | None = Field(
+        description="identity of the trained networks; null without", examples=["lab-3f9c1e0b7a52"]
+    )
+    machine_hash: str = Field(description="changes with the machine file's content", examples=["9a0c41d27be8"])
+    windows: int = Field(description="window reports", examples=[119])
+    alarms: int = Field(description="alarm events", examples=[1])
+    raised: tuple[str, ...] = Field(description="alarms raised at the end", examples=[["k_by"]])
+    blocks: int = Field(description="blocks accepted", examples=[6000])
+    refused_blocks: dict[str, int] = Field(description="blocks refused, by reason", examples=[{"overlap": 1}])
+    last_refusal: str = Field(description="latest reason for refusing a block; empty if none was", examples=[""])
+    gaps: int = Field(description="interruptions before accepted blocks", examples=[0])
+    missing_s: float = Field(description="data time that the gaps cost", examples=[0.0])
+    data_s: float = Field(description="length of the accepted blocks", examples=[600.0])
+    elapsed_s: float = Field(description="how long the replay took", examples=[12.0])
+    times_real_time: float = Field(description="data_s over elapsed_s", examples=[50.0])
+    descriptor_differences: tuple[str, ...] = Field(
+        description="how the recorded channel descriptor differs from the machine file", examples=[[]]
+    )
+    stopped: bool = Field(description="whether it was stopped before the end", examples=[False])
+    sha256: str = Field(description="SHA-256 of all result lines, each with its line end", examples=["9f86d081"])
+
+
+class ReplayLine(BaseModel):
+    """One line of a program that replays: progress, or the summary at the end."""
+
+    model_config = _JSON
+
+    kind: Literal["progress", "summary"]
+    progress: ReplayProgress | None = None
+    summary: OfflineSummary | None = None
+
+
+class ReplayRequest(BaseModel):
+    """A replay to be started."""
+
+    model_config = _JSON
+
+    recordings: tuple[str, ...] = Field(
+        min_length=1,
+        max_length=1000,
+        description="ids of recordings of one machine, in any order",
+        examples=[["demo/lab/20260101T000000Z.mcap"]],
+    )
+    mode: Literal["offline", "paced"] = Field(
+        default="offline",
+        description="offline: through a monitor of its own at full speed; paced: onto the network below `prefix`",
+        examples=["offline"],
+    )
+    machine: str | None = Field(
+        default=None,
+        description="offline: another machine file, as a shipped name or SITE/MACHINE of a monitored one",
+        examples=["demo/lab"],
+    )
+    bundle: str | None = Field(
+        default=None,
+        description="offline: other trained networks, as a shipped name; needs `machine`",
+        examples=["lab"],
+    )
+    from_ns: int | None = Field(
+        default=None, ge=0, description="only what was recorded from this time on", examples=[1767225600000000000]
+    )
+    to_ns: int | None = Field(
+        default=None, ge=0, description="only what was recorded before this time", examples=[1767225900000000000]
+    )
+    pace: float = Field(
+        default=1.0, ge=0.1, le=1000.0, description="paced: recorded seconds per second", examples=[10.0]
+    )
+
+
+class ReplayJob(BaseModel):
+    """A replay that was started over HTTP."""
+
+    model_config = _JSON
+
+    id: str = Field(description="names the replay until the service stops", examples=["5f2b9c0d1a7e"])
+    state: Literal["running", "paused", "finished", "stopped", "failed"] = Field(
+        description="finished: came to its end; stopped: was told to; failed: `error` says why", examples=["finished"]
+    )
+    mode: Literal["offline", "paced"] = Field(description="as requested", examples=["offline"])
+    recordings: tuple[str, ...] = Field(
+        description="ids of the recordings", examples=[["demo/lab/20260101T000000Z.mcap"]]
+    )
+    machine: str | None = Field(
+        description="machine file and, after @, trained networks it is evaluated with; null: by the recorded name",
+        examples=["lab@lab"],
+    )
+    from_ns: int | None = Field(description="as requested", examples=[1767225600000000000])
+    to_ns: int | None = Field(description="as requested", examples=[1767225900000000000])
+    pace: float | None = Field(description="recorded seconds per second; null: as fast as possible", examples=[None])
+    prefix: str = Field(
+        description="paced: what goes before every key, and the namespace of a monitor for it; empty offline",
+        examples=[""],
+    )
+    started_ns: int = Field(description="when it was started, by this computer's clock", examples=[1767312000000000000])
+    progress: ReplayProgress | None = Field(description="how far it is; null before the first message")
+    summary: OfflineSummary | None = Field(description="what was found; null before the end, and if paced")
+    error: str = Field(description="why it failed; else empty", examples=[""])
+
+
+class ReplaySeek(BaseModel):
+    """Where a replay is to go on: a time, or a distance from where it is."""
+
+    model_config = _JSON
+
+    to_ns: int | None = Field(default=None, ge=0, description="time of recording", examples=[1767225700000000000])
+    by_s: float | None = Field(
+        default=None,
+        ge=-1e9,
+        le=1e9,
+        description="seconds from where it is, back if negative; give this or `to_ns`",
+        examples=[None],
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if (self.to_ns is None) == (self.by_s is None):
+            raise ValueError("give either to_ns or by_s")
+        return self
