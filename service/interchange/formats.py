@@ -39,8 +39,7 @@ def open_source(path: Path, mapping: Mapping) -> Source:  # noqa: PLR0911  # one
         case "csv":
             from service.interchange.tables import CsvSource  # noqa: PLC0415
 
-            times = frozenset({mapping.time.column or ""} if mapping.time.is_datetime else ())
-            return CsvSource(path, mapping.csv, times)
+            return CsvSource(path, mapping.csv, mapping.time.column, datetimes=mapping.time.is_datetime)
         case "parquet":
             from service.interchange.tables import ParquetSource  # noqa: PLC0415
 

@@ -61,8 +61,11 @@ class CsvSource(_Table):
     path : Path
     form : CsvFormat
         Delimiter, decimal sign and which lines to leave out.
-    times : frozenset of str
-        Columns with ISO 8601 times instead of numbers.
+    time_column : str or None
+        Column with the times. Where its first cells are whole numbers it is read as such, because nanoseconds since
+        1970 have more digits than a float.
+    datetimes : bool
+        Whether it has ISO 8601 times instead of numbers.
 
     Raises
     ------
@@ -70,10 +73,14 @@ class CsvSource(_Table):
         If the first lines are no table.
     """
 
-    def __init__(self, path: Path, form: CsvFormat, times: frozenset[str]) -> None:
-        self._form, self._times = form, times
+    def __init__(self, path: Path, form: CsvFormat, time_column: str | None, *, datetimes: bool) -> None:
+        self._form, self._time_column = form, time_column
+        self._time_type = pa.timestamp("ns", tz="UTC") if datetimes else pa.float64()
         with readable(path, "CSV"), self._reader(path, None) as reader:
             names = list(reader.schema.names)
+            label = "" if time_column is None else self._label(time_column)
+            if not datetimes and label in names and reader.schema.field(names.index(label)).type == pa.int64():
+                self._time_type = pa.int64()
         if not form.header:
             names = [str(number + 1) for number in range(len(names))]
         super().__init__(path, [name.strip() for name in names])
@@ -106,8 +113,8 @@ class CsvSource(_Table):
         form = self._form
         types: dict[str, Any] = {}
         for name in wanted or ():
-            time = pa.timestamp("ns", tz="UTC") if name in self._times else pa.float64()
-            types[self._label(name)] = pa.string() if as_text else time
+            kind = self._time_type if name == self._time_column else pa.float64()
+            types[self._label(name)] = pa.string() if as_text else kind
         return pa.csv.open_csv(
             path,
             pa.csv.ReadOptions(
@@ -129,8 +136,8 @@ class CsvSource(_Table):
         )
 
     def _label(self, name: str) -> str:
-        """Arrow's own name of a column."""
-        return name if self._form.header else f"f{int(name) - 1}"
+        """Arrow's own name of a column; columns without names are numbered from 1."""
+        return name if self._form.header else f"f{int(name) - 1 if name.isdecimal() else name}"
 
     def _fault(self, wanted: list[str]) -> str:
         """Find the cell that is no number."""
@@ -141,7 +148,7 @@ class CsvSource(_Table):
                     for name in wanted:
                         for offset, cell in enumerate(batch.column(self._label(name)).to_pylist()):
                             if cell is not None and not self._is_value(name, cell):
-                                what = "an ISO 8601 time" if name in self._times else "a number"
+                                what = "an ISO 8601 time" if self._is_datetime(name) else "a number"
                                 return (
                                     f"{self.path}: row {row + offset + 1}, column {name!r}: found {cell!r}, "
                                     f"expected {what}"
@@ -151,9 +158,12 @@ class CsvSource(_Table):
                 return f"{self.path}: after row {row}: {error}"
         return ""
 
+    def _is_datetime(self, name: str) -> bool:
+        return name == self._time_column and bool(pa.types.is_timestamp(self._time_type))
+
     def _is_value(self, name: str, cell: str) -> bool:
         try:
-            if name in self._times:
+            if self._is_datetime(name):
                 pa.scalar(cell).cast(pa.timestamp("ns", tz="UTC"))
             else:
                 float(cell.strip().replace(self._form.decimal, "."))

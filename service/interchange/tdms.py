@@ -33,8 +33,13 @@ class TdmsSource:
         with readable(path, "TDMS", "npTDMS"):
             from nptdms import TdmsFile  # noqa: PLC0415  # an extra
 
-            self._file = TdmsFile.open(path)
-            channels = [channel for group in self._file.groups() for channel in group.channels()]
+            self._file = path.open("rb")  # ours, because the library leaves a file open that it cannot read
+            try:
+                self._tdms = TdmsFile.open(self._file)
+                channels = [channel for group in self._tdms.groups() for channel in group.channels()]
+            except BaseException:
+                self._file.close()
+                raise
         short = [channel.name for channel in channels]
         for channel in channels:
             self._channels[f"{channel.group_name}/{channel.name}"] = channel
@@ -82,6 +87,7 @@ class TdmsSource:
 
     def close(self) -> None:
         """Close the file."""
+        self._tdms.close()
         self._file.close()
 
     def __enter__(self) -> Self:

@@ -1,0 +1,72 @@
+"""What the tests of import and export share: a machine, its signals, and recordings read back."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from models.machine import Machine, load_machine
+from models.signals.block import FloatArray
+from models.signals.recording import read_recording
+from models.signals.wire import decode_block
+from service.ingest import Gate
+from service.interchange.importing import Imported, import_file
+from service.interchange.mapping import load_mapping
+
+START = "2026-01-31T12:00:00Z"
+START_NS = 1769860800_000_000_000
+RATE_HZ = 2000.0
+SPEED_HZ = 22.0
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """A contiguous part of a recording."""
+
+    start_ns: int
+    samples: FloatArray
+
+
+def machine(**changes: object) -> Machine:
+    """Displacement and velocity of the bearing in y, and the shaft angle, as float64."""
+    lab = load_machine("lab")
+    kept = {"y1", "y1_dot", "theta"}
+    sensors = tuple(channel for channel in lab.sensors if channel.name in kept)
+    return Machine.model_validate({**lab.model_dump(), "dtype": "float64", "sensors": sensors, **changes})
+
+
+def signals(count: int, rate_hz: float = RATE_HZ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Time, s; displacement, um; velocity, mm/s; shaft angle, rad."""
+    time = np.arange(count) / rate_hz
+    omega = 2 * np.pi * SPEED_HZ
+    return (
+        time,
+        40 * np.cos(omega * time) + 3 * np.sin(170.0 * time) - 12,
+        -40e-3 * omega * np.sin(omega * time),
+        np.mod(omega * time, 2 * np.pi),
+    )
+
+
+def imported(folder: Path, source: Path, mapping: str, described: Machine | None = None) -> tuple[Imported, Path]:
+    """Import a file with a mapping given as text."""
+    described = described or machine()
+    file = folder / "mapping.toml"
+    file.write_text(mapping, encoding="utf-8")
+    out = folder / "imported.mcap"
+    return import_file(source, load_mapping(file, described), described, out, overwrite=True), out
+
+
+def stretches(recording: Path, described: Machine | None = None) -> list[Stretch]:
+    """What a monitor makes of a recording: nothing may be refused, and gaps are where its gate sees them."""
+    described = described or machine()
+    gate = Gate(described)
+    found: list[tuple[int, list[FloatArray]]] = []
+    for message in read_recording(recording, keys={described.keys.stream}):
+        block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        assert message.log_time_ns == block.end_ns
+        verdict = gate.judge(block, schema_hash)
+        assert verdict.accepted, verdict.text
+        if not found or not verdict.continuous:
+            found.append((block.start_ns, []))
+        found[-1][1].append(np.asarray(block.samples, dtype=np.float64))
+    return [Stretch(start_ns, np.concatenate(blocks)) for start_ns, blocks in found]

@@ -1,0 +1,194 @@
+"""What is exported is read by the other program's library with units and times, and can be imported again."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from scipy.io import loadmat
+
+from models.errors import RecordingError
+from models.machine import Machine, load_machine
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.recording import RecordedMessage, RecordingWriter
+from models.signals.wire import encode_arrow, encode_block
+from service.interchange.exported import Selection
+from service.interchange.exporting import ExportFormat, export
+from service.schemas import AlarmCloudEvent, Report, example
+from tests.interchange.material import START_NS, imported, stretches
+
+LAB = load_machine("lab")
+STEP_NS = 500_000
+
+
+def recording(
+    path: Path, described: Machine = LAB, blocks: int = 400, gap_after: int = 150, lost: int = 37
+) -> FloatArray:
+    """A live recording with a gap, blocks in both encodings, reports and alarms; its samples."""
+    rng = np.random.default_rng(5)
+    samples = rng.standard_normal((blocks * 200, len(described.sensors))).astype(described.dtype)
+    keys, schema_hash = described.keys, described.descriptor.schema_hash
+    with RecordingWriter(path) as writer:
+
+        def put(key: str, payload: bytes, attachment: bytes, encoding: str) -> None:
+            writer.write(RecordedMessage(key, payload, attachment, encoding, START_NS, START_NS))
+
+        put(keys.descriptor, described.descriptor.model_dump_json().encode(), b"", "application/json")
+        for number in range(blocks):
+            sequence = number + (lost if number >= gap_after else 0)
+            rows = samples[number * 200 : (number + 1) * 200]
+            block = SampleBlock(START_NS + sequence * 200 * STEP_NS, sequence, 1, described.rate_hz, rows)
+            encode = encode_arrow if number % 50 == 3 else encode_block
+            put(keys.stream, *encode(block, schema_hash))
+            if number == 7:
+                put(keys.stream, *encode_block(block, schema_hash))  # delivered twice
+                put(keys.stream, b"abc", b"", "application/x-rotorwatch-block")
+        for number in range(3):
+            report = {**example(Report), "site": "demo", "machine": "lab", "end_ns": START_NS + number * 5_000_000_000}
+            put(keys.report, json.dumps(report).encode(), b"", "application/json")
+        put(keys.report, b'{"half": ', b"", "application/json")
+        put(keys.alarm_event, json.dumps(example(AlarmCloudEvent)).encode(), b"", "application/json")
+    return samples.astype(np.float64)
+
+
+def times(blocks: int = 400, gap_after: int = 150, lost: int = 37) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    row = np.arange(blocks * 200)
+    return START_NS + STEP_NS * (row + np.where(row >= gap_after * 200, lost * 200, 0))
+
+
+def mapping(machine: Machine, names: dict[str, tuple[str, str]], time: str) -> str:
+    lines = [f'[time]\ncolumn = "{time}"\nunit = "ns"\nstart = "unix"\n[channels]']
+    for channel in machine.sensors:
+        column, unit = names[channel.name]
+        lines.append(f'{channel.name} = {{ column = "{column}", unit = "{unit}" }}')
+    return "\n".join(lines)
+
+
+SI = {"um": "m", "mm/s": "m/s", "rad": "rad"}
+
+
+@pytest.mark.parametrize("si", [False, True])
+@pytest.mark.parametrize("kind", ["parquet", "csv", "mat"])
+def test_exported_files_are_read_by_others_and_come_back_unchanged(
+    tmp_path: Path, kind: ExportFormat, si: bool
+) -> None:
+    samples = recording(tmp_path / "run.mcap")
+    out = tmp_path / f"run.{kind}"
+    table = export(Selection((tmp_path / "run.mcap",), si=si), "stream", kind, out)
+    assert table.rows == samples.shape[0]
+    assert len(table.skipped) == 2  # the repeated block and the one that is none
+    units = {channel.name: SI[channel.unit] if si else channel.unit for channel in LAB.sensors}
+    factors = np.array([channel.to_si if si else 1.0 for channel in LAB.sensors])
+    expected = samples * factors
+    names = {name: (name, unit) for name, unit in units.items()}
+    if kind == "parquet":
+        read = pa.parquet.read_table(out)
+        assert {field.name: field.metadata[b"unit"].decode() for field in read.schema} == {"time_ns": "ns", **units}
+        time_ns = read.column("time_ns").to_numpy()
+        found = np.column_stack([read.column(name).to_numpy() for name in units])
+        assert json.loads(read.schema.metadata[b"descriptor"])["machine"] == "lab"
+        time = "time_ns"
+    elif kind == "csv":
+        with out.open(newline="", encoding="utf-8") as file:
+            header, *rows = list(csv.reader(file))
+        assert header == ["time_ns", *(f"{name} [{unit}]" for name, unit in units.items())]
+        time_ns = np.array([int(row[0]) for row in rows])
+        found = np.array([[float(cell) for cell in row[1:]] for row in rows])
+        names = {name: (f"{name} [{unit}]", unit) for name, unit in units.items()}
+        time = "time_ns"
+    else:
+        content = loadmat(out, simplify_cells=True)["data"]
+        assert {name: content[name]["unit"] for name in units} == units
+        time_ns = content["time_ns"]["samples"]
+        found = np.column_stack([content[name]["samples"] for name in units])
+        names = {name: (f"data.{name}.samples", unit) for name, unit in units.items()}
+        time = "data.time_ns.samples"
+    np.testing.assert_array_equal(time_ns, times())
+    np.testing.assert_array_equal(found.astype(np.float32), expected.astype(np.float32))
+    wrapped = samples.copy()
+    wrapped[:, 8] = np.mod(samples[:, 8], 2 * np.pi)
+    done, back = imported(tmp_path, out, mapping(LAB, names, time), LAB)
+    first, second = stretches(back, LAB)
+    again = np.concatenate([first.samples, second.samples])
+    np.testing.assert_array_equal(again[:, :8], samples[:, :8])
+    np.testing.assert_allclose(again[:, 8], wrapped[:, 8], atol=1e-6)
+    assert (first.start_ns, first.samples.shape[0]) == (START_NS, 150 * 200)
+    assert second.start_ns == START_NS + 187 * 200 * STEP_NS
+    assert len(done.read.gaps) == 1
+
+
+def test_a_part_is_cut_to_the_sample_and_recordings_are_joined_in_time(tmp_path: Path) -> None:
+    whole = recording(tmp_path / "b.mcap")
+    selection = Selection(
+        (tmp_path / "b.mcap",), from_ns=START_NS + 1001 * STEP_NS - 7, to_ns=START_NS + 1700 * STEP_NS
+    )
+    export(selection, "stream", "parquet", tmp_path / "part.parquet")
+    read = pa.parquet.read_table(tmp_path / "part.parquet")
+    np.testing.assert_array_equal(read.column("time_ns").to_numpy(), times()[1001:1700])
+    np.testing.assert_array_equal(read.column("y1").to_numpy(), whole[1001:1700, 0].astype(np.float32))
+
+
+def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
+    recording(tmp_path / "run.mcap", blocks=2)
+    selection = Selection((tmp_path / "run.mcap",), to_ns=START_NS + 6_000_000_000)
+    table = export(selection, "reports", "parquet", tmp_path / "reports.parquet")
+    assert len(table.skipped) == 1  # the half message
+    read = pa.parquet.read_table(tmp_path / "reports.parquet")
+    assert read.column("end_ns").to_pylist() == [START_NS, START_NS + 5_000_000_000]
+    report = Report.model_validate(example(Report))
+    assert read.column("speed_rad_s").to_pylist() == [report.speed_rad_s] * 2
+    (reading,) = report.parameters
+    assert read.column(f"{reading.name}.relative_change").to_pylist() == [reading.relative_change] * 2
+    assert read.column("e.relative_change").null_count == 2
+    assert read.schema.field("speed_rad_s").metadata[b"unit"] == b"rad/s"
+    export(Selection((tmp_path / "run.mcap",)), "alarms", "csv", tmp_path / "alarms.csv")
+    with (tmp_path / "alarms.csv").open(newline="", encoding="utf-8") as file:
+        (event,) = list(csv.DictReader(file))
+    said = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
+    assert (event["parameter"], event["kind"], int(event["time_ns"])) == (
+        said.data.parameter,
+        said.data.kind,
+        said.data.time_ns,
+    )
+    assert event["text"] == said.data.text
+    export(Selection((tmp_path / "run.mcap",)), "reports", "mat", tmp_path / "reports.mat")
+    content = loadmat(tmp_path / "reports.mat", simplify_cells=True)["data"]
+    assert content["state"]["samples"].tolist() == [report.state] * 3
+    assert np.isnan(content["e_relative_change"]["samples"]).all()
+
+
+def test_channels_that_change_on_the_way_are_refused(tmp_path: Path) -> None:
+    recording(tmp_path / "a.mcap", blocks=2)
+    sensors = [channel.model_dump() for channel in LAB.sensors]
+    sensors[0]["unit"] = "mil"
+    recording(tmp_path / "b.mcap", Machine.model_validate({**LAB.model_dump(), "sensors": sensors}), blocks=2)
+    with pytest.raises(RecordingError, match="the channels on rotorwatch/demo/lab/descriptor are not those of before"):
+        export(Selection((tmp_path / "a.mcap", tmp_path / "b.mcap")), "stream", "csv", tmp_path / "out.csv")
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_one_of_several_machines_must_be_chosen(tmp_path: Path) -> None:
+    heavy = load_machine("heavy")
+    recording(tmp_path / "a.mcap", blocks=2)
+    recording(tmp_path / "b.mcap", heavy, blocks=3)
+    both = (tmp_path / "a.mcap", tmp_path / "b.mcap")
+    with pytest.raises(RecordingError, match="there are demo/heavy, demo/lab; choose one with --machine"):
+        export(Selection(both), "stream", "csv", tmp_path / "out.csv")
+    with pytest.raises(RecordingError, match="no machine demo/light; there are demo/heavy, demo/lab"):
+        export(Selection(both, machine="demo/light"), "stream", "csv", tmp_path / "out.csv")
+    assert export(Selection(both, machine="demo/heavy"), "stream", "csv", tmp_path / "out.csv").rows == 600
+
+
+def test_what_is_not_there_and_what_is_there_already_is_said(tmp_path: Path) -> None:
+    recording(tmp_path / "run.mcap", blocks=2)
+    selection = Selection((tmp_path / "run.mcap",), from_ns=START_NS + 10**12)
+    with pytest.raises(RecordingError, match="no stream in the time that is wanted"):
+        export(selection, "stream", "parquet", tmp_path / "out.parquet")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+    with pytest.raises(RecordingError, match=r"run\.mcap: exists already"):
+        export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap")
+    with pytest.raises(RecordingError, match=r"run\.mcap: is one of the recordings"):
+        export(Selection((tmp_path / "run.mcap",)), "stream", "parquet", tmp_path / "run.mcap", overwrite=True)

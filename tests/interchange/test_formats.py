@@ -1,0 +1,274 @@
+"""Files written by each format's own library come in with their samples and times."""
+
+import csv
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import asammdf
+import h5py
+import nptdms
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+import pyuff
+from scipy.io import savemat, wavfile
+
+from models.signals.recording import read_recording
+from service.interchange.source import SourceError
+from tests.interchange.material import RATE_HZ, START, START_NS, imported, machine, signals, stretches
+
+COUNT = 70_001  # more than one chunk of rows
+
+CHANNELS = """
+[channels]
+y1 = { column = "x", unit = "um" }
+y1_dot = { column = "v", unit = "mm/s" }
+theta = { column = "a", unit = "rad" }
+"""
+TIME_COLUMN = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
+RATE = f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n'
+
+Columns = dict[str, np.ndarray[tuple[int], np.dtype[np.float64]]]
+
+
+def write_csv(path: Path, columns: Columns) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+
+def write_german_csv(path: Path, columns: Columns) -> None:
+    with path.open("w", encoding="latin-1") as file:
+        file.write("Prüfstand 3\nt;x;v;a\ns;µm;mm/s;rad\n")
+        for row in zip(*(column.tolist() for column in columns.values()), strict=True):
+            file.write(";".join(repr(value).replace(".", ",") for value in row) + "\n")
+
+
+def write_parquet(path: Path, columns: Columns) -> None:
+    pa.parquet.write_table(pa.table(dict(columns)), path, row_group_size=9999)
+
+
+def write_npz(path: Path, columns: Columns) -> None:
+    np.savez_compressed(path, x=columns["x"], v=columns["v"], a=columns["a"], fs=np.array(RATE_HZ))
+
+
+def write_npz_table(path: Path, columns: Columns) -> None:
+    np.savez(path, table=np.vstack([columns["x"], columns["v"], columns["a"]]))
+
+
+def write_mat(path: Path, columns: Columns) -> None:
+    savemat(path, {"run": {"x": columns["x"], "v": columns["v"]}, "a": columns["a"][:, None], "fs": RATE_HZ})
+
+
+def write_mat73(path: Path, columns: Columns) -> None:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name in ("x", "v"):
+            data = file.create_dataset(f"run/{name}", data=columns[name][None, :], chunks=True, compression="gzip")
+            data.attrs["MATLAB_class"] = np.bytes_(b"double")
+        file.create_dataset("a", data=columns["a"][None, :]).attrs["MATLAB_class"] = np.bytes_(b"double")
+        text = file.create_dataset("note", data=np.frombuffer(b"hello", dtype=np.uint8).astype(np.uint16)[None, :])
+        text.attrs["MATLAB_class"] = np.bytes_(b"char")
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64, Created on: Sat Jan 31 12:00:00 2026 HDF5 schema 1.00 .")
+
+
+def write_wav(path: Path, columns: Columns) -> None:
+    wavfile.write(path, int(RATE_HZ), np.column_stack([columns["x"], columns["v"], columns["a"]]))
+
+
+def write_uff(path: Path, columns: Columns) -> None:
+    sets = [
+        pyuff.prepare_58(
+            binary=1,
+            func_type=1,
+            rsp_node=number,
+            rsp_dir=2,
+            ref_node=0,
+            ref_dir=0,
+            data=columns[name],
+            x=columns["t"],
+            id1=name,
+            abscissa_spacing=1,
+            abscissa_min=0.0,
+            abscissa_inc=1 / RATE_HZ,
+            num_pts=columns[name].size,
+            ord_data_type=4,
+            abscissa_spec_data_type=17,
+            ordinate_spec_data_type=8,
+            orddenom_spec_data_type=0,
+            z_axis_value=0.0,
+            ordinate_axis_units_lab=unit,
+        )
+        for number, (name, unit) in enumerate([("x", "um"), ("v", "mm/s"), ("a", "rad")])
+    ]
+    pyuff.UFF(str(path)).write_sets(sets, "add")
+
+
+def write_tdms(path: Path, columns: Columns) -> None:
+    with nptdms.TdmsWriter(str(path)) as writer:
+        for first in range(0, COUNT, 30_000):
+            writer.write_segment(
+                [
+                    nptdms.ChannelObject(
+                        "run",
+                        name,
+                        columns[name][first : first + 30_000],
+                        {
+                            "wf_increment": 1 / RATE_HZ,
+                            "wf_start_time": np.datetime64("2026-01-31T12:00:00"),
+                            "wf_start_offset": 0.0,
+                            "unit_string": unit,
+                        },
+                    )
+                    for name, unit in (("x", "um"), ("v", "mm/s"), ("a", "rad"))
+                ]
+            )
+
+
+def write_mf4(path: Path, columns: Columns) -> None:
+    with asammdf.MDF(version="4.10") as file:
+        file.start_time = datetime(2026, 1, 31, 12, tzinfo=UTC)
+        units = (("x", "um"), ("v", "mm/s"), ("a", "rad"))
+        file.append([asammdf.Signal(columns[name], columns["t"], name=name, unit=unit) for name, unit in units[:2]])
+        file.append([asammdf.Signal(columns["a"], columns["t"], name="a", unit="rad")])
+        file.append([asammdf.Signal(columns["a"][:10], columns["t"][:10], name="v", unit="mm/s")])
+        file.save(path, overwrite=True)
+
+
+def without_units(text: str) -> str:
+    for unit in ("um", "mm/s", "rad"):
+        text = text.replace(f', unit = "{unit}"', "")
+    return text
+
+
+CASES: dict[str, tuple[str, Callable[[Path, Columns], None], str]] = {
+    "csv": ("run.csv", write_csv, TIME_COLUMN + CHANNELS),
+    "csv-german": (
+        "run.txt",
+        write_german_csv,
+        TIME_COLUMN
+        + '[csv]\ndelimiter = ";"\ndecimal = ","\nskip_lines = 1\nskip_lines_after_header = 1\nencoding = "latin-1"\n'
+        + CHANNELS,
+    ),
+    "parquet": ("run.parquet", write_parquet, TIME_COLUMN + CHANNELS),
+    "npz": ("run.npz", write_npz, f'[time]\nrate_from = "fs"\nstart = "{START}"\n' + CHANNELS),
+    "npz-table": (
+        "run.npz",
+        write_npz_table,
+        RATE
+        + CHANNELS.replace('"x"', '"table", index = 0')
+        .replace('"v"', '"table", index = 1')
+        .replace('"a"', '"table", index = 2'),
+    ),
+    "mat-5": (
+        "run.mat",
+        write_mat,
+        f'[time]\nrate_from = "fs"\nstart = "{START}"\n' + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"'),
+    ),
+    "mat-7.3": ("run.mat", write_mat73, RATE + CHANNELS.replace('"x"', '"run.x"').replace('"v"', '"run.v"')),
+    "wav": (
+        "run.wav",
+        write_wav,
+        f'[time]\nstart = "{START}"\n' + CHANNELS.replace('"x"', "1").replace('"v"', "2").replace('"a"', "3"),
+    ),
+    "uff": ("run.uff", write_uff, f'[time]\nstart = "{START}"\n' + without_units(CHANNELS)),
+    "tdms": ("run.tdms", write_tdms, without_units(CHANNELS).replace('"v"', '"run/v"')),
+    "mf4": ("run.mf4", write_mf4, without_units(CHANNELS).replace('"v"', '"0/v"')),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # pyuff's own
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_file_of_the_formats_own_library_comes_in_unchanged(case: str, tmp_path: Path) -> None:
+    name, write, mapping = CASES[case]
+    time, x, v, angle = signals(COUNT)
+    write(tmp_path / name, {"t": time, "x": x, "v": v, "a": angle})
+    done, recording = imported(tmp_path, tmp_path / name, mapping)
+    (found,) = stretches(recording)
+    assert found.start_ns == START_NS
+    assert done.read.rows == done.written.samples == COUNT
+    np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
+    first = next(read_recording(recording))
+    assert first.key == machine().keys.descriptor
+    assert first.payload.decode() == machine().descriptor.model_dump_json()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "largest"), [(np.int16, 2.0**15), (np.int32, 2.0**31), (np.uint8, 2.0**7), (np.float32, 1.0)]
+)
+def test_whole_numbers_of_a_wav_file_are_fractions_of_full_scale(
+    tmp_path: Path, dtype: type[np.generic], largest: float
+) -> None:
+    fraction = np.sin(np.arange(4000) * 0.07) * 0.9
+    offset = 128 if dtype is np.uint8 else 0
+    whole = np.rint(fraction * largest) if largest > 1 else fraction
+    wavfile.write(tmp_path / "run.wav", 2000, np.column_stack([(whole + offset).astype(dtype)] * 3))
+    _, recording = imported(
+        tmp_path,
+        tmp_path / "run.wav",
+        f'time.start = "{START}"\n[channels]\ny1 = {{ column = 1, unit = "um", scale = 250.0 }}\n'
+        'y1_dot = { column = 2, unit = "mm/s" }\ntheta = { column = 3, unit = "rad" }\n',
+    )
+    np.testing.assert_allclose(
+        stretches(recording)[0].samples[:, 0], whole / largest * 250, rtol=1e-6 if dtype is np.float32 else 1e-12
+    )
+
+
+def test_dates_in_a_parquet_file_are_the_times(tmp_path: Path) -> None:
+    _, x, v, angle = signals(3000)
+    time = pa.array(START_NS + 500_000 * np.arange(3000), type=pa.timestamp("ns", tz="Europe/Berlin"))
+    pa.parquet.write_table(pa.table({"t": time, "x": x, "v": v, "a": angle}), tmp_path / "run.parquet")
+    mapping = '[time]\ncolumn = "t"\nunit = "datetime"\n' + CHANNELS
+    (found,) = stretches(imported(tmp_path, tmp_path / "run.parquet", mapping)[1])
+    assert found.start_ns == START_NS
+    np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
+
+
+@pytest.mark.parametrize("written", ["dates", "nanoseconds", "milliseconds"])
+def test_a_text_table_without_names_counts_its_columns(tmp_path: Path, written: str) -> None:
+    _, x, v, angle = signals(3000)
+    with (tmp_path / "run.csv").open("w", encoding="utf-8") as file:
+        for row in range(3000):
+            time_ns = START_NS + 500_000 * row
+            second, rest = divmod(time_ns, 1_000_000_000)
+            texts = {
+                "dates": f"{datetime.fromtimestamp(second, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}Z",
+                "nanoseconds": str(time_ns),
+                "milliseconds": str(row / 2),
+            }
+            file.write(f"{texts[written]},{float(x[row])!r},{float(v[row])!r},{float(angle[row])!r}\n")
+    times = {
+        "dates": 'unit = "datetime"',
+        "nanoseconds": 'unit = "ns"\nstart = "unix"',
+        "milliseconds": f'unit = "ms"\nstart = "{START}"',
+    }
+    mapping = f"[time]\ncolumn = 1\n{times[written]}\n[csv]\nheader = false\n" + CHANNELS.replace('"x"', "2")
+    mapping = mapping.replace('"v"', "3").replace('"a"', "4")
+    (found,) = stretches(imported(tmp_path, tmp_path / "run.csv", mapping)[1])
+    assert found.start_ns == START_NS
+    np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
+
+
+def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", x=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(SourceError, match="no column 'x'; there are none"):
+        imported(tmp_path, tmp_path / "run.npz", RATE + CHANNELS)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"])
+def test_a_file_that_is_none_of_its_kind_is_named(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"broken.{suffix}"
+    path.write_bytes(b"\x00\xff\x13 this is not it" * 30)
+    with pytest.raises(SourceError, match=r"broken\."):
+        imported(tmp_path, path, RATE + CHANNELS)
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+def test_an_unknown_format_says_which_ones_there_are(tmp_path: Path) -> None:
+    (tmp_path / "run.xyz").write_text("1,2")
+    with pytest.raises(SourceError, match=r"'\.xyz' is not known.*\.tdms"):
+        imported(tmp_path, tmp_path / "run.xyz", RATE + CHANNELS)

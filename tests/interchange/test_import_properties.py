@@ -1,0 +1,187 @@
+"""Whatever the gaps, the units and the places of duplicated times: nothing is invented, shifted or lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.machine import Machine
+from models.signals.units import unit_factor
+from service.interchange.source import SourceError
+from tests.interchange.material import RATE_HZ, START, START_NS, imported, machine, signals, stretches
+
+STEP_NS = 500_000
+CHANNELS = """
+[channels]
+y1 = { column = "x", unit = "um" }
+y1_dot = { column = "v", unit = "mm/s" }
+theta = { column = "a", unit = "rad" }
+"""
+NANOSECONDS = '[time]\ncolumn = "t"\nunit = "ns"\nstart = "unix"\n'
+
+runs = st.lists(
+    st.tuples(st.integers(2, 900), st.integers(2, 40_000)),  # samples, then steps without any
+    min_size=1,
+    max_size=6,
+)
+
+
+def write(
+    path: Path, time: np.ndarray[tuple[int], np.dtype[np.int64]], rows: int
+) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """A Parquet file with these times; the samples are numbered by their rows."""
+    _, x, v, a = signals(rows)
+    pa.parquet.write_table(pa.table({"t": time, "x": x, "v": v, "a": a}), path, row_group_size=311)
+    return np.column_stack([x, v, a])
+
+
+@settings(deadline=None, max_examples=40)
+@given(content=runs, shift_ns=st.integers(0, STEP_NS))
+def test_gaps_stay_gaps_and_every_sample_keeps_its_time(
+    tmp_path_factory: pytest.TempPathFactory, content: list[tuple[int, int]], shift_ns: int
+) -> None:
+    folder = tmp_path_factory.mktemp("gaps")
+    pieces, at = [], START_NS + shift_ns
+    for samples, pause in content:
+        pieces.append(at + STEP_NS * np.arange(samples, dtype=np.int64))
+        at += STEP_NS * (samples + pause - 1)
+    time = np.concatenate(pieces)
+    expected = write(folder / "run.parquet", time, time.size)
+    done, recording = imported(folder, folder / "run.parquet", NANOSECONDS + CHANNELS)
+    found = stretches(recording)
+    assert [stretch.start_ns for stretch in found] == [int(piece[0]) for piece in pieces]
+    assert [stretch.samples.shape[0] for stretch in found] == [piece.size for piece in pieces]
+    np.testing.assert_array_equal(np.concatenate([stretch.samples for stretch in found]), expected)
+    assert len(done.read.gaps) == len(content) - 1
+    for gap, (_, pause) in zip(done.read.gaps, content, strict=False):
+        assert gap.to_ns - gap.from_ns == pytest.approx((pause - 1) * STEP_NS)
+
+
+@settings(deadline=None, max_examples=30)
+@given(rows=st.integers(3, 2000), data=st.data())
+def test_a_duplicated_time_is_named_by_its_row(
+    tmp_path_factory: pytest.TempPathFactory, rows: int, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("duplicates")
+    twice = data.draw(st.integers(1, rows - 1))
+    time = START_NS + STEP_NS * np.arange(rows, dtype=np.int64)
+    time[twice:] -= STEP_NS
+    write(folder / "run.parquet", time, rows)
+    with pytest.raises(SourceError, match=f"row {twice + 1}, column t: repeats the time of the row before"):
+        imported(folder, folder / "run.parquet", NANOSECONDS + CHANNELS)
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    displacement=st.sampled_from(["m", "mm", "um", "µm", "\u03bcm", "mil", "in"]),
+    velocity=st.sampled_from(["m/s", "mm/s", "in/s", "ips"]),
+    angle=st.sampled_from(["rad", "deg", "rev"]),
+    kept=st.tuples(st.sampled_from(["m", "mm", "um", "mil"]), st.sampled_from(["m/s", "mm/s", "in/s"])),
+    scale=st.floats(1e-3, 1e3),
+    offset=st.floats(-50, 50),
+    sign=st.sampled_from([1, -1]),
+)
+def test_any_mix_of_units_gives_the_same_motion(
+    tmp_path_factory: pytest.TempPathFactory,
+    displacement: str,
+    velocity: str,
+    angle: str,
+    kept: tuple[str, str],
+    scale: float,
+    offset: float,
+    sign: int,
+) -> None:
+    folder = tmp_path_factory.mktemp("units")
+    _, x, v, a = signals(400)
+    x_SI, v_SI = x * 1e-6, v * 1e-3
+    sensors = [channel.model_dump() for channel in machine().sensors]
+    sensors[0]["unit"], sensors[1]["unit"] = kept
+    described: Machine = machine(sensors=sensors)
+    numbers = (sign * x_SI / unit_factor("displacement", displacement) - offset) / scale
+    pa.parquet.write_table(
+        pa.table(
+            {
+                "x": numbers,
+                "v": v_SI / unit_factor("velocity", velocity),
+                "a": a / unit_factor("shaft_angle", angle) + (1.0 if angle == "rev" else 0.0),
+            }
+        ),
+        folder / "run.parquet",
+    )
+    mapping = (
+        f'[time]\nrate_hz = 2000.0\nstart = "{START}"\n[channels]\n'
+        f'y1 = {{ column = "x", unit = "{displacement}", scale = {scale!r}, offset = {offset!r}, sign = {sign} }}\n'
+        f'y1_dot = {{ column = "v", unit = "{velocity}" }}\ntheta = {{ column = "a", unit = "{angle}" }}\n'
+    )
+    _, recording = imported(folder, folder / "run.parquet", mapping, described)
+    (found,) = stretches(recording, described)
+    si = found.samples * [channel.to_si for channel in described.sensors]
+    resolution = 1e-13 * abs(offset) * unit_factor("displacement", displacement)
+    np.testing.assert_allclose(si[:, 0], x_SI, rtol=1e-9, atol=1e-15 + resolution)
+    np.testing.assert_allclose(si[:, 1], v_SI, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(np.exp(1j * si[:, 2]), np.exp(1j * a), atol=1e-9)
+    assert ((si[:, 2] >= 0) & (si[:, 2] < 2 * np.pi)).all()
+
+
+@settings(deadline=None, max_examples=20)
+@given(seed=st.integers(0, 2**32 - 1), drift=st.floats(-5e-5, 5e-5))
+def test_jitter_and_a_drifting_clock_make_no_gaps(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, drift: float
+) -> None:
+    folder = tmp_path_factory.mktemp("jitter")
+    rng = np.random.default_rng(seed)
+    rows = 20_000
+    ideal = np.arange(rows) * STEP_NS * (1 + drift)
+    time = START_NS + np.rint(ideal + rng.uniform(-0.15, 0.15, rows) * STEP_NS).astype(np.int64)
+    expected = write(folder / "run.parquet", time, rows)
+    done, recording = imported(folder, folder / "run.parquet", NANOSECONDS + CHANNELS)
+    (found,) = stretches(recording)
+    assert not done.read.gaps
+    np.testing.assert_array_equal(found.samples, expected)
+    assert abs(found.start_ns - START_NS) < 0.1 * STEP_NS
+    assert abs(done.written.end_ns - START_NS - rows * STEP_NS * (1 + drift)) < 0.2 * STEP_NS
+
+
+@pytest.mark.parametrize("missing", [1, 3, 9])
+def test_gaps_up_to_the_declared_limit_are_bridged_and_said(tmp_path: Path, missing: int) -> None:
+    rows = 3000
+    time, x, v, a = signals(rows)
+    present = np.r_[0:1500, 1500 + missing : 2000, 2300:rows]
+    content = {"t": time[present], "x": x[present], "v": v[present], "a": a[present]}
+    pa.parquet.write_table(pa.table(content), tmp_path / "run.parquet")
+    mapping = f'[time]\ncolumn = "t"\nstart = "{START}"\nfill_gaps_up_to_s = 0.0045\n' + CHANNELS
+    done, recording = imported(tmp_path, tmp_path / "run.parquet", mapping)
+    assert done.read.filled == missing
+    assert [round((gap.to_ns - gap.from_ns) / STEP_NS) for gap in done.read.gaps] == [300]
+    first, second = stretches(recording)
+    assert first.samples.shape[0] == 2000
+    assert second.start_ns == START_NS + 2300 * STEP_NS
+    filled = first.samples[1500 : 1500 + missing]
+    ends = first.samples[[1499, 1500 + missing]]
+    part = np.arange(1, missing + 1) / (missing + 1)
+    np.testing.assert_allclose(filled[:, 0], ends[0, 0] + part * (ends[1, 0] - ends[0, 0]), rtol=1e-9)
+    np.testing.assert_allclose(np.exp(1j * filled[:, 2]), np.exp(1j * a[1500 : 1500 + missing]), atol=1e-6)
+
+
+@pytest.mark.parametrize(("rate_hz", "ratio"), [(5000.0, "2/5"), (1600.0, "5/4"), (2560.0, "25/32")])
+def test_another_rate_is_resampled_in_pieces_as_in_one(tmp_path: Path, rate_hz: float, ratio: str) -> None:
+    rows = int(rate_hz * 45)
+    _, x, v, a = signals(rows, rate_hz)
+    pa.parquet.write_table(pa.table({"x": x + 5000, "v": v, "a": a}), tmp_path / "run.parquet")
+    mapping = f'[time]\nrate_hz = {rate_hz}\nresample = true\nstart = "{START}"\n' + CHANNELS
+    done, recording = imported(tmp_path, tmp_path / "run.parquet", mapping)
+    assert str(done.clock.ratio) == ratio
+    (found,) = stretches(recording)
+    first_s = (found.start_ns - START_NS) / 1e9
+    assert 0 < first_s < 0.05
+    at = first_s + np.arange(found.samples.shape[0]) / RATE_HZ
+    omega = 2 * np.pi * 22.0
+    exact = 40 * np.cos(omega * at) + 3 * np.sin(170.0 * at) - 12
+    assert np.abs(found.samples[:, 0] - 5000 - exact).max() < 0.005 * 43
+    assert np.abs(np.angle(np.exp(1j * (found.samples[:, 2] - omega * at)))).max() < 0.005
+    assert done.cut_rows == rows - round(found.samples.shape[0] * rate_hz / RATE_HZ)
+    assert found.samples.shape[0] > 0.99 * 45 * RATE_HZ
