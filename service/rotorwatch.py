@@ -10,6 +10,7 @@ from rich.table import Table
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 from service.commands import interchange as interchange_commands
+from service.commands import record as record_commands
 from service.commands import replay as replay_commands
 from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
@@ -39,6 +40,7 @@ app = typer.Typer(
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
 )
 
+record_commands.register(app)
 replay_commands.register(app)
 interchange_commands.register(app)
 

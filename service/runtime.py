@@ -34,9 +34,10 @@ from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
 from service.logs import logger
 from service.recording.catalogue import Catalogue
+from service.recording.recorder import MachineRecorder
 from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
-from service.transport import Link, MachineCallbacks, MachineLink
+from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.worker import MachineWorker
 
 __all__ = ["HttpError", "Runtime", "StopRequest", "running", "stop_request"]
@@ -77,6 +78,7 @@ class Runtime:
         directory = settings.recording.directory
         self.catalogue = None if directory is None else Catalogue(Path(directory))
         self.replays = ReplayDesk(settings, self.catalogue)
+        self._recorders: dict[tuple[str, str], MachineRecorder] = {}
         self._link: Link | None = None
         self._server: _HttpServer | None = None
         self._undo = ExitStack()
@@ -110,6 +112,7 @@ class Runtime:
                 worker_alive=worker.alive,
                 worker_errors=worker.errors,
                 last_worker_error=worker.last_error,
+                recording=self._recording_state(worker.machine),
             )
             for worker in self._workers
         )
@@ -133,6 +136,7 @@ class Runtime:
             undo.callback(self._link.close)
             links = []
             for worker in self._workers:
+                self._record(worker.machine, self._link, undo)
                 links.append(self._connect(worker, self._link, undo))
             supervisor = _Supervisor(list(zip(self._workers, links, strict=True)))
             undo.callback(supervisor.stop)
@@ -142,6 +146,24 @@ class Runtime:
             server.start(self)
             self._undo = undo.pop_all()
         _log.info("running", http=server.url, machines=len(self._workers))
+
+    def _record(self, machine: Machine, link: Link, undo: ExitStack) -> None:
+        """Record the machine, if that is wanted; trouble with the disk is the recorder's own affair."""
+        if self.settings.recording.directory is None:
+            return
+        if self.settings.link.namespace:
+            _log.warning("not recorded: what is heard in a namespace is a replay", machine=machine.name)
+            return
+        recorder = MachineRecorder(machine, self.settings.recording)
+        undo.callback(recorder.stop)
+        recorder.start()
+        # Before anything is published for the machine, and undeclared after everything is.
+        undo.callback(MachineTap(link, machine.keys, recorder.put).close)
+        self._recorders[machine.site, machine.name] = recorder
+
+    def _recording_state(self, machine: Machine) -> str:
+        recorder = self._recorders.get((machine.site, machine.name))
+        return "off" if recorder is None else recorder.status().text
 
     def _connect(self, worker: MachineWorker, link: Link, undo: ExitStack) -> MachineLink:
         machine: Machine = worker.machine

@@ -444,6 +444,10 @@ class MachineReadiness(BaseModel):
     worker_alive: bool = Field(description="the thread that evaluates the machine's blocks runs", examples=[True])
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
     last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
+    recording: str = Field(
+        description="off, idle (nothing has arrived), recording, or failing: why. Monitoring goes on all the same",
+        examples=["recording"],
+    )
 
 
 class Readiness(BaseModel):

@@ -12,6 +12,7 @@ Callbacks run on Zenoh's threads. An exception in one is logged and counted here
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -23,10 +24,11 @@ import zenoh.ext
 from models.errors import RotorwatchError
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings
+from models.signals.recording import RecordedMessage
 from service.inbox import RawBlock
 from service.logs import logger
 
-__all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "TopicMessage", "follow", "route"]
+__all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap", "TopicMessage", "follow", "route"]
 
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
@@ -262,6 +264,54 @@ class MachineLink:
             self._callbacks.on_descriptor(reply.ok.payload.to_bytes())
 
 
+class MachineTap:
+    """Hands on every message under a machine's keys as it is, whoever published it, this program included.
+
+    Parameters
+    ----------
+    link : Link
+        Open session; must outlive this object.
+    keys : MachineKeys
+        The machine's keys.
+    on_message : callable
+        Takes each message on a thread of Zenoh's: be short. Descriptors also come as answers to a query, at the start
+        and whenever a publisher appears, so that one announced earlier is known.
+    """
+
+    def __init__(self, link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], None]) -> None:
+        self._link = link
+        self._keys = keys
+        self._on_message = on_message
+        session, guarded = link.session, link.guarded
+        with ExitStack() as undo:
+            undo.callback(session.declare_subscriber(f"{keys.root}/**", guarded(self._take)).undeclare)
+            alive = session.liveliness().declare_subscriber(
+                keys.publisher_alive, guarded(self._take_alive), history=True
+            )
+            undo.callback(alive.undeclare)
+            self._undeclare = undo.pop_all()
+        self._ask()
+
+    def close(self) -> None:
+        """Undeclare the subscriptions."""
+        self._undeclare.close()
+
+    def _ask(self) -> None:
+        self._link.session.get(self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._on_message(_verbatim(sample))
+
+    def _take_alive(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._ask()
+
+    def _take_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._on_message(_verbatim(reply.ok))
+
+
 @contextmanager
 def follow(
     settings: LinkSettings, machines: str, topics: tuple[str, ...], callback: Callable[[TopicMessage], None]
@@ -330,6 +380,23 @@ def route(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> Iterator[No
         yield
     finally:
         link.close()
+
+
+def _verbatim(sample: zenoh.Sample) -> RecordedMessage:
+    """A sample with the time at which it arrived, and that of its publication if it carries one."""
+    log_time_ns = time.time_ns()
+    publish_time_ns = log_time_ns
+    if sample.timestamp is not None:
+        publish_time_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    return RecordedMessage(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        attachment,
+        str(sample.encoding),
+        log_time_ns,
+        publish_time_ns,
+    )
 
 
 def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: int) -> zenoh.ext.AdvancedPublisher:

@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from models.errors import RecordingError
 from models.signals.recording import DAMAGE, RecordedMessage, RecordingWriter, reading, unpacked, writing
 
-__all__ = ["Salvage", "salvage_recording"]
+__all__ = ["Salvage", "inspect_recording", "salvage_recording"]
 
 
 @dataclass(slots=True)
@@ -83,9 +83,7 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
     RecordingError
         If `damaged` is missing or nothing of it can be read, or `target` exists or cannot be written.
     """
-    with reading(damaged):
-        stat = damaged.stat()
-    salvage = Salvage(size_bytes=stat.st_size, lost_bytes=stat.st_size, written_ns=stat.st_mtime_ns)
+    salvage = _nothing_yet(damaged)
     messages = _salvaged(damaged, salvage)
     first = next(messages, None)
     if first is None:
@@ -106,6 +104,26 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
         writer.part.unlink(missing_ok=True)
         raise
     return salvage
+
+
+def inspect_recording(path: Path) -> Salvage:
+    """Read a recording from end to end and say what can be read of it.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be opened.
+    """
+    salvage = _nothing_yet(path)
+    for _ in _salvaged(path, salvage):
+        pass
+    return salvage
+
+
+def _nothing_yet(path: Path) -> Salvage:
+    with reading(path):
+        stat = path.stat()
+    return Salvage(size_bytes=stat.st_size, lost_bytes=stat.st_size, written_ns=stat.st_mtime_ns)
 
 
 def _salvaged(damaged: Path, salvage: Salvage) -> Iterator[RecordedMessage]:

@@ -97,7 +97,7 @@ class Catalogue:
         found: list[Recording] = []
         for folder in self._folders(site, machine):
             kept = kept_reasons(folder)
-            for path in sorted(folder.iterdir()):
+            for path in _entries(folder):
                 recording = self._recording(path) if _FILE.fullmatch(path.name) else None
                 if recording is not None:
                     found.append(replace(recording, kept_because=kept.get(path.name, "")))
@@ -157,7 +157,9 @@ class Catalogue:
                 recording = replace(recording, problem=str(error))
             else:
                 count = sum(summary.messages.values())
-                recording = replace(recording, start_ns=summary.start_ns, end_ns=summary.end_ns, messages=count)
+                recording = replace(recording, messages=count)
+                if count:
+                    recording = replace(recording, start_ns=summary.start_ns, end_ns=summary.end_ns)
         self._read[path] = (stat.st_mtime_ns, stat.st_size, recording)
         return recording
 
@@ -210,10 +212,15 @@ def kept_reasons(folder: Path) -> dict[str, str]:
 
 def _subfolders(folder: Path, name: str | None) -> list[Path]:
     """Folders that may be a site or a machine, sorted; symbolic links are none."""
-    if name is not None and not _PLACE_ONLY.fullmatch(name):
-        return []
+    entries = [folder / name] if name is not None and _PLACE_ONLY.fullmatch(name) else []
+    if name is None:
+        entries = _entries(folder)
+    return [e for e in entries if _PLACE_ONLY.fullmatch(e.name) and e.is_dir() and not e.is_symlink()]
+
+
+def _entries(folder: Path) -> list[Path]:
+    """What is in a folder, sorted; nothing if it is gone or closed to us."""
     try:
-        entries = [folder / name] if name is not None else sorted(folder.iterdir())
-        return [e for e in entries if _PLACE_ONLY.fullmatch(e.name) and e.is_dir() and not e.is_symlink()]
+        return sorted(folder.iterdir())
     except OSError:
         return []

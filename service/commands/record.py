@@ -1,0 +1,233 @@
+"""``rotorwatch record`` and ``rotorwatch recover``: messages into files, and what a crash left of them."""
+
+import json
+import sys
+from contextlib import ExitStack
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from models.errors import MachineFileError, RecordingError
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
+
+if TYPE_CHECKING:  # these import numpy, which --help must not wait for
+    from models.machine import Machine
+    from models.signals.salvage import Salvage
+    from service.config import RecordingSettings
+    from service.recording.recorder import MachineRecorder
+
+__all__ = ["register"]
+
+_STATUS_S = 0.5
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(record)
+    app.command()(recover)
+
+
+def record(
+    machine: Annotated[
+        list[str] | None,
+        typer.Option("--machine", metavar="FILE", help="Machine to record: shipped name or path. Repeatable."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where files go, in DIR/<site>/<machine>/.")
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option("--config", metavar="FILE", help="Settings (TOML): machines, and what is kept, \\[recording]."),
+    ] = None,
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+    rotate_s: Annotated[
+        float | None, typer.Option("--rotate-s", metavar="SECONDS", help="Longest time in one file; 300 if left out.")
+    ] = None,
+    rotate_mb: Annotated[
+        float | None, typer.Option("--rotate-mb", metavar="MB", help="Size at which a file is closed; 256 if left out.")
+    ] = None,
+    keep_gb: Annotated[
+        float | None, typer.Option("--keep-gb", metavar="GB", help="Most that is kept per machine; 20 if left out.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="The recorders' status as JSON lines: how many messages are safe on disk.")
+    ] = False,
+) -> None:
+    """Record everything that is published under machines' keys until Ctrl-C.
+
+    A monitor records by itself if its settings say so; this is for recording without one. Older files are dropped; what
+    lies around an alarm is kept longer.
+
+    [bold]Examples[/bold]
+
+    Beside a monitor on this computer:
+    [cyan]rotorwatch record --machine pump-7.toml --out /data/recordings[/cyan]
+
+    Two machines, through a router:
+    [cyan]rotorwatch record --machine pump-7.toml --machine fan-2.toml --out /data --connect tcp/10.0.0.9:7447[/cyan]
+    """
+    with exit_codes(), ExitStack() as undo:
+        one_blas_thread()
+        changes = {"rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
+        machines, settings = _settings(config, machine, out, {k: v for k, v in changes.items() if v is not None})
+        from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
+        from service.config import LogSettings  # noqa: PLC0415
+        from service.logs import configure_logging  # noqa: PLC0415
+        from service.recording.recorder import MachineRecorder  # noqa: PLC0415
+        from service.runtime import stop_request  # noqa: PLC0415
+        from service.transport import Link, MachineTap  # noqa: PLC0415
+
+        configure_logging(LogSettings())
+        ends = tuple(connect or (() if listen else (ENDPOINT,)))
+        link_settings = LinkSettings(mode="peer" if listen else "client", listen=tuple(listen or ()), connect=ends)
+        recorders = [MachineRecorder(one, settings) for one in machines]
+        for recorder in recorders:
+            recorder.prepare()  # a folder that cannot be written is a mistake to be told at once
+        stop = undo.enter_context(stop_request())
+        link = Link(link_settings)
+        undo.callback(link.close)
+        with ExitStack() as running:
+            for recorder in recorders:
+                running.callback(recorder.stop)
+                recorder.start()
+                running.callback(MachineTap(link, recorder.machine.keys, recorder.put).close)
+                if not as_json:
+                    typer.echo(f"recording {recorder.machine.keys.root} into {recorder.folder}/; Ctrl-C ends")
+            show = _Statuses(recorders) if as_json else None
+            sys.stdout.flush()
+            while not stop.wait(_STATUS_S):
+                if show is not None:
+                    show()
+        if show is not None:
+            show()
+        elif not _summed_up(recorders):
+            raise typer.Exit(1)
+
+
+def recover(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="What a crash left, usually NAME.mcap.part.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="Name of the recovered recording, for one FILE. If left out: NAME.mcap, or NAME.recovered.mcap if the "
+            "damaged file has that name.",
+        ),
+    ] = None,
+) -> None:
+    """Recover recordings whose writer was killed, and damaged ones; say what was recovered and what was lost.
+
+    The damaged file stays. A recorder recovers what it left itself when it is started again.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch recover /data/recordings/demo/lab/20261121T142530Z.mcap.part[/cyan]
+    """
+    with exit_codes():
+        if out is not None and len(files) > 1:
+            raise MachineFileError(f"--out names one file, and there are {len(files)} to recover")
+    failed = False
+    for file in files:
+        try:
+            _recover(file, out)
+        except RecordingError as error:
+            failed = True
+            typer.echo(str(error), err=True)
+    if failed:
+        raise typer.Exit(1)
+
+
+class _Statuses:
+    """Writes a JSON line for every recorder whose status has changed."""
+
+    def __init__(self, recorders: "list[MachineRecorder]") -> None:
+        self._shown: dict[str, str] = {}
+        self._recorders = recorders
+
+    def __call__(self) -> None:
+        for recorder in self._recorders:
+            line = json.dumps(asdict(recorder.status()))
+            if self._shown.get(recorder.folder.as_posix()) != line:
+                self._shown[recorder.folder.as_posix()] = line
+                typer.echo(line)
+        sys.stdout.flush()
+
+
+def _settings(
+    config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
+) -> "tuple[list[Machine], RecordingSettings]":
+    """Machines and settings: the command line over the settings file."""
+    from pydantic import ValidationError  # noqa: PLC0415  # keeps --help quick
+
+    from models.machine import load_machine, validation_text  # noqa: PLC0415
+    from service.config import RecordingSettings, load_settings  # noqa: PLC0415
+
+    settings = None if config is None else load_settings(config)
+    if not machines and settings is None:
+        raise MachineFileError("nothing to record: give --machine FILE, or --config FILE with machines in it")
+    fields = {} if settings is None else settings.recording.model_dump()
+    if out is not None:
+        fields["directory"] = str(out)
+    try:
+        recording = RecordingSettings.model_validate(fields | changes)
+    except ValidationError as error:
+        raise MachineFileError(validation_text(Path("command line"), error)) from error
+    if recording.directory is None:
+        raise MachineFileError("nowhere to record to: give --out DIR, or directory in [recording] of the settings")
+    files = machines or [entry.file for entry in settings.machines] if settings is not None else machines or []
+    loaded = [load_machine(file) for file in files]
+    roots = [one.keys.root for one in loaded]
+    for root in roots:
+        if roots.count(root) > 1:
+            raise MachineFileError(f"two of the machine files describe {root}")
+    return loaded, recording
+
+
+def _summed_up(recorders: "list[MachineRecorder]") -> bool:
+    """Say what was recorded; whether it was everything."""
+    whole = True
+    for recorder in recorders:
+        status = recorder.status()
+        whole = whole and not status.dropped and not status.lost and not status.problem
+        typer.echo(
+            f"{status.site}/{status.machine}: {status.synced} of {status.received} messages recorded, "
+            f"{status.files} files closed; {status.dropped} dropped, {status.lost} lost"
+            + (f"; {status.problem}" if status.problem else "")
+        )
+    return whole
+
+
+def _recover(file: Path, out: Path | None) -> None:
+    from models.signals.salvage import inspect_recording, salvage_recording  # noqa: PLC0415  # keeps --help quick
+    from service.recording.catalogue import PART  # noqa: PLC0415
+    from service.recording.leftovers import is_locked, loss_text  # noqa: PLC0415
+
+    partial = file.suffix == PART
+    if partial and is_locked(file.parent):
+        raise RecordingError(f"{file}: a recorder is at work in {file.parent}, and recovers what is left there itself")
+    if not partial and inspect_recording(file).complete:
+        typer.echo(f"{file}: complete, nothing to recover")
+        return
+    target = out
+    if target is None:
+        target = (
+            file.with_suffix("") if partial else file.with_name(f"{file.name.removesuffix('.mcap')}.recovered.mcap")
+        )
+    salvage = salvage_recording(file, target)
+    typer.echo(f"{file}: {salvage.count} messages recovered into {target}")
+    for line in _contents(salvage):
+        typer.echo(f"  {line}")
+    typer.echo(f"  {loss_text(salvage)}")
+
+
+def _contents(salvage: "Salvage") -> list[str]:
+    width = max(map(len, salvage.messages), default=0)
+    lines = [f"{key:<{width}} {count:>9} messages" for key, count in sorted(salvage.messages.items())]
+    begin, end = (datetime.fromtimestamp(t * 1e-9, UTC) for t in (salvage.start_ns, salvage.end_ns))
+    span_s = (salvage.end_ns - salvage.start_ns) * 1e-9
+    return [*lines, f"from {begin:%Y-%m-%d %H:%M:%S.%f} to {end:%Y-%m-%d %H:%M:%S.%f} UTC ({span_s:.3f} s)"]
