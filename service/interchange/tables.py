@@ -202,7 +202,8 @@ class ParquetSource(_Table):
             kind = self._schema.field(name).type
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_timestamp(kind)):
                 raise SourceError(f"{self.path}: column {name!r} holds {kind}, expected numbers")
-        with readable(self.path, "Parquet"), pa.parquet.ParquetFile(self.path) as file:
+        # With pre_buffer Arrow would keep all that it has read of the file.
+        with readable(self.path, "Parquet"), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
                 yield tuple(_array(batch.column(name)) for name in wanted)
 

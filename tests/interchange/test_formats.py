@@ -16,7 +16,8 @@ import pyuff
 from scipy.io import savemat, wavfile
 
 from models.signals.recording import read_recording
-from service.interchange.source import SourceError
+from service.interchange.source import Reference, SourceError
+from service.interchange.tables import ParquetSource
 from tests.interchange.material import RATE_HZ, START, START_NS, imported, machine, signals, stretches
 
 COUNT = 70_001  # more than one chunk of rows
@@ -251,6 +252,19 @@ def test_a_text_table_without_names_counts_its_columns(tmp_path: Path, written: 
     (found,) = stretches(imported(tmp_path, tmp_path / "run.csv", mapping)[1])
     assert found.start_ns == START_NS
     np.testing.assert_array_equal(found.samples, np.column_stack([x, v, angle]))
+
+
+def test_a_long_parquet_file_is_not_kept_in_memory(tmp_path: Path) -> None:
+    column = np.random.default_rng(1).standard_normal(2_000_000)
+    pa.parquet.write_table(pa.table({"x": column}), tmp_path / "run.parquet", row_group_size=100_000)
+    del column
+    before = pa.total_allocated_bytes()
+    rows, most = 0, 0
+    for (chunk,) in ParquetSource(tmp_path / "run.parquet").chunks([Reference("x")]):
+        rows += chunk.size
+        most = max(most, pa.total_allocated_bytes() - before)
+    assert rows == 2_000_000
+    assert most < 8e6  # of 16 MB
 
 
 def test_pickled_objects_are_not_loaded(tmp_path: Path) -> None:

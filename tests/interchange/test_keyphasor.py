@@ -96,7 +96,7 @@ def test_edges_are_the_same_in_whatever_pieces_the_signal_comes(cuts: list[int],
 
 
 def test_a_chattering_edge_counts_once_with_hysteresis_and_often_without() -> None:
-    time = np.arange(12) * 1.0
+    time = np.arange(12, dtype=np.float64)
     signal = np.array([0.0, 0, 3, 1.8, 3, 1.9, 3, 0, 0, 3, 3, 0])
     assert EdgeDetector(2.0, 1.0, rising=True).feed(time, signal).size == 2
     assert EdgeDetector(2.0, 0.0, rising=True).feed(time, signal).size == 4
