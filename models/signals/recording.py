@@ -141,6 +141,7 @@ class RecordingWriter:
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
             self._writer.start(profile=_PROFILE, library=_LIBRARY)
             self._json_schema = self._writer.register_schema("json", "jsonschema", b'{"type":"object"}')
+            self._hand_over()
 
     @property
     def messages(self) -> int:

@@ -99,9 +99,11 @@ def record(
                     typer.echo(f"recording {recorder.machine.keys.root} into {recorder.folder}/; Ctrl-C ends")
             show = _Statuses(recorders) if as_json else None
             sys.stdout.flush()
-            while not stop.wait(_STATUS_S):
+            while True:
                 if show is not None:
                     show()
+                if stop.wait(_STATUS_S):
+                    break
         if show is not None:
             show()
         elif not _summed_up(recorders):

@@ -6,8 +6,8 @@
                              (bounded)     |
                                            '--> leftovers, retention, kept.json
 
-Trouble with the disk never reaches the caller of `put`: it is logged, stated in the status, and tried again every two
-seconds; meanwhile the queue keeps what it can.
+Trouble with the disk never reaches the caller of `put`: it is logged, stated in the status, and tried again every
+second; meanwhile the queue keeps what it can.
 """
 
 import json
@@ -32,7 +32,7 @@ from service.recording.retention import AlarmMark, alarm_mark, alarm_marks, deci
 __all__ = ["MachineRecorder", "RecorderStatus"]
 
 _SYNC_S = 1.0
-_RETRY_S = 2.0
+_RETRY_S = 1.0
 _JOIN_S = 30.0
 _TIDY_S = 600.0
 _MOST_CHANNELS = 10_000
@@ -199,6 +199,7 @@ class MachineRecorder:
         return "" if writer is None else writer.part.name
 
     def _run(self) -> None:
+        last = False
         while True:
             try:
                 self.prepare()
@@ -216,7 +217,9 @@ class MachineRecorder:
                 self._leave_out()
                 self._fail(f"{type(error).__name__}: {error}")
             if self._give_up.wait(_RETRY_S):
-                break
+                if last:
+                    break
+                last = True
         self._lost += len(self._pending)
         while batch := self._backlog.take(0.0):
             self._lost += len(batch)
@@ -228,7 +231,7 @@ class MachineRecorder:
         while True:
             if not self._pending:
                 self._pending.extend(self._backlog.take(_SYNC_S / 4))
-            while self._pending:
+            if self._pending:
                 self._at_hand = True
                 self._write(self._pending[0])
                 self._at_hand = False
@@ -237,11 +240,7 @@ class MachineRecorder:
             if writer is not None:
                 if now_s - self._synced_s >= _SYNC_S:
                     self._sync(writer)
-                if (
-                    writer.size_bytes >= self.settings.rotate_mb * 1e6
-                    or now_s - self._opened_s >= self.settings.rotate_s
-                    or writer.channels >= _MOST_CHANNELS
-                ):
+                if self._is_due(writer, now_s):
                     self._close(writer)
                     self._tidy()
             elif now_s - self._tidied_s >= _TIDY_S:
@@ -251,6 +250,14 @@ class MachineRecorder:
                     self._close(self._writer)
                     self._tidy()
                 return
+
+    def _is_due(self, writer: RecordingWriter, now_s: float) -> bool:
+        """Whether the file is to be closed and another one begun."""
+        return (
+            writer.size_bytes >= self.settings.rotate_mb * 1e6
+            or now_s - self._opened_s >= self.settings.rotate_s
+            or writer.channels >= _MOST_CHANNELS
+        )
 
     def _write(self, message: RecordedMessage) -> None:
         writer = self._writer
