@@ -33,7 +33,6 @@ _CACHE_OTHER = 100
 _HEARTBEAT_S = 0.5
 _POLL_S = 0.02
 _DRAIN_S = 60.0
-_LINGER_S = 2.0  # so that a subscriber can fetch what it missed
 _BLOCKED_US = 20_000_000
 _LIVENESS_TIMEOUT_S = 2.0
 
@@ -62,6 +61,8 @@ class NetworkPlan:
         Times of recording.
     wait_for_subscriber_s : float
         Hold the first message of a pass back at most this long.
+    linger_s : float
+        How long a pass stays open after its last message, so that a subscriber can fetch what it missed.
     """
 
     link: LinkSettings
@@ -73,6 +74,7 @@ class NetworkPlan:
     from_ns: int
     to_ns: int
     wait_for_subscriber_s: float = 0.0
+    linger_s: float = 2.0
 
     def prefix_of(self, number: int) -> str:
         """Prefix of a pass.
@@ -323,7 +325,7 @@ def replay_to_network(
             if not control.stopped:
                 if plan.pace is None:
                     link.drain(_DRAIN_S)
-                control.wait_until(control.now_s() + _LINGER_S)
+                control.wait_until(control.now_s() + plan.linger_s)
             link.end_pass()
     if control.reason:
         raise LiveMachineError(control.reason)

@@ -263,11 +263,14 @@ class _Job:
             self._view = self._view.model_copy(update=update)
 
     def _last_words(self) -> str:
-        """End of what the process said on standard error, without this computer's paths to the results."""
+        """End of what the process said on standard error; nothing of the inside."""
         try:
             text = (self.folder / _MESSAGES).read_text(encoding="utf-8", errors="replace")
         except OSError:
             return ""
+        if "Traceback (most recent call last)" in text:
+            _log.error("a replay ended with a defect", id=self._view.id, messages=text[-_ERROR_CHARACTERS:])
+            return "an error inside the replay; the service's log says more"
         return text.strip()[-_ERROR_CHARACTERS:].replace(f"{self.folder}/", "")
 
 

@@ -76,9 +76,9 @@ def play(
             due_s = None if plan.pace is None else anchor_s + (message.log_time_ns - anchor_ns) / 1e9 / plan.pace
             if not control.wait_until(due_s):
                 break
+            control.at(message.log_time_ns)
             sink.put(message)
             count += 1
-            control.at(message.log_time_ns)
             if on_progress is not None:
                 on_progress(_progress(plan, control, message.log_time_ns, count))
         if control.stopped:

@@ -120,7 +120,9 @@ class ReplayJob(BaseModel):
     )
     from_ns: int | None = Field(description="as requested", examples=[1767225600000000000])
     to_ns: int | None = Field(description="as requested", examples=[1767225900000000000])
-    pace: float | None = Field(description="recorded seconds per second; null: as fast as possible", examples=[None])
+    pace: float | None = Field(
+        default=None, description="recorded seconds per second; null: as fast as possible", examples=[None]
+    )
     prefix: str = Field(
         description="paced: what goes before every key, and the namespace of a monitor for it; empty offline",
         examples=[""],

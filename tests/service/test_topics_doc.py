@@ -11,6 +11,9 @@ from models.signals.channels import ChannelDescriptor
 from models.signals.keys import MachineKeys
 from service.api import AlarmEventList, Alive, MachineList, ReportList, create_app
 from service.config import ServiceSettings, load_settings
+from service.recordings_api import RecordingDetail, RecordingList
+from service.replay.schemas import ReplayJob, ReplayRequest, ReplaySeek
+from service.replays_api import ReplayAlarmList, ReplayList, ReplayReportList
 from service.runtime import Runtime
 from service.schemas import (
     AlarmCloudEvent,
@@ -44,8 +47,25 @@ ROUTES: dict[str, type[BaseModel]] = {
     "/api/v1/machines/{site}/{machine}/alarms": AlarmStates,
     "/api/v1/machines/{site}/{machine}/detectable": DetectableChanges,
     "/api/v1/machines/{site}/{machine}/alarms/events": AlarmEventList,
+    "/api/v1/recordings": RecordingList,
+    "/api/v1/recordings/{site}/{machine}/{name}": RecordingDetail,
+    "/api/v1/replays": ReplayList,
+    "/api/v1/replays/{replay_id}": ReplayJob,
+    "/api/v1/replays/{replay_id}/reports": ReplayReportList,
+    "/api/v1/replays/{replay_id}/alarms": ReplayAlarmList,
     "/healthz": Alive,
     "/readyz": Readiness,
+}
+CHANGES: dict[str, type[BaseModel] | None] = {
+    "POST /api/v1/replays": ReplayRequest,
+    "POST /api/v1/replays/{replay_id}/seek": ReplaySeek,
+    "POST /api/v1/replays/{replay_id}/pause": None,
+    "POST /api/v1/replays/{replay_id}/resume": None,
+    "DELETE /api/v1/replays/{replay_id}": None,
+}
+WITHOUT_EXAMPLE = {
+    "GET /api/v1/recordings/{site}/{machine}/{name}/download",
+    "GET /api/v1/replays/{replay_id}/events",
 }
 
 
@@ -90,9 +110,10 @@ def test_every_state_is_explained() -> None:
 
 def test_every_route_of_the_application_has_its_section() -> None:
     app = create_app(Runtime(settings("tcp/127.0.0.1:0")))
-    served = set(app.openapi()["paths"])
-    assert served == set(ROUTES)
-    assert {title.removeprefix("`GET ").removeprefix("GET ") for title in sections("api.md")} == served | {"Errors"}
+    paths = app.openapi()["paths"]
+    served = {f"{method.upper()} {path}" for path, methods in paths.items() for method in methods}
+    assert served == {f"GET {path}" for path in ROUTES} | set(CHANGES) | WITHOUT_EXAMPLE
+    assert set(sections("api.md")) == served | {"Errors", "Who may change anything"}
 
 
 @pytest.mark.parametrize("route", ROUTES)
@@ -100,6 +121,14 @@ def test_example_of_a_route_is_valid(route: str) -> None:
     (shown,) = json_blocks(sections("api.md")[f"GET {route}"])
     ROUTES[route].model_validate(shown)
     assert set(shown) == set(ROUTES[route].model_fields)
+
+
+@pytest.mark.parametrize("route", [route for route, model in CHANGES.items() if model is not None])
+def test_example_of_a_request_is_valid(route: str) -> None:
+    model = CHANGES[route]
+    assert model is not None
+    (shown,) = json_blocks(sections("api.md")[route])
+    model.model_validate(shown)
 
 
 def test_example_of_a_problem_is_valid() -> None:
@@ -110,8 +139,9 @@ def test_example_of_a_problem_is_valid() -> None:
 def test_every_query_argument_is_explained() -> None:
     page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     paths = create_app(Runtime(settings("tcp/127.0.0.1:0"))).openapi()["paths"]
-    arguments = {p["name"] for path in paths.values() for p in path["get"].get("parameters", []) if p["in"] == "query"}
-    assert arguments == {"since_ns", "until_ns", "limit", "all", "change"}
+    routes = [route for path in paths.values() for route in path.values()]
+    arguments = {p["name"] for route in routes for p in route.get("parameters", []) if p["in"] == "query"}
+    assert arguments == {"since_ns", "until_ns", "limit", "all", "change", "site", "machine", "offset"}
     for name in arguments - {"all"}:
         assert f"| `{name}` |" in page
     assert "?all=true" in page

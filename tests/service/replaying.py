@@ -1,0 +1,57 @@
+"""What the tests of replays share: recordings of simulated machines, and what a running service said, as lines."""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from models.machine import Machine
+from models.signals.block import SampleBlock
+from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
+from service import conversion
+from service.worker import MachineWorker
+from simulator.recorder import record
+from tests.service.live import LAB
+
+__all__ = ["digest_of", "lines_of", "recording", "split", "write"]
+
+
+def recording(path: Path, stream: Sequence[SampleBlock], machine: Machine = LAB) -> Path:
+    """A recording as the simulator writes it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    record(machine, ((block, ()) for block in stream), path)
+    return path
+
+
+def write(path: Path, messages: Sequence[RecordedMessage]) -> Path:
+    """A recording of these messages."""
+    with RecordingWriter(path) as writer:
+        for message in messages:
+            writer.write(message)
+    return path
+
+
+def split(source: Path, folder: Path, at: int) -> list[Path]:
+    """The same messages in two files, the later one first."""
+    messages = list(read_recording(source))
+    return [write(folder / "b.mcap", messages[at:]), write(folder / "a.mcap", messages[:at])]
+
+
+def lines_of(worker: MachineWorker) -> list[str]:
+    """What a live monitor published, as lines: topic and message in the order of time, reports before alarms."""
+    keys, most = worker.machine.keys, 1000
+    timed = [
+        (window.end_ns, 0, keys.report, conversion.report(worker.identity, window).model_dump_json())
+        for window in reversed(worker.history.reports(limit=most))
+    ]
+    timed += [
+        (event.time_ns, 1, keys.alarm_event, conversion.alarm_cloud_event(worker.identity, event).model_dump_json())
+        for event in reversed(worker.history.alarm_events(limit=most))
+    ]
+    timed.sort(key=lambda entry: entry[:2])
+    return [f'{{"topic": {json.dumps(topic)}, "message": {text}}}' for _, _, topic, text in timed]
+
+
+def digest_of(worker: MachineWorker) -> str:
+    """SHA-256 of these lines."""
+    return hashlib.sha256("".join(line + "\n" for line in lines_of(worker)).encode()).hexdigest()

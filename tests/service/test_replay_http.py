@@ -1,0 +1,365 @@
+"""Recordings and replays over HTTP: a real service, real processes."""
+
+import hashlib
+import http.client
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+from pydantic import BaseModel
+
+from models.signals.link import LinkSettings
+from service.config import HttpSettings, MachineEntry, RecordingSettings, ReplaySettings, ServiceSettings
+from service.recordings_api import RecordingDetail, RecordingList
+from service.replay.schemas import ReplayJob
+from service.replays_api import ReplayAlarmList, ReplayDesk, ReplayList, ReplayReportList
+from service.runtime import Runtime, running
+from service.schemas import Problem
+from simulator.scenario import parse_fault
+from tests.service.live import START_NS, endpoint, scenario_blocks, until
+from tests.service.replaying import recording
+
+M = TypeVar("M", bound=BaseModel)
+ID = "demo/lab/20260101T000000Z.mcap"
+RECORDINGS, REPLAYS = "/api/v1/recordings", "/api/v1/replays"
+GET_MODELS: dict[str, type[BaseModel]] = {
+    RECORDINGS: RecordingList,
+    f"{RECORDINGS}/{{site}}/{{machine}}/{{name}}": RecordingDetail,
+    REPLAYS: ReplayList,
+    f"{REPLAYS}/{{replay_id}}": ReplayJob,
+    f"{REPLAYS}/{{replay_id}}/reports": ReplayReportList,
+    f"{REPLAYS}/{{replay_id}}/alarms": ReplayAlarmList,
+}
+DAY_NS = 86_400 * 10**9
+ENDED = ("finished", "stopped", "failed")
+
+
+def plan(directory: Path | None, **replay: object) -> ServiceSettings:
+    return ServiceSettings(
+        link=LinkSettings(listen=(endpoint(),)),
+        http=HttpSettings(port=0),
+        machines=(MachineEntry(file="lab", bundle="lab"),),
+        # The service records there too; recordings of January stay.
+        recording=RecordingSettings(directory=None if directory is None else str(directory), keep_days=36_500.0),
+        replay=ReplaySettings.model_validate(replay),
+    )
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    recording(folder / ID, scenario_blocks(85.0, parse_fault("c_bz=0.5@0")))
+    recording(folder / "demo/lab/20260101T010000Z.mcap", scenario_blocks(3.0, start_ns=START_NS + 3600 * 10**9))
+    (folder / "demo/pump").mkdir()
+    (folder / "demo/pump/20260101T020000Z.mcap.part").write_bytes(b"being written")
+    (folder / "secret.mcap").write_text("secret", encoding="utf-8")
+    (folder / "demo/lab/link.mcap").symlink_to(folder / "secret.mcap")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runtime(directory: Path) -> Iterator[Runtime]:
+    with running(plan(directory)) as started:
+        yield started
+
+
+@pytest.fixture
+def client(runtime: Runtime) -> Iterator[httpx.Client]:
+    with httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=30.0) as opened:
+        yield opened
+
+
+def get(client: httpx.Client, path: str, model: type[M], **arguments: Any) -> M:
+    return model.model_validate_json(client.get(path, params=arguments).raise_for_status().content)
+
+
+def problem(answer: httpx.Response, status: int) -> Problem:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    return Problem.model_validate_json(answer.content)
+
+
+def start(client: httpx.Client, **request: Any) -> ReplayJob:
+    answer = client.post(REPLAYS, json={"recordings": [ID], **request})
+    assert answer.status_code == 201, answer.text
+    return ReplayJob.model_validate_json(answer.content)
+
+
+def ended(client: httpx.Client, job: ReplayJob) -> ReplayJob:
+    until(lambda: get(client, f"{REPLAYS}/{job.id}", ReplayJob).state in ENDED, "end of the replay")
+    return get(client, f"{REPLAYS}/{job.id}", ReplayJob)
+
+
+def test_recordings_are_listed(client: httpx.Client) -> None:
+    first, second, part = get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings
+    assert first.id == ID
+    assert (first.site, first.machine, first.messages, first.complete) == ("demo", "lab", 851, True)
+    assert (first.start_ns, first.end_ns) == (START_NS, START_NS + 85 * 10**9)
+    assert not part.complete
+    by_time = get(client, RECORDINGS, RecordingList, since_ns=second.start_ns, until_ns=second.end_ns)
+    assert by_time.recordings == (second,)
+    assert get(client, RECORDINGS, RecordingList, site="demo", machine="fan").recordings == ()
+    detail = get(client, f"{RECORDINGS}/{ID}", RecordingDetail)
+    assert detail.keys == {"rotorwatch/demo/lab/descriptor": 1, "rotorwatch/demo/lab/stream": 850}
+
+
+def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, directory: Path) -> None:
+    whole = (directory / ID).read_bytes()
+    answer = client.get(f"{RECORDINGS}/{ID}/download").raise_for_status()
+    assert answer.content == whole
+    assert 'filename="20260101T000000Z.mcap"' in answer.headers["content-disposition"]
+    part = client.get(f"{RECORDINGS}/{ID}/download", headers={"Range": "bytes=100-299"})
+    assert (part.status_code, part.content) == (206, whole[100:300])
+    found = problem(client.get(f"{RECORDINGS}/demo/pump/20260101T020000Z.mcap.part/download"), 409)
+    assert "incomplete" in found.detail
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "demo/lab/link.mcap",
+        "demo/lab/../../secret.mcap",
+        "demo/lab/..%2f..%2fsecret.mcap",
+        "demo/lab/%2e%2e/%2e%2e/secret.mcap",
+        "%2e%2e/%2e%2e/secret.mcap",
+        "demo/../secret.mcap",
+        "demo/%2e%2e/secret.mcap",
+        "demo//secret.mcap",
+        "demo/lab/..%5csecret.mcap",
+        "demo/lab/%00.mcap",
+        "demo/lab/%2fetc%2fpasswd",
+        ".replays/lab/results.jsonl",
+    ],
+)
+def test_no_path_leads_out_of_the_directory(runtime: Runtime, place: str) -> None:
+    """Sent as written: a client library would tidy the path up first."""
+    for suffix in ("", "/download"):
+        connection = http.client.HTTPConnection(urlsplit(runtime.http_url).netloc, timeout=30)
+        connection.request("GET", f"{RECORDINGS}/{place}{suffix}")
+        answer = connection.getresponse()
+        text = answer.read()
+        connection.close()
+        assert answer.status == 404
+        assert b"secret\n" not in text
+        assert text != b"secret"
+
+
+@pytest.mark.parametrize(
+    "name", ["../../secret.mcap", "demo/lab/../../secret.mcap", "/etc/passwd", "demo/lab/link.mcap", "--offline", ""]
+)
+def test_no_replay_leads_out_of_the_directory(client: httpx.Client, name: str) -> None:
+    problem(client.post(REPLAYS, json={"recordings": [name]}), 404)
+
+
+def test_an_offline_replay_over_http_finds_what_it_finds_on_the_command_line(
+    client: httpx.Client, runtime: Runtime, directory: Path
+) -> None:
+    job = start(client)
+    assert (job.state, job.mode, job.machine, job.prefix) == ("running", "offline", "lab@lab", "")
+    events: list[tuple[str, ReplayJob]] = []
+    with client.stream("GET", f"{REPLAYS}/{job.id}/events") as stream:
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        kind = ""
+        for line in stream.iter_lines():
+            if line.startswith("event: "):
+                kind = line.removeprefix("event: ")
+            elif line.startswith("data: "):
+                events.append((kind, ReplayJob.model_validate_json(line.removeprefix("data: "))))
+    assert [kind for kind, _ in events] == ["progress"] * (len(events) - 1) + ["end"]
+    done = events[-1][1]
+    assert (done.state, done.error) == ("finished", "")
+    assert get(client, f"{REPLAYS}/{job.id}", ReplayJob) == done
+    assert done in get(client, REPLAYS, ReplayList).replays
+    summary = done.summary
+    assert summary is not None
+    assert done.progress is not None
+    assert done.progress.fraction == 1.0
+    assert (summary.alarms, summary.raised, summary.blocks) == (1, ("c_bz",), 850)
+    results = (directory / ".replays" / job.id / "results.jsonl").read_bytes()
+    assert hashlib.sha256(results).hexdigest() == summary.sha256
+
+    reports = get(client, f"{REPLAYS}/{job.id}/reports", ReplayReportList)
+    assert (len(reports.reports), reports.next_offset) == (summary.windows, None)
+    some = get(client, f"{REPLAYS}/{job.id}/reports", ReplayReportList, offset=2, limit=5)
+    assert (some.reports, some.next_offset) == (reports.reports[2:7], 7)
+    (event,) = get(client, f"{REPLAYS}/{job.id}/alarms", ReplayAlarmList).events
+    assert event.data.parameter == "c_bz"
+
+    worker = runtime.machines()[0]
+    assert worker.history.reports() == ()
+    assert worker.history.alarm_events() == ()
+    assert worker.health().alarms == ()
+
+
+def test_a_paced_replay_is_paused_moved_and_stopped(client: httpx.Client, runtime: Runtime) -> None:
+    job = start(client, mode="paced", pace=5.0)
+    place = f"{REPLAYS}/{job.id}"
+    assert (job.prefix, job.machine) == (f"replay/{job.id}", None)
+
+    def position_s() -> float:
+        progress = get(client, place, ReplayJob).progress
+        return -1.0 if progress is None else (progress.position_ns - START_NS) / 1e9
+
+    until(lambda: position_s() > 0, "first block")
+    limit = problem(client.post(REPLAYS, json={"recordings": [ID]}), 429)
+    assert job.id in limit.detail
+    assert ReplayJob.model_validate_json(client.post(f"{place}/pause", json={}).content).state == "paused"
+    client.post(f"{place}/seek", json={"to_ns": START_NS + 60 * 10**9}).raise_for_status()
+    assert position_s() < 60
+    client.post(f"{place}/seek", json={"by_s": 10.0}).raise_for_status()
+    assert ReplayJob.model_validate_json(client.post(f"{place}/resume", json={}).content).state == "running"
+    until(lambda: position_s() >= 70, "the place")
+    problem(client.get(f"{place}/reports"), 404)
+    for wrong in ({}, {"to_ns": 1, "by_s": 1.0}, {"to_ns": -1}):
+        problem(client.post(f"{place}/seek", json=wrong), 422)
+    assert ReplayJob.model_validate_json(client.delete(place).content).state == "stopped"
+    problem(client.post(f"{place}/pause", json={}), 409)
+    assert runtime.machines()[0].health().quality.accepted_blocks == 0
+
+
+def test_a_stretch_and_another_machine(client: httpx.Client) -> None:
+    done = ended(client, start(client, machine="lab", from_ns=START_NS + 10**9, to_ns=START_NS + 31 * 10**9))
+    assert done.machine == "lab"
+    assert done.summary is not None
+    assert done.summary.bundle is None
+    assert done.summary.blocks == 300
+    failed = ended(client, start(client, from_ns=START_NS + DAY_NS))
+    assert failed.state == "failed"
+    assert "nothing was recorded in between" in failed.error
+    assert failed.summary is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "status", "detail"),
+    [
+        ({"recordings": []}, 422, "recordings: "),
+        ({"recordings": ["demo/pump/20260101T020000Z.mcap.part"]}, 409, "incomplete"),
+        ({"machine": "../lab.toml"}, 422, "neither shipped nor monitored; monitored are demo/lab"),
+        ({"machine": "lab", "bundle": "/etc"}, 422, "is not the name of shipped networks"),
+        ({"bundle": "lab"}, 422, "needs machine"),
+        ({"mode": "paced", "pace": 0.01}, 422, "pace: "),
+        ({"mode": "live"}, 422, "mode: "),
+        ({"shell": "rm"}, 422, "shell: "),
+    ],
+)
+def test_wrong_requests_are_refused(client: httpx.Client, changes: dict[str, Any], status: int, detail: str) -> None:
+    before = get(client, REPLAYS, ReplayList).replays
+    found = problem(client.post(REPLAYS, json={"recordings": [ID], **changes}), status)
+    assert detail in found.detail
+    assert get(client, REPLAYS, ReplayList).replays == before
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Sec-Fetch-Site": "cross-site"}, 403),
+        ({"Sec-Fetch-Site": "same-site"}, 403),
+        ({"Host": "evil.example"}, 403),
+        ({"Host": "evil.example", "Origin": "http://evil.example"}, 403),  # a name that was made to lead here
+        ({"Content-Type": "text/plain"}, 415),
+        ({"Content-Type": "application/x-www-form-urlencoded"}, 415),
+    ],
+)
+def test_pages_from_elsewhere_cannot_start_anything(client: httpx.Client, headers: dict[str, str], status: int) -> None:
+    before = get(client, REPLAYS, ReplayList).replays
+    body = json.dumps({"recordings": [ID]}).encode()
+    answer = client.post(REPLAYS, content=body, headers={"Content-Type": "application/json", **headers})
+    problem(answer, status)
+    if status == 403:
+        problem(client.delete(f"{REPLAYS}/{'0' * 12}", headers=headers), 403)
+    assert get(client, REPLAYS, ReplayList).replays == before
+
+
+def test_our_own_page_may(client: httpx.Client, runtime: Runtime) -> None:
+    own = {"Origin": runtime.http_url, "Sec-Fetch-Site": "same-origin"}
+    answer = client.post(REPLAYS, json={"recordings": [ID], "to_ns": START_NS + 10**9}, headers=own)
+    assert answer.status_code == 201
+    assert ended(client, ReplayJob.model_validate_json(answer.content)).state == "finished"
+
+
+def test_unknown_replays(client: httpx.Client) -> None:
+    for path in ("", "/reports", "/alarms", "/events"):
+        problem(client.get(f"{REPLAYS}/nothing{path}"), 404)
+    problem(client.delete(f"{REPLAYS}/nothing"), 404)
+
+
+def test_openapi_tells_of_every_route(client: httpx.Client) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    for path, model in GET_MODELS.items():
+        responses = paths[path]["get"]["responses"]
+        model.model_validate(responses["200"]["content"]["application/json"]["example"])
+        assert "500" in responses
+    ReplayJob.model_validate(paths[REPLAYS]["post"]["responses"]["201"]["content"]["application/json"]["example"])
+
+
+def test_without_a_directory_the_answer_names_the_setting() -> None:
+    with running(plan(None)) as runtime, httpx.Client(base_url=runtime.http_url, trust_env=False) as client:
+        assert "[recording] directory" in problem(client.get(RECORDINGS), 404).detail
+        assert "[recording] directory" in problem(client.post(REPLAYS, json={"recordings": [ID]}), 404).detail
+        assert get(client, REPLAYS, ReplayList).replays == ()
+
+
+def test_switched_off_nothing_can_be_started(directory: Path) -> None:
+    settings = plan(directory, enabled=False)
+    with running(settings) as runtime, httpx.Client(base_url=runtime.http_url, trust_env=False) as client:
+        found = problem(client.post(REPLAYS, json={"recordings": [ID]}), 403)
+        assert "[replay] enabled" in found.detail
+        assert len(get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings) == 3
+
+
+@pytest.mark.parametrize(
+    ("host", "enabled", "expected"),
+    [
+        ("127.0.0.1", None, True),
+        ("::1", None, True),
+        ("localhost", None, True),
+        ("0.0.0.0", None, False),  # noqa: S104  # nothing listens
+        ("10.0.0.5", None, False),
+        ("plant.example", None, False),
+        ("10.0.0.5", True, True),
+        ("127.0.0.1", False, False),
+    ],
+)
+def test_started_by_default_only_on_loopback(host: str, enabled: bool | None, expected: bool) -> None:
+    settings = plan(None, enabled=enabled).model_copy(update={"http": HttpSettings(host=host)})
+    assert ReplayDesk(settings, None).enabled is expected
+
+
+def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path) -> None:
+    folder = directory / ".replays"
+    with running(plan(directory, kept=1)) as runtime, httpx.Client(
+        base_url=runtime.http_url, trust_env=False, timeout=30.0
+    ) as client:  # fmt: skip
+        first = ended(client, start(client, to_ns=START_NS + 10**9))
+        assert (folder / first.id).is_dir()
+        second = start(client, mode="paced", pace=0.1)
+        assert not (folder / first.id).exists()
+        problem(client.get(f"{REPLAYS}/{first.id}"), 404)
+        until(lambda: get(client, f"{REPLAYS}/{second.id}", ReplayJob).progress is not None, "first block")
+        jobs = runtime.replays.jobs
+    assert jobs is not None
+    stopped = jobs.job(second.id)
+    assert stopped is not None
+    assert stopped.state == "stopped"
+    assert not processes_with(second.id)
+
+
+def processes_with(text: str) -> list[str]:
+    """Command lines of this computer that hold a text."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != os.getpid():
+            try:
+                line = (entry / "cmdline").read_bytes()
+            except OSError:
+                continue
+            if text.encode() in line:
+                found.append(line.decode(errors="replace"))
+    return found

@@ -1,0 +1,161 @@
+"""Live, replayed at any pace, and offline: the same reports and alarms; and what is live hears nothing of a replay."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from models.diagnosis.networks.bundle import load_bundle
+from models.signals.keys import MachineKeys
+from models.signals.link import LinkSettings
+from models.signals.recording import read_recording
+from service.monitor import MachineMonitor
+from service.replay.control import Control
+from service.replay.offline import OfflineReplay
+from service.replay.schemas import OfflineSummary
+from service.replay.source import RecordingSource
+from service.replay_link import NetworkPlan, replay_to_network
+from service.runtime import running
+from service.transport import TopicMessage, follow
+from service.worker import MachineWorker
+from simulator.scenario import parse_fault
+from tests.service.live import LAB, endpoint, scenario_blocks, send, service, settings, until
+from tests.service.replaying import digest_of, lines_of, recording, split
+
+BLOCKS = 850
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The lab machine with too much damping, 85 s: one alarm."""
+    stream = scenario_blocks(BLOCKS / 10, parse_fault("c_bz=0.5@0"))
+    return recording(tmp_path_factory.mktemp("recordings") / "faulty.mcap", stream)
+
+
+def offline(*files: Path) -> tuple[OfflineSummary, list[str]]:
+    lines: list[str] = []
+    source = RecordingSource(files)
+    run = OfflineReplay(source, source.machine(), LAB, load_bundle("lab", LAB), lines.append)
+    return run.run(), lines
+
+
+@pytest.fixture(scope="module")
+def expected(faulty: Path) -> OfflineSummary:
+    summary, _ = offline(faulty)
+    return summary
+
+
+def network(source: RecordingSource, address: str, prefix: str, pace: float | None) -> NetworkPlan:
+    return NetworkPlan(
+        link=LinkSettings(mode="client", connect=(address,)),
+        machines=source.machines,
+        everything=False,
+        prefix=prefix,
+        pace=pace,
+        passes=1,
+        from_ns=source.start_ns,
+        to_ns=source.end_ns + 1,
+        wait_for_subscriber_s=20.0,
+    )
+
+
+@contextmanager
+def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> Iterator[MachineWorker]:
+    base = settings("tcp/127.0.0.1:0", bundle="lab", when_full=when_full, bound=2000)
+    with running(
+        base.model_copy(update={"link": link.model_copy(update={"namespace": namespace})})
+    ) as runtime:  # fmt: skip
+        yield runtime.machines()[0]
+
+
+def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSummary) -> None:
+    monitor = MachineMonitor(LAB, load_bundle("lab", LAB))
+    reports = [
+        monitor.step_payload(message.payload, message.attachment, message.encoding)
+        for message in read_recording(faulty, keys={LAB.keys.stream})
+    ]
+    assert expected.windows == sum(len(report.windows) for report in reports) > 10
+    assert expected.alarms == sum(len(report.events) for report in reports) == 1
+    assert expected.raised == ("c_bz",)
+    assert expected.blocks == BLOCKS
+    assert expected.refused_blocks == {}
+    assert expected.data_s == pytest.approx(BLOCKS / 10)
+    assert expected.descriptor_differences == ()
+    assert not expected.stopped
+
+
+def test_offline_in_two_files_is_the_same(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
+    summary, _ = offline(*split(faulty, tmp_path, 400))
+    assert (summary.sha256, summary.windows) == (expected.sha256, expected.windows)
+
+
+def test_one_sample_more_or_less_is_another_answer(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
+    """The digest notices what it is there to notice."""
+    stream = scenario_blocks(BLOCKS / 10, parse_fault("c_bz=0.5@0"))
+    samples = stream[300].samples.copy()
+    samples[7, 2] *= 1.001
+    stream[300] = replace(stream[300], samples=samples)
+    summary, _ = offline(recording(tmp_path / "touched.mcap", stream))
+    assert summary.windows == expected.windows
+    assert summary.sha256 != expected.sha256
+
+
+def test_live_is_the_same(expected: OfflineSummary) -> None:
+    address = endpoint()
+    with service(address, bundle="lab", when_full="wait") as (_, worker):
+        send(address, scenario_blocks(BLOCKS / 10, parse_fault("c_bz=0.5@0")))
+        until(lambda: worker.health().quality.accepted_blocks == BLOCKS, "all blocks")
+    assert digest_of(worker) == expected.sha256
+
+
+@pytest.mark.parametrize(("pace", "when_full"), [(None, "wait"), (50.0, "drop")], ids=["max", "50"])
+def test_replayed_onto_the_network_is_the_same(
+    faulty: Path, expected: OfflineSummary, pace: float | None, when_full: str
+) -> None:
+    address, source = endpoint(), RecordingSource([faulty])
+    with monitor_in("replay/x", LinkSettings(listen=(address,)), when_full) as worker:
+        count = replay_to_network(source, network(source, address, "replay/x", pace), Control())
+        until(lambda: worker.health().quality.accepted_blocks == BLOCKS, "all blocks")
+        health = worker.health()
+    assert count == BLOCKS + 1  # and the descriptor
+    assert health.quality.refused_blocks == {}
+    assert health.stream.descriptor_mismatch == ()
+    assert digest_of(worker) == expected.sha256
+
+
+def test_a_replay_disturbs_nothing_that_is_live(faulty: Path, expected: OfflineSummary, tmp_path: Path) -> None:
+    """A healthy machine, and on the same network the replay of its fault, with a monitor of its own."""
+    healthy = scenario_blocks(BLOCKS / 10)
+    undisturbed, lines = offline(recording(tmp_path / "healthy.mcap", healthy))
+    assert undisturbed.alarms == 0
+    address, source = endpoint(), RecordingSource([faulty])
+    heard: list[TopicMessage] = []
+    client = LinkSettings(mode="client", connect=(address,))
+    with (
+        service(address, bundle="lab", bound=2000) as (_, live),
+        monitor_in("replay/x", client) as replayed,
+        follow(client, "demo/lab", ("alarm_event", "report"), heard.append),
+    ):
+        plan = network(source, address, "replay/x", 30.0)
+        thread = threading.Thread(target=replay_to_network, args=(source, plan, Control()))
+        thread.start()
+        until(lambda: replayed.health().quality.accepted_blocks > 0, "replayed blocks")
+        assert not live.health().stream.publisher_alive
+        assert live.health().quality.accepted_blocks == 0
+        send(address, healthy)
+        thread.join()
+        until(lambda: live.health().quality.accepted_blocks == BLOCKS, "live blocks")
+        until(lambda: replayed.health().quality.accepted_blocks == BLOCKS, "replayed blocks")
+        until(lambda: len(heard) >= undisturbed.windows, "live reports")
+        health = live.health()
+    assert health.quality.refused_blocks == {}
+    assert health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
+    assert health.alarms == ()
+    assert lines_of(live) == lines
+    assert digest_of(live) == undisturbed.sha256
+    assert digest_of(replayed) == expected.sha256  # which did raise its alarm, there
+    assert len(heard) == undisturbed.windows
+    assert {message.key for message in heard} == {MachineKeys("demo", "lab").report}
