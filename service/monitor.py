@@ -161,7 +161,7 @@ class MachineMonitor:
 
     def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
         self.machine = machine
-        self._plan = plan_for(machine)
+        self._plan = plan_for(machine, lagged=bundle is not None)  # only the networks look at lags
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
         self._evaluator = WindowEvaluator(machine, bundle)

@@ -1,11 +1,12 @@
 """Evaluation of one window: several diagnosticians side by side, and whether they agree."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
@@ -82,8 +83,7 @@ class WindowEvaluator:
     def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
         self._machine = machine
         self._place = f"{machine.site}/{machine.name}"
-        # One fit per length: each starts from where it ended on the same length one hop before.
-        self._likelihoods: dict[int, LikelihoodFit] = {}
+        self._likelihood = LengthFits(machine)
         others: list[Diagnostician] = []
         if bundle is not None and bundle.amortised is not None:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
@@ -106,11 +106,11 @@ class WindowEvaluator:
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
         speed = self._speed(window)
-        deciding = self._decide(0, window)
+        deciding = self._decide(window, self._likelihood.window)
         evaluated = {}
         for hops, statistics in short.items():
             try:
-                evaluated[hops] = self._decide(hops, statistics)
+                evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops))
             except EstimationError:
                 continue  # too little data for itself; the window has said what there is to say
         equations: tuple[EquationReading, ...] = ()
@@ -143,11 +143,10 @@ class WindowEvaluator:
             )
         return speed
 
-    def _decide(self, hops: int, window: WindowStatistics) -> Diagnosis:
+    def _decide(self, window: WindowStatistics, diagnose: Callable[[WindowStatistics], Diagnosis]) -> Diagnosis:
         """The likelihood's diagnosis with what these sensors do not determine taken out."""
-        likelihood = self._likelihoods.setdefault(hops, LikelihoodFit(self._machine))
         try:
-            diagnosis = likelihood.diagnose(window)
+            diagnosis = diagnose(window)
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{self._place}: {error} in this window") from error
         return determined(diagnosis, window, self._machine.window.length_s)

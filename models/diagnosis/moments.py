@@ -81,8 +81,15 @@ class Plan:
         return np.column_stack([states, samples[:, self.angle_column].astype(np.float64)])
 
 
-def plan_for(machine: Machine) -> Plan:
-    """Derive the plan of a machine."""
+def plan_for(machine: Machine, *, lagged: bool = True) -> Plan:
+    """Derive the plan of a machine.
+
+    Parameters
+    ----------
+    machine : Machine
+    lagged : bool
+        Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
+    """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
     states = tuple(name for name in STATE_INDEX if name in order)
@@ -90,6 +97,7 @@ def plan_for(machine: Machine) -> Plan:
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
     lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
+    longest = int(lags[-1])
     first, last = (round(edge * window.segment_s) for edge in window.band_hz)
     return Plan(
         rate_hz=rate_hz,
@@ -98,9 +106,9 @@ def plan_for(machine: Machine) -> Plan:
         scales=np.array([machine.sensors[column].to_si for column in columns]),
         angle_column=order.get("theta"),
         hop=round(window.hop_s * rate_hz),
-        preamble=max(int(lags[-1]), segment // 2),
+        preamble=max(longest, segment // 2),
         segment=segment,
-        lags=lags,
+        lags=lags if lagged else lags[:1],
         bins=np.arange(first, last + 1),
         hops=window.hops,
         max_span_ns=round(window.max_span_s * 1e9),
@@ -174,6 +182,9 @@ def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
     transform of a block's length.
     """
     longest, n = int(plan.lags[-1]), a.shape[1]
+    if longest == 0:
+        own = a[plan.preamble :]
+        return np.asarray((own.T @ own)[np.newaxis], dtype=np.float64)
     size = _fast_length(longest + max(2 * longest, 256))
     block = size - longest
     count = -(-plan.hop // block)

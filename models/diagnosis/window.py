@@ -65,14 +65,17 @@ class WindowStatistics:
     duration_s: float
 
 
-def window_statistics(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowStatistics:
+def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool = True) -> WindowStatistics:
     """Add hops up to a window and take out its mean and its rotation-synchronous part.
+
+    Without `lagged`, correlations are at lag zero alone: the spectra are all that the likelihood asks for.
 
     With a = (x, n) and β the least-squares coefficients of x on n over the window, the sum of
     (x - βn)(t-τ) (x - βn)ᵀ(t) is the product sum seen through the matrix (I, -β) from both sides.
     """
     n = len(plan.states)
-    products = np.stack([hop.products for hop in hops])
+    n_lags = plan.lags_s.size if lagged else 1
+    products = np.stack([hop.products[:n_lags] for hop in hops])
     total = products[0].copy()
     for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
         total += hop
@@ -94,7 +97,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowStatist
         end_ns=hops[-1].end_ns,
         n_samples=len(hops) * plan.hop,
         n_segments=segments.shape[0],
-        lags_s=plan.lags_s,
+        lags_s=plan.lags_s[:n_lags],
         correlation=(remove @ total @ remove.T) / (len(hops) * plan.hop),
         hop_correlation=hop_correlation,
         spectrum=spectrum,
@@ -197,9 +200,9 @@ class SlidingWindow:
         Parameters
         ----------
         hops : int, optional
-            How many of the latest hops; all hops of a full window without it.
+            How many of the latest hops, with correlations at lag zero alone; all hops of a full window without it.
         """
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):
             return None
-        return window_statistics(self.plan, tuple(self._hops)[-count:])
+        return window_statistics(self.plan, tuple(self._hops)[-count:], lagged=hops is None)

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from models.diagnosis.likelihood.bound import cramer_rao
-from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
@@ -283,8 +283,8 @@ def _follow(settings: tuple[SequentialSettings, ...], trial: _Trial) -> tuple[_O
     machine, plan = trial.machine, plan_for(trial.machine)
     healthy, scenario, step_s = _scenario(trial)
     bound = cramer_rao(machine, plan.states, true_condition(healthy, machine), machine.window.length_s)
-    window = SlidingWindow(plan)
-    fits: dict[int, LikelihoodFit] = {}
+    window, whole = SlidingWindow(plan), plan.hops
+    fits = LengthFits(machine)
     watches: list[_Watch] = []
 
     def look(hops: int) -> Stretch | None:
@@ -292,11 +292,11 @@ def _follow(settings: tuple[SequentialSettings, ...], trial: _Trial) -> tuple[_O
         if statistics is None:
             return None
         try:
-            return _stretch(machine, fits.setdefault(hops, LikelihoodFit(machine)).diagnose(statistics), statistics)
+            read = fits.window(statistics) if hops == whole else fits.short(hops, statistics)
         except (EstimationError, np.linalg.LinAlgError):
             return None  # refused, as the monitor refuses it
+        return _stretch(machine, read, statistics)
 
-    whole = plan.hops
     start_ns: int | None = None
     for block, _ in blocks(scenario, machine, block_s=_BLOCK_S):
         if start_ns is None:

@@ -7,15 +7,17 @@ the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.likelihood.bins import BinGroups, group_bins
+from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import goodness_of_fit
 from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Workspace
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
 from models.diagnosis.likelihood.unbalance import estimate_unbalance
 from models.diagnosis.moments import ComplexArray
@@ -39,24 +41,32 @@ _MOST_LOG_RATIO = float(np.log(5))
 _MOST_EXCESS = 100.0
 """Mean squared excess over its expectation, beyond which a window is not evaluated: a dead or clipped channel."""
 _SYNCHRONOUS_BINS = 3
+_FOLLOWED = 12
+"""Windows in a row that may be followed from one search before the next."""
 
 
 class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
-    The state kept between windows is only the starting point, and how alike the forces' colours were.
+    The state kept between windows is the starting point, how alike the forces' colours were, and the slopes of the last
+    search, with which windows that differ little from it are followed.
 
     Parameters
     ----------
     machine : Machine
         Nominal rotor and unbalance phase.
+    follow : bool
+        Whether windows that follow each other overlap, so that they may be followed.
     """
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: Machine, *, follow: bool = False) -> None:
         self._machine = machine
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
+        self._follow = follow
         self._last: FloatArray | None = None
         self._strength: float | None = None
+        self._line: Linearised | None = None
+        self._line_segments = self._followed = 0
         self._groups: dict[bytes, BinGroups] = {}
         self._workspace = Workspace()
 
@@ -67,7 +77,11 @@ class LikelihoodFit:
 
     def reset(self) -> None:
         """Start the next window cold."""
-        self._last = self._strength = None
+        self._last = self._strength = self._line = None
+
+    def start_near(self, other: "LikelihoodFit") -> None:
+        """Start the next window where another fit of the same machine has ended."""
+        self._last, self._strength, self._line = other._last, other._strength, None
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
@@ -78,57 +92,108 @@ class LikelihoodFit:
             If a channel has no power in the band (a dead sensor), two carry the same signal, the search finds no
             maximum, or nothing within the model comes near the window.
         """
-        speed = window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
+        speed = self._speed(window)
         excluded = _near_rotation(window.frequencies_hz, speed)
         power = self._checked_power(window, ~excluded)
-        scale = np.sqrt(power)
         nowhere = f"{self._machine.name}: the likelihood has no maximum for this window"
         try:
             # Trial points may lie far out; what comes of them is checked, not warned of.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                model, search, found = self._maximise(window, excluded, scale, speed)
+                model, search, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed)
             covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
             raise EstimationError(nowhere) from error
-        theta = found.theta
-        if not (np.all(np.isfinite(theta)) and np.all(np.diag(covariance) > 0)):
+        if not (np.all(np.isfinite(found.theta)) and np.all(np.diag(covariance) > 0)):
             self.reset()
             raise EstimationError(nowhere)
-        self._last, self._strength = theta, search.strength
+        self._last, self._strength = found.theta, search.strength
         self._check_explained(model, search, found)
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
-        ratio = np.exp(theta[:n])
+        states = model.groups.average(window.spectrum)
+        goodness = goodness_of_fit(self._machine, model, search, found, states)
+        read = self._read(window, model, found.whitened.point, structural, speed)
+        return replace(read, misfit_z=goodness.misfit_z, suspect=goodness.suspect, steps=found.steps)
+
+    def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
+        """Read a short stretch of the latest window by one step from the window's maximum.
+
+        Parameters
+        ----------
+        stretch : WindowStatistics
+            Latest hops of the window that was diagnosed last.
+
+        Returns
+        -------
+        Diagnosis or None
+            None if there is no such window, or the stretch says anything that the window does not: diagnose it then.
+            Whether the stretch is outside the model is not tested closely, so there is no misfit.
+        """
+        line, speed = self._line, self._speed(stretch)
+        if line is None:
+            return None
+        groups = self._grouped(stretch.frequencies_hz, _near_rotation(stretch.frequencies_hz, speed), 1.0)
+        if groups is not line.model.groups or stretch.states != line.model.motions.states:
+            return None
+        seen = line.glance(_observed(line.model, stretch), stretch.n_segments / self._line_segments)
+        if seen is None:
+            return None
+        try:
+            return self._read(stretch, line.model, seen.point, seen.structural, speed)
+        except EstimationError:
+            return None
+
+    def _speed(self, window: WindowStatistics) -> float:
+        return window.speed_rad_s if np.isfinite(window.speed_rad_s) else self._machine.operation.speed_rad_s
+
+    def _read(
+        self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
+    ) -> Diagnosis:
+        """Readings of the structural parameters at a point, and of e from the window's synchronous part."""
+        ratio = np.exp(point.theta[: len(STRUCTURAL)])
         change, spread = ratio - 1, structural * np.outer(ratio, ratio)
         names: tuple[str, ...] = STRUCTURAL
         if window.synchronous is not None:
             e = estimate_unbalance(
-                self._machine,
-                model,
-                found.whitened.point,
-                structural,
-                window.synchronous,
-                speed,
-                window.duration_s,
+                self._machine, model, point, structural, window.synchronous, speed, window.duration_s
             )
             names, change = (*names, "e"), np.append(change, e.change)
             cross = (e.covariance * ratio)[:, None]
             spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
-        states = model.groups.average(window.spectrum)
-        goodness = goodness_of_fit(self._machine, model, search, found, states)
         readings = tuple(
             ParameterReading(name, self.by, float(value), float(error))
             for name, value, error in zip(names, change, np.sqrt(np.diag(spread)), strict=True)
         )
-        return Diagnosis(
-            self.by,
-            readings,
-            covariance=np.asarray(spread, dtype=np.float64),
-            misfit_z=goodness.misfit_z,
-            suspect=goodness.suspect,
-            steps=found.steps,
+        return Diagnosis(self.by, readings, covariance=np.asarray(spread, dtype=np.float64))
+
+    def _followed_or_searched(
+        self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float
+    ) -> tuple[SpectralModel, FisherScoring, Maximum]:
+        found = None
+        line, self._line = self._line, None
+        if line is not None and self._followed < _FOLLOWED and self._alike(line, window, excluded):
+            found = line.follow(_observed(line.model, window), speed, _NEAR, _GAIN)
+            if found is not None:
+                self._line, self._followed = line, self._followed + 1
+                return line.model, line.search, found
+            search = self._search(line.model, window, speed, self._strength)
+            # The same units, and the first step's derivatives are those at which the last search ended.
+            model, found = line.model, _searched(search, line)
+        if found is None:
+            model, search, found = self._maximise(window, excluded, scale, speed)
+        if self._follow:
+            self._line = Linearised(model, search, found)
+            self._line_segments, self._followed = window.n_segments, 0
+        return model, search, found
+
+    def _alike(self, line: Linearised, window: WindowStatistics, excluded: npt.NDArray[np.bool_]) -> bool:
+        """Whether a window has the size, the channels and the frequencies of the last search."""
+        return (
+            window.n_segments == self._line_segments
+            and window.states == line.model.motions.states
+            and self._grouped(window.frequencies_hz, excluded, 1.0) is line.model.groups
         )
 
     def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
@@ -213,6 +278,14 @@ class LikelihoodFit:
                 f"as sampling does, at most {_MOST_EXCESS:g} is evaluated): a sensor is at fault, or something outside "
                 "the model has changed"
             )
+
+
+def _searched(search: FisherScoring, line: Linearised) -> Maximum | None:
+    """Search from where the last search ended; None if that makes no valid spectrum for this window."""
+    try:
+        return search.maximise(line.theta, _WARM_STEPS, _NEAR, _GAIN, line.derivatives)
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _observed(model: SpectralModel, window: WindowStatistics) -> ComplexArray:

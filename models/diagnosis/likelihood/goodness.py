@@ -21,7 +21,8 @@ from models.signals.block import FloatArray
 
 __all__ = ["Alternative", "Goodness", "goodness_of_fit"]
 
-_PLANES = (slice(0, 3), slice(3, 6))
+_SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
+"""Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z."""
 _MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
 _LEAST_INFORMATION = 1e-4
 """An alternative of which less than this is left beside the model's own parameters cannot be told from them."""
@@ -155,18 +156,11 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
     rotor = machine.rotor
     for (name, dofs), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):
+        held = np.zeros((6, 6))
+        held[dofs, dofs] = mass
         names.append(name)
-        slopes.append(
-            np.sum([model.local_slope(point, whitened, response, dof, dof, w2 * mass) for dof in dofs], axis=0)
-        )
+        slopes.append(model.dynamic_slope(point, whitened, response, held, w2))
     shaft = Q_shaft(rotor) * np.exp(found.theta[STRUCTURAL.index("EI")])
-    one = np.ones_like(w2)
-    unequal = np.zeros_like(slopes[0])
-    for sign, plane in zip((1, -1), _PLANES, strict=True):
-        for row in range(plane.start, plane.stop):
-            for column in range(plane.start, plane.stop):
-                element = -sign * shaft[row, column] * one
-                unequal = unequal + model.local_slope(point, whitened, response, row, column, element)
     names.append("shaft stiffer in y than in z")
-    slopes.append(unequal)
+    slopes.append(model.dynamic_slope(point, whitened, response, shaft * _SIGNS, -np.ones_like(w2)))
     return names, np.stack(slopes)

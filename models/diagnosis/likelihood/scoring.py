@@ -9,7 +9,7 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
-__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened", "Workspace"]
+__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened", "Workspace", "whitened_at"]
 
 LOG_NOISE = float(np.log(1e-3))
 """Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
@@ -131,19 +131,33 @@ class FisherScoring:
         self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
         self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
         self._slopes, self._weighted = workspace.arrays((model.size, self.averages.size, model.n * model.n))
-        self._ridge = np.full(model.size, _WEAK)
-        self._ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
-        self._ridge[model.colour_at] = _COLOUR
+        self.ridge = np.full(model.size, _WEAK)
+        self.ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
+        self.ridge[model.colour_at] = _COLOUR
         self.strength = float(_STRENGTHS[0]) if strength is None else strength
-        self._ridge[model.shape_at] = self.strength
-        self._ridge[model.cutoff_at] = _CUTOFF
-        self._ridge[model.order_at] = _ORDER if model.shapes else _FIXED
+        self.ridge[model.shape_at] = self.strength
+        self.ridge[model.cutoff_at] = _CUTOFF
+        self.ridge[model.order_at] = _ORDER if model.shapes else _FIXED
         self.centre = np.zeros(model.size)
         self.centre[model.noise_at] = LOG_NOISE
         self.centre[model.cutoff_at] = np.log(usual_cutoff_hz)
         self.centre[model.order_at] = np.log(2)
 
-    def maximise(self, theta: FloatArray, most_steps: int, near: float, gain: float) -> Maximum:
+    @property
+    def pull(self) -> FloatArray:
+        """The pulls as they enter the information on C: next to nothing there, to keep it invertible."""
+        pull = self.ridge.copy()
+        pull[self._model.level_at] = 1e-3
+        return pull
+
+    def maximise(
+        self,
+        theta: FloatArray,
+        most_steps: int,
+        near: float,
+        gain: float,
+        derivatives: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Maximum:
         """Search from a starting point.
 
         Parameters
@@ -153,6 +167,8 @@ class FisherScoring:
         near, gain : float
             Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
             gain less than `gain` in log-likelihood.
+        derivatives : tuple of ndarray, optional
+            Slopes and information of the data by C at `theta` if an earlier search has ended there: most of a step.
 
         Raises
         ------
@@ -165,7 +181,7 @@ class FisherScoring:
         value, whitened = self._value(theta)
         if whitened is None:
             raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
-        gradient, information, slopes, on_levels = self._scores(theta, whitened)
+        gradient, information, slopes, on_levels = self._scores(theta, whitened, derivatives)
         while True:
             covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
             full_step = np.asarray(covariance @ gradient, dtype=np.float64)
@@ -195,7 +211,7 @@ class FisherScoring:
                 damping = max(damping / 8, 1e-7)
             else:
                 damping *= 8
-        fitted = model.size - float(self._ridge @ np.diag(covariance))
+        fitted = model.size - float(self.ridge @ np.diag(covariance))
         return Maximum(theta, on_levels, slopes, whitened, steps, fitted, full_step[diagnosed])
 
     def _learn_strength(self, theta: FloatArray, covariance: FloatArray) -> bool:
@@ -212,33 +228,33 @@ class FisherScoring:
         evidence = np.sum(np.log(_STRENGTHS / left) + slope[:, None] ** 2 / left, axis=0)
         new = float(_STRENGTHS[np.argmax(evidence)])
         self.strength = new
-        self._ridge[at] = new
+        self.ridge[at] = new
         return bool(abs(np.log(new / old)) > _SAME_STRENGTH)
 
     def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
         """Log-likelihood and the weak pulls, up to a constant."""
-        point = self._model.at(theta, self._speed_rad_s)
-        try:
-            L = np.linalg.cholesky(point.S)
-        except np.linalg.LinAlgError:
+        whitened = whitened_at(self._model.at(theta, self._speed_rad_s), self._observed)
+        if whitened is None:
             return -np.inf, None
-        log_determinant = 2 * np.log(np.einsum("fii->fi", L).real).sum(axis=1)
-        L_inverse = np.asarray(np.linalg.inv(L), dtype=np.complex128)
-        excess = L_inverse @ self._observed @ L_inverse.conj().swapaxes(1, 2)
-        trace = np.einsum("fii->f", excess).real
-        diagonal = np.arange(self._model.n)
-        excess[:, diagonal, diagonal] -= 1
-        pull = self._ridge @ (theta - self.centre) ** 2 / 2
-        return float(-self.averages @ (log_determinant + trace) - pull), Whitened(point, L_inverse, excess)
+        log_determinant = -2 * np.log(np.einsum("fii->fi", whitened.L_inverse).real).sum(axis=1)
+        trace = np.einsum("fii->f", whitened.excess).real  # and n, a constant
+        pull = self.ridge @ (theta - self.centre) ** 2 / 2
+        return float(-self.averages @ (log_determinant + trace) - pull), whitened
 
-    def _scores(self, theta: FloatArray, whitened: Whitened) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _scores(
+        self, theta: FloatArray, whitened: Whitened, derivatives: tuple[FloatArray, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Gradient, information for the step (both by T), packed slopes, and information by C."""
         model = self._model
-        slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
-        root = np.sqrt(self.averages)[:, None]
-        weighted = np.multiply(slopes, root, out=self._weighted).reshape(model.size, -1)
-        gradient: FloatArray = weighted @ (packed(whitened.excess) * root).ravel()
-        on_levels: FloatArray = weighted @ weighted.T
+        if derivatives is None:
+            slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
+            root = np.sqrt(self.averages)[:, None]
+            weighted = np.multiply(slopes, root, out=self._weighted).reshape(model.size, -1)
+            on_levels: FloatArray = weighted @ weighted.T
+        else:
+            slopes, on_levels = derivatives[0], derivatives[1].copy()
+        excess = packed(whitened.excess) * self.averages[:, None]
+        gradient: FloatArray = slopes.reshape(model.size, -1) @ excess.ravel()
         levels = model.level_at
         chain = _levels_by_factor(model.factor(theta))
         information = on_levels.copy()
@@ -246,13 +262,23 @@ class FisherScoring:
         information[:, levels] = information[:, levels] @ chain
         information[levels, levels] += _curvature(gradient[levels])
         gradient[levels] = chain.T @ gradient[levels]
-        gradient -= self._ridge * (theta - self.centre)
-        information[np.diag_indices(model.size)] += self._ridge
-        # On C itself the pull is next to nothing: it only keeps directions invertible that no sensor sees.
-        pull = self._ridge.copy()
-        pull[levels] = 1e-3
-        on_levels[np.diag_indices(model.size)] += pull
+        gradient -= self.ridge * (theta - self.centre)
+        information[np.diag_indices(model.size)] += self.ridge
+        on_levels[np.diag_indices(model.size)] += self.pull
         return gradient, information, slopes, on_levels
+
+
+def whitened_at(point: ModelPoint, observed: ComplexArray) -> Whitened | None:
+    """See estimated spectra through the Cholesky factors of expected ones; None if those are no valid spectra."""
+    try:
+        L = np.linalg.cholesky(point.S)
+    except np.linalg.LinAlgError:
+        return None
+    L_inverse = np.asarray(np.linalg.inv(L), dtype=np.complex128)
+    excess = L_inverse @ observed @ L_inverse.conj().swapaxes(1, 2)
+    diagonal = np.arange(excess.shape[-1])
+    excess[:, diagonal, diagonal] -= 1
+    return Whitened(point, L_inverse, excess)
 
 
 def _levels_by_factor(T: FloatArray) -> FloatArray:

@@ -32,7 +32,17 @@ from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.matrices import M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
 
-__all__ = ["COLUMNS", "ROWS", "SHAPES", "STRUCTURAL", "ModelPoint", "SpectralModel", "packed", "twice_packed"]
+__all__ = [
+    "COLUMNS",
+    "ROWS",
+    "SHAPES",
+    "STRUCTURAL",
+    "ModelPoint",
+    "SpectralModel",
+    "factor_of",
+    "packed",
+    "twice_packed",
+]
 
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
@@ -171,8 +181,8 @@ class SpectralModel:
         T[ROWS, COLUMNS] = theta[self.level_at]
         return T
 
-    def at(self, theta: FloatArray, speed_rad_s: float) -> ModelPoint:
-        """Expected spectra at a parameter point."""
+    def at(self, theta: FloatArray, speed_rad_s: float, C: FloatArray | None = None) -> ModelPoint:
+        """Expected spectra at a parameter point, or with another level matrix than its own."""
         shape = self._w.shape
         w = self._w.ravel()
         H = self.receptance(theta[: self.cutoff_at], speed_rad_s, w)
@@ -181,7 +191,7 @@ class SpectralModel:
         gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
         seen = H[:, self.motions.dofs].reshape(*shape, self.n, 6) * self._factor[..., None]
         G = seen * unit * np.sqrt(gain)[:, :, None, None]
-        C = self.levels(theta)
+        C = self.levels(theta) if C is None else C
         S = _summed(G @ C, G)
         diagonal = np.arange(self.n)
         S[:, diagonal, diagonal] += self.noise(theta)
@@ -229,9 +239,8 @@ class SpectralModel:
         for parameter, dof in enumerate(_BEARING_DOFS):
             factor = -dynamic_change[parameter] * (1j * self._w if parameter % 2 else np.ones_like(self._w))
             out[parameter] = self.local_slope(point, whitened, response, dof, dof, factor)
-        unit = self.force_unit * point.colour[:, None, None, :]
-        shaft = -((whitened / unit) @ (self._Q_shaft * np.exp(theta[4]))) @ point.H
-        out[4] = twice_packed(_summed(shaft, response))
+        shaft = self._Q_shaft * np.exp(theta[4])
+        out[4] = self.dynamic_slope(point, whitened, response, shaft, -np.ones_like(self._w))
         for at, slope in zip(
             (self.cutoff_at, self.order_at), low_pass_slopes(self.groups.nodes_hz, *self.filter(theta)), strict=True
         ):
@@ -248,6 +257,23 @@ class SpectralModel:
             pair = whitened[..., row].transpose(0, 2, 1) @ whitened[..., column].conj()
             out[self.level_at.start + number] = twice_packed(pair) * (0.5 if row == column else 1.0)
         return out
+
+    def dynamic_slope(
+        self, point: ModelPoint, whitened: ComplexArray, response: ComplexArray, change: FloatArray, factor: FloatArray
+    ) -> FloatArray:
+        """Packed slope of the spectra by a change of the whole dynamic matrix, `change` times `factor`, sign reversed.
+
+        Parameters
+        ----------
+        point : ModelPoint
+        whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
+            L⁻¹G and L⁻¹GC.
+        change : ndarray, shape (6, 6)
+        factor : ndarray, shape (n_groups, n_nodes)
+        """
+        unit = self.force_unit * point.colour[:, None, None, :]
+        moved = ((whitened / unit) @ change) @ point.H * factor[..., None, None]
+        return twice_packed(_summed(moved, response))
 
     def local_slope(
         self,
@@ -273,6 +299,13 @@ class SpectralModel:
         u = whitened[..., row] / (self.force_unit[row] * point.colour[:, None, None, row]) * factor[..., None]
         v = (response @ point.H[:, :, column].conj()[..., None])[..., 0]
         return twice_packed(u.transpose(0, 2, 1) @ v.conj())
+
+
+def factor_of(C: FloatArray) -> FloatArray:
+    """T, lower triangular, of the level matrix nearest to C that an excitation can have; shape (6, 6)."""
+    values, vectors = np.linalg.eigh(C)
+    root = vectors * np.sqrt(np.maximum(values, 0))
+    return np.asarray(np.linalg.qr(root.T)[1].T, dtype=np.float64)
 
 
 def packed(matrices: ComplexArray) -> FloatArray:

@@ -1,0 +1,179 @@
+"""Following the maximum from hop to hop without searching it anew.
+
+A window that has slid by one hop is nearly the window before. The slopes of the expected spectra, which are most of a
+search's cost, are then those of the last search, and what is solved is
+
+    Σ ν tr{W_a (Ŝ - S(θ))} = pulls,    W_a = L₀⁻ᴴ (L₀⁻¹ ∂S/∂θ_a L₀⁻ᴴ) L₀⁻¹ at the last search's maximum,
+
+with S(θ) exact. Whatever the weights W, its expectation is zero at the truth (an unbiased estimating equation, V. P.
+Godambe, Annals of Mathematical Statistics 31 (1960)); near the last maximum they are the likelihood's own, so nothing
+worth speaking of is lost. Levels move as the elements of C, in which the spectra are linear.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, whitened_at
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, factor_of, packed
+from models.diagnosis.moments import ComplexArray
+from models.signals.block import FloatArray
+
+__all__ = ["Glance", "Linearised"]
+
+_MOST_STEPS = 6
+_FARTHEST = 0.15
+"""Relative change of the expected spectra (rms) beyond which the weights are no longer their own."""
+_NEWS = 3.0
+"""Standard errors by which a stretch may differ from the window it is part of without being searched for itself."""
+_LEAST_EXCESS_Z, _EXCESS_MARGIN = 4.0, 1.15
+"""A stretch further from the theory than this is searched for itself. The margin: at another level all of it counts
+as excess."""
+
+
+@dataclass(frozen=True, slots=True)
+class Glance:
+    """What one step from the window's maximum says of a stretch that holds nothing new.
+
+    Attributes
+    ----------
+    point : ModelPoint
+        The window's spectra at the stretch's parameters: what is not diagnosed is the window's.
+    structural : ndarray, shape (n_diagnosed, n_diagnosed)
+        Covariance of the diagnosed parameters.
+    """
+
+    point: ModelPoint
+    structural: FloatArray
+
+
+class Linearised:
+    """The spectra around the maximum of the last search, and where the maximum has moved since.
+
+    Parameters
+    ----------
+    model : SpectralModel
+    search : FisherScoring
+        The search that ended there; its averages and pulls are used.
+    found : Maximum
+        Its slopes are copied.
+    """
+
+    def __init__(self, model: SpectralModel, search: FisherScoring, found: Maximum) -> None:
+        self.model, self.search = model, search
+        self.theta = found.theta
+        self._slopes = found.slopes.copy()
+        self._L_inverse = found.whitened.L_inverse
+        self._S = np.einsum("fii->fi", found.whitened.point.S).real.copy()
+        self._pull = search.pull
+        self._data_information: FloatArray = found.information - np.diag(self._pull)
+        self._inverses: dict[float, FloatArray] = {}
+        self._fitted = found.fitted
+        self._point = found.whitened.point
+        # In directions that the data leave to the pulls on T the equation is solved as the search left it.
+        self._left: FloatArray = self._gradient(packed(found.whitened.excess))[model.level_at]
+
+    @property
+    def derivatives(self) -> tuple[FloatArray, FloatArray]:
+        """Slopes, and information of the data by C, where the last search ended."""
+        return self._slopes, self._data_information
+
+    def follow(self, observed: ComplexArray, speed_rad_s: float, near: float, gain: float) -> Maximum | None:
+        """Solve for the next window's estimated spectra; None where a new search is due.
+
+        Parameters
+        ----------
+        observed : ndarray, shape (n_groups, n, n)
+            In the units of the model.
+        speed_rad_s : float
+        near, gain : float
+            As `FisherScoring.maximise` has them.
+        """
+        model, point = self.model, self._point
+        covariance = self._inverse(1.0)
+        diagnosed = slice(model.cutoff_at)
+        errors = np.sqrt(np.diag(covariance)[diagnosed])
+        before = np.inf
+        for steps in range(_MOST_STEPS + 1):
+            gradient = self._pulled(self._gradient(self._whitened(observed - point.S)), point, 1.0)
+            step = np.asarray(covariance @ gradient, dtype=np.float64)
+            left = float(gradient @ step) / 2
+            if np.all(np.abs(step[diagnosed]) < near * errors) and left < gain:
+                whitened = whitened_at(point, observed)
+                if whitened is None:
+                    return None
+                self._point = point
+                information = self._data_information + np.diag(self._pull)
+                return Maximum(point.theta, information, self._slopes, whitened, steps, self._fitted, step[diagnosed])
+            if steps == _MOST_STEPS or left > before:
+                break
+            before = left
+            point = self._moved(point, step, speed_rad_s)
+            expected = np.einsum("fii->fi", point.S).real
+            if not np.mean((expected / self._S - 1) ** 2) < _FARTHEST**2:
+                break
+        return None
+
+    def glance(self, observed: ComplexArray, share: float) -> Glance | None:
+        """Take one step from the latest maximum; None if the stretch says anything new.
+
+        Parameters
+        ----------
+        observed : ndarray, shape (n_groups, n, n)
+            Of the stretch.
+        share : float
+            Its segments over those of the window.
+        """
+        model, point = self.model, self._point
+        rest = self._whitened(observed - point.S)
+        gradient = self._pulled(self._gradient(rest), point, share)
+        covariance = self._inverse(share)
+        step = covariance @ gradient
+        diagnosed = slice(model.cutoff_at)
+        structural = covariance[diagnosed, diagnosed]
+        if np.any(np.abs(step[diagnosed]) > _NEWS * np.sqrt(np.diag(structural))):
+            return None
+        theta = point.theta.copy()
+        theta[diagnosed] += step[diagnosed]
+        left = rest - np.tensordot(step, self._slopes, axes=1)
+        total = share * float(self.search.averages @ np.sum(left**2, axis=1))
+        usual = model.n**2 * float(np.trace(model.groups.shared))
+        scatter = model.n * float(np.sqrt(2 * np.sum(model.groups.shared**2)))
+        if total > _EXCESS_MARGIN * usual + _LEAST_EXCESS_Z * scatter:
+            return None
+        return Glance(replace(point, theta=theta), np.asarray(structural, dtype=np.float64))
+
+    def _whitened(self, difference: ComplexArray) -> FloatArray:
+        """L₀⁻¹ X L₀⁻ᴴ, packed, shape (n_groups, n²)."""
+        return packed(self._L_inverse @ difference @ self._L_inverse.conj().swapaxes(1, 2))
+
+    def _gradient(self, rest: FloatArray) -> FloatArray:
+        """What the data say about every parameter, levels by C."""
+        weighted = (rest * self.search.averages[:, None]).ravel()
+        return np.asarray(self._slopes.reshape(self.model.size, -1) @ weighted, dtype=np.float64)
+
+    def _pulled(self, gradient: FloatArray, point: ModelPoint, share: float) -> FloatArray:
+        """The gradient of a share of the data with the pulls."""
+        levels = self.model.level_at
+        pulled = share * gradient - self.search.ridge * (point.theta - self.search.centre)
+        pulled[levels] = share * (gradient[levels] - self._left)
+        return pulled
+
+    def _inverse(self, share: float) -> FloatArray:
+        if share not in self._inverses:
+            information = share * self._data_information + np.diag(self._pull)
+            self._inverses[share] = np.asarray(np.linalg.inv(information), dtype=np.float64)
+        return self._inverses[share]
+
+    def _moved(self, point: ModelPoint, step: FloatArray, speed_rad_s: float) -> ModelPoint:
+        """The point after a step: logarithms by one at most, variances as the step on the variance itself says."""
+        model = self.model
+        theta = point.theta.copy()
+        logarithms = slice(model.level_at.start)
+        theta[logarithms] += np.clip(step[logarithms], -1, 1)
+        theta[model.noise_at] = point.theta[model.noise_at] + np.log(np.clip(1 + step[model.noise_at], 0.2, 4))
+        C = point.C.copy()
+        C[ROWS, COLUMNS] += step[model.level_at]
+        C[COLUMNS, ROWS] = C[ROWS, COLUMNS]
+        theta[model.level_at] = factor_of(C)[ROWS, COLUMNS]
+        return model.at(theta, speed_rad_s, C)

@@ -1,0 +1,91 @@
+"""Following a sliding window reads what searching it anew reads; news is noticed."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.moments import plan_for
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import load_machine
+from models.signals.block import FloatArray
+from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
+from simulator.scenario import Event
+from simulator.stream import blocks
+
+LAB = load_machine("lab")
+SEED = 61
+
+
+@lru_cache
+def slid(layout: Layout, step: tuple[str, float] | None = None) -> tuple[SlidingWindow, tuple[WindowStatistics, ...]]:
+    """A minute and six hops; a parameter may change three hops before the end. The window as it is at the end."""
+    draw = Draw(LAB, SEED, Purpose.EVALUATION, 7, layout=layout)
+    faults = [] if step is None else [Event(at_s=77.5, parameter=step[0], relative_change=step[1])]
+    scenario = draw_condition(draw, 0).overridden(duration_s=92.6, faults=faults)
+    plan = plan_for(LAB)
+    window, found = SlidingWindow(plan), []
+    for block, _ in blocks(scenario, LAB, block_s=1.0):
+        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
+            full = window.statistics()
+            found += [] if full is None else [full]
+    return window, tuple(found)
+
+
+def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
+    read = diagnosis.evaluable
+    return np.array([one.change or 0.0 for one in read]), np.array([one.standard_error or 0.0 for one in read])
+
+
+def test_a_followed_window_reads_what_a_search_reads() -> None:
+    for layout in Layout:
+        _, windows = slid(layout)
+        assert len(windows) == 7
+        following, searching = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB)
+        for window in windows:
+            (followed, followed_error), (searched, error) = (
+                values(fit.diagnose(window)) for fit in (following, searching)
+            )
+            assert np.all(np.abs(followed - searched) < 0.7 * error)  # each is converged to 0.15 errors
+            np.testing.assert_allclose(followed_error, error, rtol=0.1)
+
+
+def test_a_stretch_without_news_is_read_at_a_glance() -> None:
+    for layout in Layout:
+        window, windows = slid(layout)
+        fit = LikelihoodFit(LAB, follow=True)
+        for full in windows:
+            fit.diagnose(full)
+        for hops in (2, 4, 7):
+            stretch = window.statistics(hops)
+            assert stretch is not None
+            seen = fit.glance(stretch)
+            assert seen is not None
+            assert seen.misfit_z is None
+            near = LikelihoodFit(LAB)
+            near.start_near(fit)
+            (glanced, glanced_error), (searched, error) = values(seen), values(near.diagnose(stretch))
+            assert np.all(np.abs(glanced - searched) < 0.8 * error)
+            np.testing.assert_allclose(glanced_error, error, rtol=0.15)
+
+
+def test_news_is_not_read_at_a_glance() -> None:
+    window, windows = slid(Layout.INDEPENDENT, ("k_by", -0.2))
+    fits, fit = LengthFits(LAB), LikelihoodFit(LAB, follow=True)
+    for full in windows:
+        fits.window(full)
+        fit.diagnose(full)
+    stretch = window.statistics(2)
+    assert stretch is not None
+    assert fit.glance(stretch) is None
+    change, error = values(fits.short(2, stretch))
+    assert abs(change[0] + 0.2) < 4 * error[0] < 0.2
+
+
+def test_nothing_is_glanced_at_before_a_window_was_searched() -> None:
+    window, _ = slid(Layout.INDEPENDENT)
+    stretch = window.statistics(2)
+    assert stretch is not None
+    assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
