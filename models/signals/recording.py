@@ -139,9 +139,14 @@ class RecordingWriter:
         with writing(self.part):
             self._file = self.part.open("wb")
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-            self._writer.start(profile=_PROFILE, library=_LIBRARY)
-            self._json_schema = self._writer.register_schema("json", "jsonschema", b'{"type":"object"}')
-            self._hand_over()
+            try:
+                self._writer.start(profile=_PROFILE, library=_LIBRARY)
+                self._json_schema = self._writer.register_schema("json", "jsonschema", b'{"type":"object"}')
+                self._hand_over()
+            except OSError:  # the disk is full: no empty file stays behind
+                self.abandon()
+                self.part.unlink(missing_ok=True)
+                raise
 
     @property
     def messages(self) -> int:

@@ -155,7 +155,7 @@ def _salvaged(damaged: Path, salvage: Salvage) -> Iterator[RecordedMessage]:
 
 def _listed_channels(file: BinaryIO) -> dict[int, Channel]:
     """Channels as the index lists them; none in a file that is cut off, whose chunks introduce them one by one."""
-    with suppress(*DAMAGE, StopIteration):
+    with suppress(*DAMAGE, StopIteration, OSError):  # the last if the file is shorter than the index's end mark
         summary = make_reader(file).get_summary()
         if summary is not None:
             return dict(summary.channels)

@@ -16,7 +16,7 @@ from models.signals.recording import (
     read_recording,
     summarize_recording,
 )
-from models.signals.salvage import salvage_recording
+from models.signals.salvage import inspect_recording, salvage_recording
 
 messages = st.builds(
     RecordedMessage,
@@ -208,3 +208,104 @@ def test_a_finished_chunk_is_safe_at_once(tmp_path: Path) -> None:
         assert salvage_recording(part, new).count == count
         assert 30 < count < 50  # 256 KiB
     assert list(read_recording(new)) == content[:count]
+
+
+def test_a_damaged_chunk_is_passed_over_and_counted(tmp_path: Path) -> None:
+    content = _some(400)
+    path, new = tmp_path / "run.mcap", tmp_path / "new.mcap"
+    _write(path, content)
+    whole = inspect_recording(path)
+    assert (whole.count, whole.complete, whole.lost_bytes, whole.damaged_chunks) == (400, True, 0, 0)
+    assert (whole.start_ns, whole.end_ns) == (0, 399_000)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    salvage = salvage_recording(path, new)
+    assert (salvage.damaged_chunks, salvage.complete, salvage.unnamed_messages) == (1, False, 0)
+    back = list(read_recording(new))
+    assert len(back) == salvage.count == salvage.messages["m/stream"]
+    assert 400 - 256 * 1024 // 7200 - 1 <= len(back) < 400
+    first = next(n for n, (a, b) in enumerate(zip(back, content, strict=False)) if a != b)
+    assert back == content[:first] + content[len(content) - len(back) + first :]
+    assert 200_000 < salvage.lost_bytes < 300_000
+
+
+def test_the_chunk_that_names_the_keys_may_be_the_damaged_one(tmp_path: Path) -> None:
+    content = _some(400)
+    path = tmp_path / "run.mcap"
+    _write(path, content)
+    data = bytearray(path.read_bytes())
+    data[1000] ^= 0xFF
+    path.write_bytes(data)
+    salvage = inspect_recording(path)  # the index at the end names them as well
+    assert (salvage.damaged_chunks, salvage.unnamed_messages) == (1, 0)
+    assert salvage.count > 300
+    path.write_bytes(data[:-3000])
+    salvage = inspect_recording(path)
+    assert (salvage.damaged_chunks, salvage.count) == (1, 0)
+    assert salvage.unnamed_messages > 300
+
+
+@settings(deadline=None, max_examples=60)
+@given(place=st.floats(0, 1), keep=st.floats(0, 1), flips=st.integers(0, 3))
+def test_whatever_the_damage_what_comes_back_was_written(
+    tmp_path_factory: pytest.TempPathFactory, place: float, keep: float, flips: int
+) -> None:
+    folder = tmp_path_factory.mktemp("damage")
+    content = _some(150, 5000)
+    path = folder / "run.mcap"
+    _write(path, content)
+    data = bytearray(path.read_bytes())[: 8 + int(keep * path.stat().st_size)]
+    for flip in range(flips):
+        data[int(place * (len(data) - 1)) // (flip + 1)] ^= 0x55
+    path.write_bytes(data)
+    salvage = inspect_recording(path)
+    assert 0 <= salvage.lost_bytes <= len(data)
+    if salvage.count:
+        back = _salvage(path, folder / "new.mcap")
+        assert [message for message in content if message in back] == back
+    else:
+        with pytest.raises(RecordingError, match="nothing to recover"):
+            salvage_recording(path, folder / "new.mcap")
+
+
+def _salvage(path: Path, target: Path) -> list[RecordedMessage]:
+    salvage = salvage_recording(path, target)
+    back = list(read_recording(target))
+    assert salvage.count == len(back)
+    return back
+
+
+def test_a_flushed_message_is_safe_and_an_abandoned_file_keeps_it(tmp_path: Path) -> None:
+    content = _some(3)
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    assert (writer.messages, writer.flushed) == (0, 0)
+    writer.write(content[0])
+    assert (writer.messages, writer.flushed) == (1, 0)
+    writer.flush()
+    assert (writer.messages, writer.flushed) == (1, 1)
+    writer.write(content[1])
+    writer.sync()
+    assert writer.flushed == 2
+    assert writer.size_bytes == writer.part.stat().st_size
+    writer.write(content[2])
+    writer.abandon()
+    assert not writer.path.exists()
+    assert _salvage(writer.part, writer.path) == content[:2]
+
+
+def test_a_name_that_was_taken_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "run.mcap")
+    writer.write(_some(1)[0])
+    writer.path.write_bytes(b"somebody else's")
+    with pytest.raises(RecordingError, match=r"run\.mcap: exists already and is not overwritten; see run\.mcap\.part"):
+        writer.close()
+    assert writer.path.read_bytes() == b"somebody else's"
+    assert list(read_recording(writer.part)) == _some(1)
+
+
+def test_a_full_disk_is_an_error_with_the_file_s_name(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap.part").symlink_to("/dev/full")
+    with pytest.raises(RecordingError, match=r"run\.mcap\.part: cannot be written \(No space left on device\)"):
+        RecordingWriter(tmp_path / "run.mcap", overwrite=True)
+    assert list(tmp_path.iterdir()) == []
