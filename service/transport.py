@@ -199,14 +199,7 @@ class MachineLink:
             )
         )
         keep(session.liveliness().declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True))
-        stream = zenoh.ext.declare_advanced_subscriber(
-            session,
-            keys.stream,
-            zenoh.handlers.Callback(guarded(self._take_block), indirect=not wait_when_full),
-            history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
-            recovery=None if wait_when_full else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-            subscriber_detection=True,
-        )
+        stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=wait_when_full)
         keep(stream)
         keep(stream.sample_miss_listener(guarded(self._take_miss)))
         keep(session.liveliness().declare_token(keys.monitor_alive))
@@ -285,6 +278,9 @@ class MachineTap:
         session, guarded = link.session, link.guarded
         with ExitStack() as undo:
             undo.callback(session.declare_subscriber(f"{keys.root}/**", guarded(self._take)).undeclare)
+            # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
+            stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=False)
+            undo.callback(stream.undeclare)
             alive = session.liveliness().declare_subscriber(
                 keys.publisher_alive, guarded(self._take_alive), history=True
             )
@@ -300,6 +296,10 @@ class MachineTap:
         self._link.session.get(self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S)
 
     def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr) != self._keys.stream:
+            self._on_message(_verbatim(sample))
+
+    def _take_block(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
             self._on_message(_verbatim(sample))
 
@@ -408,6 +408,23 @@ def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: 
         cache=zenoh.ext.CacheConfig(max_samples=cache),
         sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
         publisher_detection=True,
+    )
+
+
+def _stream_subscriber(
+    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None], *, wait: bool
+) -> zenoh.ext.AdvancedSubscriber[None]:
+    """Subscribe to sample blocks: those of a publisher's cache first, those lost on the way fetched again.
+
+    With `wait` the callback may hold up the network's own thread, and nothing is fetched again.
+    """
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key,
+        zenoh.handlers.Callback(callback, indirect=not wait),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
+        recovery=None if wait else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        subscriber_detection=True,
     )
 
 

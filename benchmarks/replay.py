@@ -1,0 +1,77 @@
+"""How fast a recording of a large machine is replayed offline, and in how much memory.
+
+Run: ``python benchmarks/replay.py [MINUTES]`` (60 without). A rotor kit with twelve channels and a shaft angle at 4 kHz
+is simulated into a recording of that length and one of a sixth of it; each is replayed offline by the command, one
+after the other, in one thread. What matters is the ratio to real time and that memory does not grow with the length.
+"""
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import models
+from models.machine import load_machine
+from simulator.recorder import record
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+
+_TILT = """
+[[sensors]]
+name = "{name}"
+quantity = "{quantity}"
+location = "disc"
+direction = "{direction}"
+unit = "rad{per_s}"
+"""
+
+
+def large_machine(folder: Path) -> Path:
+    """Write the machine file: the shipped rotor kit with four tilt channels more, at twice its rate."""
+    text = (
+        (Path(models.__file__).parent / "machines" / "lab.toml")
+        .read_text(encoding="utf-8")
+        .replace("rate_hz = 2000.0", "rate_hz = 4000.0")
+    )
+    for quantity, per_s in (("tilt", ""), ("tilt_rate", "/s")):
+        for direction in "yz":
+            name = f"{quantity}-{direction}"
+            text += _TILT.format(name=name, quantity=quantity, direction=direction, per_s=per_s)
+    file = folder / "large.toml"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+def main() -> None:
+    """Measure and print."""
+    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else 60.0
+    one_thread = os.environ | dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    with tempfile.TemporaryDirectory() as place:
+        file = large_machine(Path(place))
+        machine = load_machine(file)
+        scenario, _ = load_scenario("healthy")
+        print(f"{len(machine.sensors)} channels at {machine.rate_hz:g} Hz")
+        print("minutes   MB   processor s   × real time   peak memory MB")
+        for length in (minutes / 6, minutes):
+            path = Path(place) / f"{length:g}.mcap"
+            record(machine, blocks(scenario.overridden(seed=1, duration_s=60 * length), machine), path)
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            command = ["-m", "service.rotorwatch", "replay", str(path), "--offline", "--machine", str(file)]
+            # A process of its own each: the largest of all children so far is what the system remembers.
+            subprocess.run(
+                [sys.executable, *command, "--out", str(path.with_suffix(".jsonl"))],
+                check=True,
+                env=one_thread,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            used_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+            size_mb, memory_mb = path.stat().st_size / 1e6, after.ru_maxrss / 1024
+            print(f"{length:7g} {size_mb:6.0f} {used_s:10.1f} {60 * length / used_s:13.0f} {memory_mb:13.0f}")
+
+
+if __name__ == "__main__":
+    main()
