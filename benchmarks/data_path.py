@@ -58,6 +58,8 @@ def main() -> None:
         raise SystemExit("the shipped bundle has no amortised networks: train it again")
     amortised = NetworkDiagnostician(machine, bundle.amortised)
     fit.diagnose(windows[0])
+    following = LikelihoodFit(machine, follow=True)
+    following.diagnose(windows[0])
 
     def yardstick() -> None:
         half = plan.segment // 2
@@ -75,6 +77,7 @@ def main() -> None:
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
         "statistics of a window": median_s(window.statistics, 1),
         "likelihood, warm": median_s(lambda: [fit.diagnose(one) for one in windows], len(windows)),
+        "likelihood, followed": median_s(lambda: [following.diagnose(one) for one in windows], len(windows)),
         "amortised networks, all four": median_s(lambda: [amortised.diagnose(one) for one in windows], len(windows)),
         "relation networks 28, 29, 31": median_s(lambda: [relation.diagnose(one) for one in windows], len(windows)),
         "whole data path, per hop": median_s(whole, hops),
