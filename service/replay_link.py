@@ -168,6 +168,8 @@ class ReplayLink:
         session = self._link.session
         self._target = target
         if not target.prefix:
+            for keys, _ in target.machines:
+                self._keep(session.liveliness().declare_token(keys.replay_alive))
             self._watch_for_live(target)
         for keys, descriptor in target.machines:
             self._publisher(keys.stream)

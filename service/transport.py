@@ -38,6 +38,7 @@ _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 2.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
+_STRAGGLERS_S = 2.0
 
 _T = TypeVar("_T")
 _log = logger(part="transport")
@@ -168,7 +169,8 @@ class MachineLink:
         self._keys = keys
         self._callbacks = callbacks
         self._lock = threading.Lock()
-        self._closed = False
+        self._closed = self._replayed = False
+        self._deaf_until_s = 0.0
         with ExitStack() as undo:
             self._declare(link.session, undo, wait_when_full)
             self._undeclare = undo.pop_all()
@@ -189,6 +191,11 @@ class MachineLink:
             keep(publisher)
         for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
             keep(session.declare_queryable(key, guarded(_answering(key, answer))))
+        # What is replayed on a machine's own keys is not of the machine, whoever was there first.
+        keep(session.liveliness().declare_subscriber(keys.replay_alive, guarded(self._take_replay), history=True))
+        self._replayed = self._replayed or any(
+            reply.ok is not None for reply in session.liveliness().get(keys.replay_alive, timeout=_QUERY_TIMEOUT_S)
+        )
         # Descriptor and liveliness before the stream: they say what the stream should look like.
         keep(
             zenoh.ext.declare_advanced_subscriber(
@@ -231,7 +238,16 @@ class MachineLink:
             if not self._closed:
                 publisher.put(text)
 
+    def _take_replay(self, sample: zenoh.Sample) -> None:
+        self._replayed = sample.kind == zenoh.SampleKind.PUT
+        if self._replayed:
+            _log.warning("a replay on this machine's own keys: what it sends is not evaluated", key=self._keys.root)
+        else:
+            self._deaf_until_s = time.monotonic() + _STRAGGLERS_S  # samples may arrive after the token's end
+
     def _take_block(self, sample: zenoh.Sample) -> None:
+        if self._replayed or time.monotonic() < self._deaf_until_s:
+            return
         if sample.kind == zenoh.SampleKind.PUT:
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
             self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, str(sample.encoding)))

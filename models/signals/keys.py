@@ -80,3 +80,8 @@ class MachineKeys:
     def monitor_alive(self) -> str:
         """Liveliness token of the monitor that watches the machine."""
         return f"{self.root}/alive/monitor"
+
+    @property
+    def replay_alive(self) -> str:
+        """Liveliness token of a replay on the machine's own keys: no monitor listens as long as it is there."""
+        return f"{self.root}/alive/replay"

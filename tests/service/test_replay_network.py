@@ -10,9 +10,11 @@ import zenoh
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, read_recording
+from service.inbox import RawBlock
 from service.replay.control import Control
 from service.replay.source import RecordingSource
 from service.replay_link import LiveMachineError, NetworkPlan, replay_to_network
+from service.transport import Link, MachineCallbacks, MachineLink, route
 from tests.service.live import LAB, endpoint, scenario_blocks, service, until
 from tests.service.replaying import recording, write
 
@@ -152,3 +154,34 @@ def test_original_keys_are_left_as_soon_as_somebody_live_appears(source: Recordi
     assert error.startswith(f"a live {who} of demo/lab is there")
     assert error.endswith("the replay on the original keys was stopped")
     assert 1 <= len(heard) < 30
+
+
+def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_of_it(source: RecordingSource) -> None:
+    address, taken, errors = endpoint(), list[RawBlock](), list[str]()
+
+    def nothing(_: object) -> None:
+        return None
+
+    def run() -> None:
+        try:
+            replay_to_network(source, plan(source, address, "", pace=2.0), Control())
+        except LiveMachineError as error:
+            errors.append(str(error))
+
+    callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}")
+    with route((address,)):
+        heard = Heard()
+        other = Link(LinkSettings(mode="client", connect=(address,)))
+        subscriber = other.session.declare_subscriber(LAB.keys.stream, lambda sample: collect(heard, sample))
+        thread = threading.Thread(target=run)
+        thread.start()
+        until(lambda: bool(heard), "first block")
+        late = Link(LinkSettings(mode="client", connect=(address,)))
+        monitor = MachineLink(late, LAB.keys, callbacks, wait_when_full=False)
+        thread.join()
+        assert errors  # it has seen the monitor
+        monitor.close()
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+        late.close()
+        other.close()
+    assert taken == []

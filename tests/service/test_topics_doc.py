@@ -30,7 +30,7 @@ from tests.service.live import LAB, ROOT, settings
 
 KEYS = MachineKeys("demo", "lab")
 NAMES = [name for name, value in vars(MachineKeys).items() if isinstance(value, property) and name != "root"]
-WITHOUT_JSON = {"stream", "publisher_alive", "monitor_alive"}
+WITHOUT_JSON = {"stream", "publisher_alive", "monitor_alive", "replay_alive"}
 TOPICS: dict[str, type[BaseModel]] = {
     "descriptor": ChannelDescriptor,
     "truth": TruthRecord,
