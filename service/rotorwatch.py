@@ -10,6 +10,7 @@ from rich.table import Table
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 from service.commands import interchange as interchange_commands
+from service.commands import plot as plot_commands
 from service.commands import record as record_commands
 from service.commands import replay as replay_commands
 from service.commands.replay import NamespaceOption, in_namespace
@@ -43,6 +44,7 @@ app = typer.Typer(
 record_commands.register(app)
 replay_commands.register(app)
 interchange_commands.register(app)
+plot_commands.register(app)
 
 
 @app.command()

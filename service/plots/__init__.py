@@ -1,1 +1,1 @@
-"""Plots of recordings."""
+"""Plots of recordings: what is to be seen (trend, correlation, orbit, spectrum, waterfall), and its drawing."""

@@ -1,0 +1,163 @@
+"""One picture: from the recordings it is made of to the file it is written to."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from matplotlib.figure import Figure
+
+from models.errors import MachineFileError, RecordingError
+from service.plots.correlation import correlations_of, latest_window
+from service.plots.correlation_figure import paint_correlations
+from service.plots.orbit import read_orbits
+from service.plots.orbit_figure import paint_orbits
+from service.plots.spectrum import Scaling, read_spectrum, read_waterfall
+from service.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
+from service.plots.stretches import RecordedStream
+from service.plots.style import Look, draw
+from service.plots.trend import read_trend, recorded_alarms, trend_machine
+from service.plots.trend_figure import paint_trend
+from service.replay.choice import choose_machine
+from service.replay.source import RecordingSource, parse_moment
+from service.schemas import AlarmEventData
+
+__all__ = ["Kind", "PlotRequest", "draw_plot"]
+
+Kind = Literal["trend", "correlation", "orbit", "spectrum", "waterfall"]
+_LINES = 2.56
+"""Sampling rate over the highest frequency that analysers show."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlotRequest:
+    """What is to be drawn.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Recordings.
+    kind : str
+    out : Path
+        Picture; its suffix, .png or .svg, is the format.
+    key : str or None
+        ``SITE/MACHINE``, where the recordings hold several.
+    from_, to, at : str or None
+        Times of recording, as `parse_moment` takes them; `at` is where the latest data end.
+    machine : str or None
+        ``FILE`` or ``FILE@BUNDLE`` for trends and correlations.
+    channels : tuple of str
+        For spectra.
+    revolutions : int
+        Of an orbit.
+    window_s, resolution_hz : float
+        Of a spectrum.
+    scaling : str
+        ``peak`` or ``density``.
+    log : bool
+        Whether amplitudes are on a logarithmic scale.
+    to_hz : float or None
+        Highest frequency shown.
+    over_speed, cascade : bool
+        For waterfalls: over the speed and not time; lines and not colours.
+    look : Look
+    """
+
+    files: tuple[Path, ...]
+    kind: Kind
+    out: Path
+    key: str | None = None
+    from_: str | None = None
+    to: str | None = None
+    at: str | None = None
+    machine: str | None = None
+    channels: tuple[str, ...] = ()
+    revolutions: int = 8
+    window_s: float = 20.0
+    resolution_hz: float = 0.5
+    scaling: Scaling = "peak"
+    log: bool = False
+    to_hz: float | None = None
+    over_speed: bool = False
+    cascade: bool = False
+    look: Look = field(default_factory=Look)
+
+
+def draw_plot(request: PlotRequest) -> None:
+    """Read, compute, draw, write.
+
+    Raises
+    ------
+    RotorwatchError
+        If a file cannot be used, or there is nothing to be seen; the message says what was looked for.
+    """
+    try:
+        source = RecordingSource(request.files)
+    except RecordingError as error:
+        raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
+    from_ns, to_ns = _limits(request, source)
+    if request.kind == "trend":
+        keys = trend_machine(source, request.key)
+        trend = read_trend(source, keys, request.machine, from_ns, to_ns)
+        draw(request.out, request.look, lambda look: paint_trend(trend, look))
+        return
+    keys = source.machine(request.key)
+    name = f"{keys.site}/{keys.machine}"
+    if request.kind == "correlation":
+        machine, bundle = choose_machine(keys, request.machine)
+        if bundle is None:
+            raise MachineFileError(
+                "correlations are compared with what trained networks predict, and none were named: "
+                "--machine FILE@BUNDLE"
+            )
+        found = correlations_of(latest_window(source, keys, machine, from_ns, to_ns), machine, bundle)
+        networks = bundle.identity
+        draw(request.out, request.look, lambda look: paint_correlations(found, name, networks, look))
+        return
+    stream = RecordedStream(source, keys, from_ns, to_ns)
+    if request.kind == "orbit":
+        orbits = read_orbits(stream, request.revolutions)
+        draw(request.out, request.look, lambda look: paint_orbits(orbits, name, look))
+        return
+    draw(request.out, request.look, _spectra(request, stream, recorded_alarms(source, keys, from_ns, to_ns)))
+
+
+def _spectra(
+    request: PlotRequest, stream: RecordedStream, alarms: tuple[AlarmEventData, ...]
+) -> Callable[[Look], Figure]:
+    channels = stream.channels(request.channels) or stream.displacements
+    if not channels:
+        raise MachineFileError(f"{stream.name} measures no displacement: name channels with --channel")
+    rate_hz = stream.descriptor.rate_hz
+    up_to_hz = min(rate_hz / _LINES if request.to_hz is None else request.to_hz, rate_hz / 2)
+    if up_to_hz < 4 * request.resolution_hz:
+        raise MachineFileError(
+            f"--to-hz is {up_to_hz:g}, expected at least four lines of --resolution {request.resolution_hz:g} Hz"
+        )
+    log = request.log
+    if request.kind == "spectrum":
+        spectrum = read_spectrum(stream, channels, request.window_s, request.resolution_hz, request.scaling)
+        return lambda look: paint_spectrum(spectrum, stream.name, look, log=log, up_to_hz=up_to_hz)
+    if len(request.channels) > 1:
+        raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(request.channels)}")
+    waterfall = read_waterfall(stream, channels[0], request.window_s, request.resolution_hz, request.scaling)
+    paint = paint_cascade if request.cascade else paint_map
+    return lambda look: paint(
+        waterfall, stream.name, look, alarms, over_speed=request.over_speed, log=log, up_to_hz=up_to_hz
+    )
+
+
+def _limits(request: PlotRequest, source: RecordingSource) -> tuple[int, int]:
+    start_ns, end_ns = source.start_ns, source.end_ns + 1
+    from_ns = start_ns if request.from_ is None else parse_moment(request.from_, start_ns, "--from")
+    to_ns = end_ns if request.to is None else parse_moment(request.to, start_ns, "--to")
+    if from_ns >= to_ns or from_ns >= end_ns or to_ns <= start_ns:
+        raise MachineFileError(
+            f"--from {request.from_ or 0} --to {request.to or 'the end'}: nothing was recorded in between"
+        )
+    if request.at is not None:
+        at_ns = parse_moment(request.at, start_ns, "--at")
+        if not from_ns < at_ns:
+            raise MachineFileError(f"--at {request.at}: nothing was recorded before that, from {request.from_ or 0} on")
+        to_ns = min(to_ns, at_ns + 1)  # a block is recorded when it ends
+    return max(from_ns, start_ns), min(to_ns, end_ns)

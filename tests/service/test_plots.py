@@ -1,0 +1,318 @@
+"""What pictures of recordings show: orbits, spectra, correlations and trends, before anything is drawn."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.diagnosis.networks.bundle import load_bundle
+from models.errors import MachineFileError, RotorwatchError
+from models.machine import Machine
+from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.recording import RecordedMessage
+from service.plots.correlation import correlations_of, latest_window
+from service.plots.orbit import read_orbits
+from service.plots.spectrum import read_spectrum, read_waterfall
+from service.plots.stretches import RecordedStream
+from service.plots.trend import read_trend, trend_machine
+from service.replay.offline import OfflineReplay
+from service.replay.source import RecordingSource
+from service.schemas import AlarmCloudEvent, Report
+from simulator.scenario import load_scenario, parse_fault
+from simulator.stream import blocks
+from tests.service.live import LAB, START_NS, scenario_blocks
+from tests.service.replaying import recording, write
+
+NAMES = [channel.name for channel in LAB.sensors]
+S = 10**9
+
+
+def machine_blocks(
+    signals: dict[str, Callable[[FloatArray], FloatArray]], seconds: float, without: Sequence[int] = ()
+) -> list[SampleBlock]:
+    """Blocks of 0.1 s with these signals, in the units of the channels; some blocks may be missing."""
+    size = round(0.1 * LAB.rate_hz)
+    time_s = np.arange(round(seconds * LAB.rate_hz)) / LAB.rate_hz
+    samples = np.zeros((time_s.size, len(NAMES)))
+    for name, signal in signals.items():
+        samples[:, NAMES.index(name)] = signal(time_s)
+    return [
+        SampleBlock(START_NS + round(k * 0.1 * S), k, 1, LAB.rate_hz, samples[k * size : (k + 1) * size])
+        for k in range(time_s.size // size)
+        if k not in without
+    ]
+
+
+def stream_of(path: Path, machine: Machine = LAB, seconds: tuple[float, float] | None = None) -> RecordedStream:
+    source = RecordingSource([path])
+    from_ns, to_ns = source.start_ns, source.end_ns + 1
+    if seconds is not None:
+        from_ns, to_ns = (START_NS + round(limit * S) + 1 for limit in seconds)
+    return RecordedStream(source, machine.keys, from_ns, to_ns)
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Healthy for 75 s, then half of the vertical bearing damping more."""
+    return recording(
+        tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(120.0, parse_fault("c_bz=0.5@75"))
+    )
+
+
+@pytest.fixture(scope="module")
+def lines(faulty: Path) -> list[dict[str, object]]:
+    """What an offline replay of it says, with the networks."""
+    found: list[dict[str, object]] = []
+    source = RecordingSource([faulty])
+    OfflineReplay(source, LAB.keys, LAB, load_bundle("lab", LAB), lambda line: found.append(json.loads(line))).run()
+    return found
+
+
+def reports_of(lines: list[dict[str, object]]) -> list[Report]:
+    return [Report.model_validate(line["message"]) for line in lines if line["topic"] == LAB.keys.report]
+
+
+def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_motion(tmp_path: Path) -> None:
+    scenario, machine = load_scenario("healthy")
+    quiet = scenario.model_copy(
+        update={"sources": (), "sensors": type(scenario.sensors)(), "duration_s": 12.0}
+    )  # nothing but unbalance
+    path = recording(tmp_path / "unbalance.mcap", [block for block, _ in blocks(quiet, machine, start_ns=START_NS)])
+    found = read_orbits(stream_of(path), 8)
+
+    W, rotor = machine.operation.speed_rad_s, machine.rotor
+    H = H_matrix(rotor, W)
+    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
+    q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
+    assert [orbit.location for orbit in found.orbits] == ["bearing", "disc"]
+    assert found.speed_rad_s == pytest.approx(W, rel=1e-4)
+    assert found.end_ns - found.start_ns == pytest.approx(8 * 2e9 * np.pi / W, rel=1e-4)
+    for orbit, y, z in zip(found.orbits, q_um[[0, 1]], q_um[[3, 4]], strict=True):
+        assert orbit.y.q_um == pytest.approx(y, rel=2e-3)
+        assert orbit.z.q_um == pytest.approx(z, rel=2e-3)
+        circle = np.exp(1j * np.linspace(0, 2 * np.pi, 20_000))
+        radius = np.hypot(np.real(y * circle), np.real(z * circle))
+        assert orbit.major_um == pytest.approx(2 * radius.max(), rel=2e-3)
+        assert orbit.minor_um == pytest.approx(2 * radius.min(), rel=2e-3)
+        assert np.ptp(orbit.y_um) == pytest.approx(2 * abs(y), rel=5e-3)
+        assert orbit.precession == "forward"
+        assert orbit.marks_um.shape == (9, 2)  # the pulse that begins and the one that ends, and between
+        assert orbit.marks_um == pytest.approx(np.tile([y.real, z.real], (9, 1)), abs=0.01 * abs(y))
+
+
+def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
+    """Angle falls; y peaks 90° after the pulse; the motion goes against the rotation."""
+    turn = 2 * np.pi * 25.0
+    path = recording(
+        tmp_path / "back.mcap",
+        machine_blocks(
+            {
+                "theta": lambda t: (1.0 - turn * t) % (2 * np.pi),
+                "y1": lambda t: 30 * np.cos(turn * t - 1.0 - np.pi / 2) + 400,
+                "z1": lambda t: 10 * np.sin(turn * t - 1.0 - np.pi / 2) - 300,
+            },
+            3.0,
+        ),
+    )
+    found = read_orbits(stream_of(path), 5)
+    bearing = found.orbits[0]
+    assert found.direction == -1
+    assert found.speed_rad_s == pytest.approx(-turn, rel=1e-3)
+    assert bearing.y.peak_to_peak_um == pytest.approx(60, rel=1e-3)
+    assert bearing.y.phase_lag_deg == pytest.approx(90, abs=0.2)
+    assert bearing.z.phase_lag_deg == pytest.approx(180, abs=0.2)
+    assert (bearing.major_um, bearing.minor_um) == pytest.approx((60, 20), rel=1e-3)
+    assert bearing.precession == "backward"  # y to z, and the shaft turns from z to y
+    assert abs(bearing.y_um.mean()) < 1
+
+
+def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
+    path = recording(
+        tmp_path / "gap.mcap",
+        machine_blocks(
+            {"theta": lambda t: (2 * np.pi * 20.0 * t + 1) % (2 * np.pi), "y1": lambda t: t}, 4.0, without=[34]
+        ),
+    )
+    assert read_orbits(stream_of(path), 9).revolutions == 9
+    with pytest.raises(RotorwatchError, match=r"--revolutions is 10, but only 9 whole revolutions"):
+        read_orbits(stream_of(path), 10)
+
+
+@pytest.mark.parametrize("off_line", [0.0, 0.25, 0.5])
+def test_the_peak_of_a_sine_is_its_amplitude_within_the_scalloping_of_the_window(
+    tmp_path: Path, off_line: float
+) -> None:
+    hz, amplitude = 50.0 + 0.5 * off_line, 12.0
+    path = recording(
+        tmp_path / "sine.mcap", machine_blocks({"y2": lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
+    )
+    stream = stream_of(path)
+    found = read_spectrum(stream, stream.channels(["y2"]), 20.0, 0.5, "peak")
+    scalloping = abs(np.sinc(off_line) / (1 - off_line**2))  # of the Hann window
+    assert found.values[0].max() == pytest.approx(amplitude * scalloping, rel=1e-3)
+    assert found.frequencies_hz[found.values[0].argmax()] == pytest.approx(hz, abs=0.251)
+    assert (found.averages, found.resolution_hz) == (19, 0.5)
+    assert found.end_ns == START_NS + 21 * S
+    assert found.start_ns == START_NS + 1 * S
+    density = read_spectrum(stream, stream.channels(["y2"]), 20.0, 0.5, "density")
+    assert density.values[0].sum() * 0.5 == pytest.approx(amplitude**2 / 2, rel=1e-3)
+
+
+def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
+    """A step across the gap would be broadband; segments on either side do not see it."""
+    path = recording(
+        tmp_path / "step.mcap", machine_blocks({"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
+    )
+    stream = stream_of(path)
+    found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "peak")
+    assert found.values.max() < 1e-9
+    assert found.averages == 7 + 10  # 4.0 s and 5.9 s in halves of a second
+    assert np.isnan(found.speed_rad_s) or found.speed_rad_s == 0
+    with pytest.raises(RotorwatchError, match=r"needs 10 s without a gap, .* in the last 10 s is 5.9 s"):
+        read_spectrum(stream, stream.channels(["y1"]), 10.0, 0.1, "peak")
+    with pytest.raises(MachineFileError, match="--window is 1 s, expected at least 2 s"):
+        read_spectrum(stream, stream.channels(["y1"]), 1.0, 0.5, "peak")
+
+
+def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> None:
+    def turns(t: FloatArray) -> FloatArray:  # 10 Hz to 40 Hz in 60 s
+        return 10 * t + 0.25 * t**2
+
+    path = recording(
+        tmp_path / "runup.mcap",
+        machine_blocks(
+            {
+                "theta": lambda t: (2 * np.pi * turns(t)) % (2 * np.pi),
+                "y1": lambda t: 5 * np.cos(2 * np.pi * turns(t)),
+            },
+            60.0,
+            without=range(300, 330),
+        ),
+    )
+    stream = stream_of(path)
+    found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "peak")
+    assert found.values.shape[0] == 15 + 13  # 3 s are missing, and what is left before the end is no segment
+    strongest_hz = found.frequencies_hz[found.values.argmax(axis=1)]
+    middle_s = ((found.start_ns + found.end_ns) / 2 - START_NS) / S
+    assert strongest_hz == pytest.approx(10 + 0.5 * middle_s, abs=0.76)
+    assert found.speed_rad_s / (2 * np.pi) == pytest.approx(10 + 0.5 * middle_s, abs=0.01)
+    edges, spectra = found.over_speed()
+    known = np.isfinite(spectra[:, 0])
+    slow_hz, fast_hz = edges[:-1][known] / (2 * np.pi), edges[1:][known] / (2 * np.pi)
+    strongest_hz = found.frequencies_hz[spectra[known].argmax(axis=1)]
+    assert (strongest_hz > slow_hz - 0.76).all()
+    assert (strongest_hz < fast_hz + 0.76).all()
+
+
+def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
+    stream = stream_of(faulty, seconds=(0, 20))
+    found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "peak")
+    assert found.values.shape[0] == 5
+    with pytest.raises(RotorwatchError, match=r"the speed stays between 1320 and 1320 rpm"):
+        found.over_speed()
+    with pytest.raises(RotorwatchError, match="1 spectra of demo/lab over 20 s without a gap, expected at least 2"):
+        read_waterfall(stream, stream.displacements[0], 20.0, 0.5, "peak")
+
+
+@pytest.mark.parametrize("nth", [-1, 3])
+def test_correlation_panels_carry_the_figures_of_the_report(
+    faulty: Path, lines: list[dict[str, object]], nth: int
+) -> None:
+    report = [one for one in reports_of(lines) if one.equations][nth]
+    source = RecordingSource([faulty])
+    window = latest_window(source, LAB.keys, LAB, source.start_ns, report.end_ns + S)
+    found = correlations_of(window, LAB, load_bundle("lab", LAB))
+    assert (found.start_ns, found.end_ns) == (report.start_ns, report.end_ns)
+    assert [panel.number for panel in found.panels] == [equation.equation for equation in report.equations]
+    for panel, said in zip(found.panels, report.equations, strict=True):
+        if not said.evaluable:
+            assert (panel.curves, panel.reading.reason) == ((), said.reason)
+            continue
+        residual = np.concatenate([curve.residual for curve in panel.curves])
+        assert np.mean(residual**2) == pytest.approx(said.msd, rel=1e-12)
+        assert (panel.reading.msd, panel.reading.msd_healthy) == (said.msd, said.msd_healthy)
+        measured = np.concatenate([curve.measured for curve in panel.curves])
+        assert np.sqrt(np.mean(measured**2)) == pytest.approx(1.0)  # over the target's rms
+    by_number = {panel.number: panel for panel in found.panels}
+    assert by_number["30"].reading.reason.startswith("not measured: psi_dot")
+    assert [curve.label for curve in by_number["28"].curves] == ["y1", "y2", "z1", "z2"]
+    assert by_number["28"].x[[0, -1]] == pytest.approx([0.010, 0.125])
+    assert by_number["29"].x.size == 16
+
+
+def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
+    """Each curve against the window's own correlation of that reference with the target."""
+    source = RecordingSource([faulty])
+    window = latest_window(source, LAB.keys, LAB, source.start_ns, source.end_ns + 1)
+    panel = correlations_of(window, LAB, load_bundle("lab", LAB)).panels[0]
+    lags = window.lags_s >= 0.0099
+    for curve in panel.curves:
+        i, j = window.states.index(f"{curve.label}_dot"), window.states.index("y1_dot")
+        estimated = window.correlation[lags, i, j]
+        assert np.corrcoef(curve.measured, estimated)[0, 1] == pytest.approx(1.0)
+
+
+def test_no_full_window_is_said(faulty: Path) -> None:
+    source = RecordingSource([faulty])
+    with pytest.raises(RotorwatchError, match=r"a window is 60 s, usable data are 30 s"):
+        latest_window(source, LAB.keys, LAB, source.start_ns, START_NS + 30 * S + 1)
+
+
+def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[str, object]]) -> None:
+    source = RecordingSource([faulty])
+    reports = reports_of(lines)
+    found = read_trend(source, LAB.keys, None, source.start_ns, source.end_ns + 1)
+    assert found.end_ns.tolist() == [report.end_ns for report in reports]
+    assert found.states == tuple(report.state for report in reports)
+    assert found.limits == LAB.alarms
+    alarms = [AlarmCloudEvent.model_validate(line["message"]) for line in lines if "alarm" in str(line["topic"])]
+    assert [alarm.time_ns for alarm in found.alarms] == [alarm.data.time_ns for alarm in alarms]
+    assert found.alarms[0].parameter == "c_bz"
+    for trend in found.parameters:
+        for number, report in enumerate(reports):
+            verdict = report.verdict
+            shown = report.parameters if verdict is None or verdict.settled else verdict.current
+            values = [reading for reading in shown if reading.name == trend.name and reading.interval_95]
+            if values and values[0].interval_95 is not None:
+                assert trend.change[number] == values[0].relative_change
+                assert (trend.low[number], trend.high[number]) == values[0].interval_95
+            else:
+                assert np.isnan(trend.change[number])
+    last = {trend.name: trend for trend in found.parameters}["c_bz"]
+    assert last.low[-1] < 0.5 < last.high[-1]
+
+
+def test_a_trend_of_recorded_reports_needs_no_samples(
+    tmp_path: Path, faulty: Path, lines: list[dict[str, object]]
+) -> None:
+    """Recorded reports are shown as they are; a machine file asks for new ones, and needs the samples."""
+    messages = []
+    for number, line in enumerate(lines):
+        text = json.dumps(line["message"]).encode()
+        messages.append(RecordedMessage(str(line["topic"]), text, b"", "application/json", START_NS + number, START_NS))
+    messages.append(RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", START_NS + 1000, START_NS))
+    path = write(tmp_path / "reports.mcap", [*messages, *messages[:3]])
+    source, samples = RecordingSource([path]), RecordingSource([faulty])
+    keys = trend_machine(source, None)
+    assert keys == LAB.keys
+    recorded = read_trend(source, keys, None, source.start_ns, source.end_ns + 1)
+    computed = read_trend(samples, keys, None, samples.start_ns, samples.end_ns + 1)
+    assert (recorded.origin, recorded.limits) == ("as recorded", LAB.alarms)
+    assert recorded.end_ns.tolist() == computed.end_ns.tolist()
+    assert [alarm.time_ns for alarm in recorded.alarms] == [alarm.time_ns for alarm in computed.alarms]
+    for one, other in zip(recorded.parameters, computed.parameters, strict=True):
+        np.testing.assert_array_equal(one.change, other.change)
+        np.testing.assert_array_equal(one.high, other.high)
+    with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
+        read_trend(source, keys, "lab", source.start_ns, source.end_ns + 1)
+    with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab; demo/fan is not"):
+        trend_machine(source, "demo/fan")
+
+
+def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
+    source = RecordingSource([faulty])
+    with pytest.raises(RotorwatchError, match=r"no parameter was read .*: 5 reports, while the window was filling"):
+        read_trend(source, LAB.keys, None, source.start_ns, START_NS + 30 * S)
