@@ -10,7 +10,8 @@ from service.plots.style import COLOURS, GREY, INK, Look, heading, rpm, stretch_
 
 __all__ = ["paint_orbits"]
 
-_BLANK_RAD = np.radians(14)
+_BLANK = 0.07
+"""Gap before the keyphasor's dot, of the ellipse's length."""
 
 
 def paint_orbits(found: Orbits, name: str, look: Look) -> Figure:
@@ -54,12 +55,14 @@ def _raw(axes: Axes, orbit: Orbit) -> None:
 
 def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
     sense = found.direction
-    y, z = orbit.at_running_speed(sense * np.linspace(0, 2 * np.pi - _BLANK_RAD, 400))
-    axes.plot(y, z, color=COLOURS[0], linewidth=1.8)
+    y, z = orbit.at_running_speed(sense * np.linspace(0, 2 * np.pi, 720, endpoint=False))
     at = orbit.at_running_speed(np.zeros(1))
+    far = np.hypot(y - at[0], z - at[1]) > _BLANK * orbit.major_um
+    last = int(np.flatnonzero(far)[-1]) + 1 if far.any() else y.size  # the way to the dot is left blank
+    axes.plot(y[:last], z[:last], color=COLOURS[0], linewidth=1.8)
     axes.plot(*at, "o", color=COLOURS[1], markersize=7, markeredgecolor="white", markeredgewidth=0.6)
     for part in (0.3, 0.8):  # which way it goes
-        index = int(part * 399)
+        index = int(part * 720)
         axes.annotate(
             "",
             (y[index + 4], z[index + 4]),

@@ -130,7 +130,7 @@ def _spectra(
         raise MachineFileError(f"{stream.name} measures no displacement: name channels with --channel")
     rate_hz = stream.descriptor.rate_hz
     up_to_hz = min(rate_hz / _LINES if request.to_hz is None else request.to_hz, rate_hz / 2)
-    if up_to_hz < 4 * request.resolution_hz:
+    if request.to_hz is not None and up_to_hz < 4 * request.resolution_hz:
         raise MachineFileError(
             f"--to-hz is {up_to_hz:g}, expected at least four lines of --resolution {request.resolution_hz:g} Hz"
         )

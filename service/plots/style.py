@@ -65,7 +65,7 @@ _STYLE = {
     "grid.linewidth": 0.6,
     "legend.frameon": False,
     "lines.linewidth": 1.2,
-    "path.simplify": True,
+    "text.hinting": "none",  # letters keep their distances in small pictures
     "svg.hashsalt": "rotorwatch",
     "svg.fonttype": "path",  # no font is needed to look at it
 }
@@ -111,9 +111,11 @@ def write_figure(figure: Figure, path: Path, dpi: float) -> None:
         If the file cannot be written.
     """
     kind = path.suffix.lower().removeprefix(".")
-    metadata = {"Date": None} if kind == "svg" else {"Software": None}
     try:
-        figure.savefig(path, format=kind, dpi=dpi, metadata=metadata)
+        if kind == "svg":
+            figure.savefig(path, format="svg", metadata={"Date": None})
+        else:
+            figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True})
     except OSError as error:
         raise RotorwatchError(f"{path}: cannot be written ({error.strerror or error})") from error
 

@@ -1,0 +1,161 @@
+"""`rotorwatch plot`: pictures as files, the same bytes for the same input, and errors that say what was looked for."""
+
+import struct
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from models.signals.recording import RecordedMessage, read_recording
+from service.rotorwatch import app
+from simulator.recorder import record
+from simulator.scenario import parse_fault
+from tests.service.live import LAB, ROOT, START_NS, scenario_blocks
+from tests.service.replaying import recording, write
+
+KINDS = ["trend", "correlation", "orbit", "spectrum", "waterfall"]
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return recording(tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(80.0, parse_fault("c_bz=0.5@0")))
+
+
+@pytest.fixture(scope="module")
+def without_angle(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same machine without a keyphasor."""
+    machine = LAB.model_copy(update={"sensors": LAB.sensors[:-1]})
+    stream = [(block, ()) for block in scenario_blocks(5.0)]
+    path = tmp_path_factory.mktemp("plots") / "plain.mcap"
+    short = iter(
+        [
+            (type(block)(block.start_ns, block.sequence, block.run, block.rate_hz, block.samples[:, :-1].copy()), truth)
+            for block, truth in stream
+        ]
+    )
+    record(machine, short, path)
+    return path
+
+
+def run(*arguments: str | Path) -> tuple[int, str]:
+    found = CliRunner().invoke(app, ["plot", *map(str, arguments)])
+    return found.exit_code, found.output
+
+
+def pixels(path: Path) -> tuple[int, int]:
+    head = path.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = struct.unpack(">II", head[16:24])
+    return width, height
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_as_png_and_svg(faulty: Path, tmp_path: Path, kind: str) -> None:
+    for suffix in ("png", "svg"):
+        out = tmp_path / f"picture.{suffix}"
+        code, said = run(faulty, "--kind", kind, "--out", out, "--size", "8x6", "--dpi", "50")
+        assert (code, said.strip()) == (0, str(out)), said
+    assert pixels(tmp_path / "picture.png") == (400, 300)
+    root = ET.parse(tmp_path / "picture.svg").getroot()  # noqa: S314  # written a moment ago
+    assert (root.attrib["width"], root.attrib["height"]) == ("576pt", "432pt")
+    assert sum(1 for _ in root.iter("{http://www.w3.org/2000/svg}path")) > 20
+
+
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffix: str) -> None:
+    """In another process, with another matplotlibrc."""
+    one, other = tmp_path / f"one.{suffix}", tmp_path / f"other.{suffix}"
+    arguments = ["--kind", "waterfall", "--from", "10", "--to", "30", "--cascade"]
+    assert run(faulty, *arguments, "--out", one)[0] == 0
+    (tmp_path / "matplotlibrc").write_text("axes.facecolor: yellow\nfont.size: 20\n", encoding="utf-8")
+    environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7"}
+    command = [sys.executable, "-m", "service.rotorwatch", "plot", str(faulty), *arguments, "--out", str(other)]
+    subprocess.run(command, check=True, cwd=ROOT, env=environment, timeout=120, capture_output=True)
+    assert one.read_bytes() == other.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--kind", "spectrum", "--channel", "x9"), "--channel is 'x9', which is not a channel of demo/lab; expected"),
+        (("--kind", "waterfall", "--channel", "theta"), "--channel is 'theta', which is the shaft angle"),
+        (("--kind", "waterfall", "--channel", "y1", "--channel", "y2"), "a waterfall is of one channel"),
+        (("--kind", "waterfall", "--axis", "speed"), "the speed stays between 1320 and 1320 rpm"),
+        (("--kind", "spectrum", "--window", "1"), "--window is 1 s, expected at least 2 s"),
+        (("--kind", "spectrum", "--window", "nan"), "--window is nan, expected a number above 0"),
+        (("--kind", "spectrum", "--resolution", "900"), "--resolution is 900 Hz, expected at most 250 Hz"),
+        (("--kind", "spectrum", "--to-hz", "1"), "--to-hz is 1, expected at least four lines"),
+        (("--kind", "orbit", "--channel", "y1"), "--channel makes sense only with --kind spectrum or waterfall"),
+        (("--kind", "trend", "--at", "5"), "--at makes sense only with --kind correlation or orbit or spectrum"),
+        (("--kind", "trend", "--to", "30"), "no parameter was read in this stretch of time"),
+        (("--kind", "correlation", "--at", "30"), "a window is 60 s, usable data are 30 s"),
+        (("--kind", "correlation", "--machine", "lab"), "none were named: --machine FILE@BUNDLE"),
+        (("--kind", "correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),
+        (("--kind", "orbit", "--from", "20", "--at", "20"), "--at 20: nothing was recorded before that"),
+        (("--kind", "orbit", "--from", "500"), "nothing was recorded in between"),
+        (("--kind", "orbit", "--from", "79.9", "--revolutions", "9"), "--revolutions is 9, but only"),
+        (("--kind", "orbit", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
+        (("--kind", "orbit", "--size", "big"), "--size is 'big', expected width x height in inches"),
+    ],
+)
+def test_what_cannot_be_drawn_is_said(faulty: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+    out = tmp_path / "picture.png"
+    code, said = run(faulty, *arguments, "--out", out)
+    assert code in (1, 2)
+    assert message in said
+    assert not out.exists()
+
+
+def test_names_of_pictures(faulty: Path, tmp_path: Path) -> None:
+    code, said = run(faulty, "--kind", "orbit", "--out", tmp_path / "orbit.pdf")
+    assert (code, "expected a name that ends in .png or .svg" in said) == (2, True)
+    out = tmp_path / "orbit.PNG"
+    assert run(faulty, "--kind", "orbit", "--out", out)[0] == 0
+    before = out.read_bytes()
+    code, said = run(faulty, "--kind", "orbit", "--out", out, "--revolutions", "2")
+    assert (code, "exists already; --overwrite replaces it" in said) == (2, True)
+    assert out.read_bytes() == before
+    assert run(faulty, "--kind", "orbit", "--out", out, "--revolutions", "2", "--overwrite")[0] == 0
+    assert out.read_bytes() != before
+    code, said = run(faulty, "--kind", "orbit", "--out", tmp_path / "nowhere" / "orbit.png")
+    assert (code, "cannot be written" in said) == (1, True)
+    code, said = run(tmp_path / "missing.mcap", "--kind", "orbit", "--out", tmp_path / "other.png")
+    assert (code, "missing.mcap" in said) == (2, True)
+
+
+def test_without_a_keyphasor_there_are_spectra_but_no_orbits(without_angle: Path, tmp_path: Path) -> None:
+    code, said = run(without_angle, "--kind", "orbit", "--out", tmp_path / "orbit.png")
+    assert (code, "has no channel with the shaft angle (keyphasor)" in said) == (2, True)
+    code, said = run(
+        without_angle, "--kind", "waterfall", "--axis", "speed", "--window", "2", "--out", tmp_path / "w.png"
+    )
+    assert (code, "--axis speed needs the shaft angle" in said) == (1, True)
+    for kind in ("spectrum", "waterfall"):
+        code, said = run(without_angle, "--kind", kind, "--window", "2", "--out", tmp_path / f"{kind}.png")
+        assert code == 0, said
+
+
+def test_a_recording_without_samples_and_reports(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "truth.mcap", [RecordedMessage(LAB.keys.truth, b"{}", b"", "application/json", START_NS, 0)]
+    )
+    for kind, message in (("trend", "machines with reports or sample blocks: none"), ("orbit", "sample blocks: none")):
+        code, said = run(path, "--kind", kind, "--out", tmp_path / "picture.png")
+        assert (code, message in said) == (2, True)
+
+
+def test_a_stream_without_its_descriptor(faulty: Path, tmp_path: Path) -> None:
+    path = write(tmp_path / "bare.mcap", list(read_recording(faulty, keys={LAB.keys.stream}))[:50])
+    code, said = run(path, "--kind", "spectrum", "--out", tmp_path / "picture.png")
+    assert (code, "no channel descriptor on rotorwatch/demo/lab/descriptor" in said) == (1, True)
+
+
+def test_without_matplotlib_it_says_what_to_install(
+    faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # what import does then is what it does without the package
+    code, said = run(faulty, "--kind", "orbit", "--out", tmp_path / "orbit.png")
+    assert (code, "pip install 'rotorwatch[plots]'" in said) == (2, True)
