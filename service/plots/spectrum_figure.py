@@ -10,6 +10,7 @@ from service.plots.spectrum import Spectrum, Waterfall
 from service.plots.style import (
     COLOURS,
     INK,
+    PLATE,
     UNIT_TEXT,
     Look,
     alarm_lines,
@@ -148,7 +149,7 @@ def paint_cascade(
             )  # fmt: skip
             axes.annotate(
                 f"{number}×", (number * running[-1], base[-1]), xytext=(6, 12), textcoords="offset points",
-                fontsize=9, color=COLOURS[1], annotation_clip=True, zorder=300,
+                fontsize=9, color=COLOURS[1], annotation_clip=True, zorder=300, bbox=PLATE,
             )  # fmt: skip
     full = f"{top:.3g} {_unit(found.channel, found.scaling).partition(', ')[0]}"
     right = axes.get_xlim()[1]
@@ -163,6 +164,7 @@ def paint_cascade(
         va="center",
         fontsize=8,
         zorder=400,
+        bbox=PLATE,
     )
     _waterfall_heading(figure, look, found, name)
     return figure

@@ -21,11 +21,13 @@ __all__ = [
     "COLOURS",
     "GREY",
     "INK",
+    "PLATE",
     "SEVERITY_COLOURS",
     "STATE_COLOURS",
     "UNIT_TEXT",
     "Look",
     "alarm_lines",
+    "alarm_text",
     "as_date",
     "as_dates",
     "draw",
@@ -50,6 +52,8 @@ STATE_COLOURS = {
 }
 SEVERITY_COLOURS = {"alert": "#E69F00", "danger": "#D55E00"}
 UNIT_TEXT = {"um": "µm"}
+PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+"""Behind a text that stands on lines or colours."""
 
 _STYLE = {
     "font.size": 9.0,
@@ -166,10 +170,22 @@ def time_axis(axes: Axes, *, vertical: bool = False) -> None:
     axis.set_label_text("time, UTC")
 
 
+def alarm_text(alarm: AlarmEventData) -> str:
+    """An alarm event in two words."""
+    return f"{alarm.parameter} cleared" if alarm.kind == "cleared" else f"{alarm.severity} {alarm.parameter}"
+
+
 def alarm_lines(axes: Axes, alarms: Iterable[AlarmEventData], *, vertical: bool = False) -> None:
     """A line at each alarm event: full where raised or escalated, dashed where cleared."""
     for alarm in alarms:
         at = as_date(alarm.time_ns)
         colour = SEVERITY_COLOURS.get(alarm.severity, INK)
         dashes = "--" if alarm.kind == "cleared" else "-"
-        (axes.axhline if vertical else axes.axvline)(at, color=colour, linewidth=1.3, linestyle=dashes, zorder=1.5)
+        if not vertical:
+            axes.axvline(at, color=colour, linewidth=1.3, linestyle=dashes, zorder=1.5)
+            continue
+        axes.axhline(at, color=colour, linewidth=1.3, linestyle=dashes, zorder=250)  # over the lines of a cascade
+        axes.annotate(
+            alarm_text(alarm), (0.0, at), xycoords=("axes fraction", "data"), xytext=(4, 3),
+            textcoords="offset points", fontsize=8, color=INK, zorder=251, bbox=PLATE,
+        )  # fmt: skip

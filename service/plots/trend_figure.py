@@ -16,6 +16,7 @@ from service.plots.style import (
     STATE_COLOURS,
     Look,
     alarm_lines,
+    alarm_text,
     as_date,
     as_dates,
     heading,
@@ -67,7 +68,10 @@ def paint_trend(trend: Trend, look: Look) -> Figure:
 def _legend(trend: Trend) -> list[Patch | Line2D]:
     handles: list[Patch | Line2D] = [Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval")]
     if trend.limits is not None:
-        for severity, colour in SEVERITY_COLOURS.items():
+        limits = trend.limits
+        near = any(_danger_near(parameter, limits) for parameter in trend.parameters)
+        for severity in ("alert", "danger") if near else ("alert",):
+            colour = SEVERITY_COLOURS[severity]
             handles.append(Line2D([], [], color=colour, linewidth=0.9, linestyle=_DASHES, label=f"{severity} limit"))
     if trend.alarms:
         handles.append(Line2D([], [], color=SEVERITY_COLOURS["alert"], linewidth=1.3, label="alarm raised"))
@@ -103,7 +107,7 @@ def _states(axes: Axes, trend: Trend, step_ns: int) -> None:
 def _name_alarms(axes: Axes, alarms: tuple[AlarmEventData, ...]) -> None:
     for alarm in alarms[:8]:
         axes.annotate(
-            f"{alarm.severity} {alarm.parameter}" if alarm.kind != "cleared" else f"{alarm.parameter} cleared",
+            alarm_text(alarm),
             (as_date(alarm.time_ns), 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(0, 3),
@@ -126,20 +130,24 @@ def _parameter(axes: Axes, parameter: ParameterTrend, trend: Trend, step_ns: int
     axes.set_ylabel("%")
     far = float(np.nanmax(np.abs(np.append(change, 0.0))))
     wide = float(np.nanmedian(np.maximum(np.abs(low - change), np.abs(high - change))))
-    limit = _limits(axes, parameter.name, trend.limits, far)
+    limit = _limits(axes, parameter, trend.limits)
     ends = float(np.nanmax(np.abs(np.append(low, high))))
     # One window with an endless interval must not hide the others.
     top = max(_LEAST_PERCENT, 1.15 * limit, min(1.05 * ends, 2.5 * max(far + wide, limit)))
     axes.set_ylim(-top, top)
 
 
-def _limits(axes: Axes, name: str, alarms: AlarmSettings | None, far_percent: float) -> float:
+def _danger_near(parameter: ParameterTrend, alarms: AlarmSettings) -> bool:
+    return float(np.nanmax(np.abs(parameter.change))) > 0.6 * alarms.for_parameter(parameter.name).danger_above
+
+
+def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None) -> float:
     """Lines at the alarm limits, either sign; danger only where it is near. The largest one drawn, in percent."""
     if alarms is None:
         return 0.0
-    limits = alarms.for_parameter(name)
+    limits = alarms.for_parameter(parameter.name)
     drawn = [(100 * limits.raise_above, "alert")]
-    if far_percent > 60 * limits.danger_above:
+    if _danger_near(parameter, alarms):
         drawn.append((100 * limits.danger_above, "danger"))
     for value, severity in drawn:
         for sign in (-1, 1):
