@@ -47,7 +47,8 @@ def paint_trend(trend: Trend, look: Look) -> Figure:
     _speed(panels[-1], trend, step_ns)
     for axes in panels[1:]:
         alarm_lines(axes, trend.alarms)
-    _name_alarms(panels[0], trend.alarms)
+    for name, axes in zip(("model", *(one.name for one in trend.parameters)), panels, strict=False):
+        _name_alarms(axes, [alarm for alarm in trend.alarms if alarm.parameter == name])
     panels[-1].set_xlim(*as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns])))
     time_axis(panels[-1])
     figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
@@ -104,7 +105,8 @@ def _states(axes: Axes, trend: Trend, step_ns: int) -> None:
     )
 
 
-def _name_alarms(axes: Axes, alarms: tuple[AlarmEventData, ...]) -> None:
+def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> None:
+    """Events of a parameter in the line of its title; those of the model over the states."""
     for alarm in alarms[:8]:
         axes.annotate(
             alarm_text(alarm),
@@ -112,7 +114,7 @@ def _name_alarms(axes: Axes, alarms: tuple[AlarmEventData, ...]) -> None:
             xycoords=("data", "axes fraction"),
             xytext=(0, 3),
             textcoords="offset points",
-            ha="right",
+            ha="center",
             va="bottom",
             fontsize=8,
             color=INK,
@@ -133,7 +135,7 @@ def _parameter(axes: Axes, parameter: ParameterTrend, trend: Trend, step_ns: int
     limit = _limits(axes, parameter, trend.limits)
     ends = float(np.nanmax(np.abs(np.append(low, high))))
     # One window with an endless interval must not hide the others.
-    top = max(_LEAST_PERCENT, 1.15 * limit, min(1.05 * ends, 2.5 * max(far + wide, limit)))
+    top = max(_LEAST_PERCENT, 1.15 * limit, min(1.15 * ends, 2.5 * max(far + wide, limit)))
     axes.set_ylim(-top, top)
 
 
