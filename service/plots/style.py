@@ -177,7 +177,7 @@ def alarm_text(alarm: AlarmEventData) -> str:
 
 def alarm_lines(axes: Axes, alarms: Iterable[AlarmEventData], *, vertical: bool = False) -> None:
     """A line at each alarm event: full where raised or escalated, dashed where cleared."""
-    for alarm in alarms:
+    for alarm in sorted(alarms, key=lambda event: event.severity):  # danger over alert
         at = as_date(alarm.time_ns)
         colour = SEVERITY_COLOURS.get(alarm.severity, INK)
         dashes = "--" if alarm.kind == "cleared" else "-"

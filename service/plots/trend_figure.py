@@ -97,7 +97,7 @@ def _states(axes: Axes, trend: Trend, step_ns: int) -> None:
     axes.legend(
         handles=[Patch(color=STATE_COLOURS[state], label=state) for state in seen],
         loc="lower right",
-        bbox_to_anchor=(1.0, 1.15),
+        bbox_to_anchor=(1.0, 2.0),
         ncols=len(seen),
         borderpad=0,
         handlelength=1.0,
