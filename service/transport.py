@@ -239,11 +239,12 @@ class MachineLink:
                 publisher.put(text)
 
     def _take_replay(self, sample: zenoh.Sample) -> None:
-        self._replayed = sample.kind == zenoh.SampleKind.PUT
-        if self._replayed:
+        replayed = sample.kind == zenoh.SampleKind.PUT
+        if replayed:
             _log.warning("a replay on this machine's own keys: what it sends is not evaluated", key=self._keys.root)
-        else:
-            self._deaf_until_s = time.monotonic() + _STRAGGLERS_S  # samples may arrive after the token's end
+        else:  # samples may arrive after the token's end; blocks come on another thread, so this is first
+            self._deaf_until_s = time.monotonic() + _STRAGGLERS_S
+        self._replayed = replayed
 
     def _take_block(self, sample: zenoh.Sample) -> None:
         if self._replayed or time.monotonic() < self._deaf_until_s:

@@ -164,7 +164,7 @@ def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_o
 
     def run() -> None:
         try:
-            replay_to_network(source, plan(source, address, "", pace=2.0), Control())
+            replay_to_network(source, plan(source, address, "", pace=0.5), Control())
         except LiveMachineError as error:
             errors.append(str(error))
 
