@@ -157,7 +157,9 @@ def _unbalance(
     if not (np.all(np.isfinite(observed)) and np.all(np.isfinite(spread))):
         raise EstimationError("no unbalance in the healthy recording")
     design = np.kron(np.eye(2), np.ones((len(used), 1)))
-    weight = np.linalg.pinv(positive(spread), hermitian=True)
+    # weighted as if the bearing were known: sharpest where the verdict is that nothing else changed
+    known = with_bearing.T @ np.linalg.pinv(positive(total), hermitian=True) @ with_bearing
+    weight = np.linalg.inv(positive(spread - known))
     combine = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
     vector = combine @ observed
     size = math.hypot(1 + vector[0], vector[1])

@@ -22,6 +22,8 @@ N_COEFFICIENTS = N_TERMS - 1
 _ITERATIONS = 8
 _OWN_SPREAD = 1.0  # standard deviation expected beforehand of m1/k, in units of m2/k
 _SHAFT_SPREAD = 0.5  # the same of s
+_WORTH_A_TERM = 16.0  # χ² by which that term must improve the fit
+_NO_SHAFT_SPREAD = 0.02  # the same where there is no such term
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +123,13 @@ def learn_plane(windows: tuple[WindowStatistics, ...], plane: str) -> tuple[Plan
     lags = [lag_beyond_memory(part, np.concatenate([[1.0], -fitted[0]])) for part in parts]
     parts = [lag_moments(window, plane, lag) for window, lag in zip(windows, lags, strict=True)]
     b, covariance, chi2, freedom = _fit(parts, fitted[0], prior)
+    # Fewer terms unless the last one is plainly needed; its uncertainty counts in either case. With one source,
+    # y2 - y1 and the disc's acceleration can take each other's place, and the estimate wanders along that direction
+    # further than its covariance says.
+    minimal = _fit(parts, fitted[0], np.concatenate([prior[:3], [1 / _NO_SHAFT_SPREAD**2]]))
+    if minimal[2] <= chi2 + _WORTH_A_TERM:
+        b, _, chi2, freedom = minimal
+        covariance = _fit(parts, b, prior, iterations=1)[1]
     spread = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(b)) and b[0] < 0 and b[0] < -2 * spread[0]):
         raise EstimationError(
@@ -149,9 +158,11 @@ def _start(parts: list[LagMoments]) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([first, [0.0, 0.0]]), prior
 
 
-def _fit(parts: list[LagMoments], b: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, float, int]:
+def _fit(
+    parts: list[LagMoments], b: FloatArray, prior: FloatArray, iterations: int = _ITERATIONS
+) -> tuple[FloatArray, FloatArray, float, int]:
     """Coefficients, covariance, χ² and its degrees of freedom."""
-    for _ in range(_ITERATIONS):
+    for _ in range(iterations):
         combination = np.concatenate([[1.0], -b])
         Q, C, rank = np.zeros((N_TERMS, N_TERMS)), np.zeros((N_TERMS, N_TERMS)), 0
         for part in parts:

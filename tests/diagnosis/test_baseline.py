@@ -1,0 +1,105 @@
+"""A baseline learned on healthy windows of a finite-element rotor, and later windows read against it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from models.diagnosis.baseline.diagnostician import BASELINE_PARAMETERS, BaselineDiagnostician
+from models.diagnosis.baseline.learned import learn_baseline
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from tests.diagnosis.fe_rotor import INDEPENDENT, Excitation, Rotor, plan, simulate, windows, with_bearing
+
+ROTOR = Rotor()
+OTHER = Excitation(cutoff_hz=50.0, sources=INDEPENDENT)
+
+
+@cache
+def recorded(
+    rotor: Rotor, excitation: Excitation, seed: int, count: int = 1, **noise: float
+) -> tuple[WindowStatistics, ...]:
+    sizes = plan()
+    return tuple(windows(simulate(rotor, excitation, 60.0 * count + 3, seed, **noise), sizes))
+
+
+@cache
+def monitor(**noise: float) -> BaselineDiagnostician:
+    return BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 3, **noise)))
+
+
+def z_of(diagnosis: Diagnosis) -> dict[str, float]:
+    return {reading.name: reading.z for reading in diagnosis.parameters if reading.z is not None}
+
+
+def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
+    found = [z_of(monitor().diagnose(window)) for window in recorded(ROTOR, OTHER, 2, 3)]
+    for name in BASELINE_PARAMETERS:
+        z = np.array([each[name] for each in found])
+        assert np.all(np.abs(z) < 3.5), (name, z)
+        assert abs(z.mean()) < 2, (name, z)
+
+
+@pytest.mark.parametrize(
+    ("name", "rotor", "low", "high"),
+    [
+        ("k_by", with_bearing(ROTOR, k_y=-0.1), -0.12, -0.06),
+        ("c_by", with_bearing(ROTOR, c_y=-0.3), -0.40, -0.20),
+        ("k_bz", with_bearing(ROTOR, k_z=-0.1), -0.12, -0.06),
+        ("c_bz", with_bearing(ROTOR, c_z=-0.3), -0.40, -0.20),
+        ("e", replace(ROTOR, unbalance_kg_m=1.5 * ROTOR.unbalance_kg_m), 0.2, 0.9),
+    ],
+)
+def test_what_changed_is_named_and_nothing_else(name: str, rotor: Rotor, low: float, high: float) -> None:
+    (window,) = recorded(rotor, OTHER, 3)
+    diagnosis = monitor().diagnose(window)
+    assert isolate_window(diagnosis, 0.001).changed == (name,)
+    reading = next(reading for reading in diagnosis.parameters if reading.name == name)
+    assert reading.change is not None
+    assert low < reading.change < high
+
+
+def test_little_healthy_data_widens_every_interval_and_they_still_hold() -> None:
+    sizes = plan(hops=6)
+    short = BaselineDiagnostician(learn_baseline(windows(simulate(ROTOR, Excitation(), 33, 5), sizes)))
+    for window in recorded(ROTOR, OTHER, 2, 3):
+        little, much = short.diagnose(window), monitor().diagnose(window)
+        assert max(abs(z) for z in z_of(little).values()) < 3.5
+        for few, many in zip(little.parameters[:4], much.parameters[:4], strict=True):
+            assert few.standard_error is not None
+            assert many.standard_error is not None
+            assert few.standard_error > many.standard_error
+
+
+def test_sensor_noise_does_not_bias() -> None:
+    clean = BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 3, noise=1e-4)))
+    noisy = recorded(ROTOR, OTHER, 2, 3, noise=0.05, noise_memory_s=0.002)
+    z = np.array([[z_of(clean.diagnose(window))[name] for name in BASELINE_PARAMETERS[:4]] for window in noisy])
+    assert np.all(np.abs(z.mean(axis=0)) < 2), z
+
+
+def test_what_cannot_be_read_says_why() -> None:
+    (window,) = recorded(ROTOR, OTHER, 3)
+    diagnosis = monitor().diagnose(replace(window, synchronous=None))
+    reasons = {reading.name: reading.reason for reading in diagnosis.parameters}
+    assert reasons["e"] == "no phase reference or not all displacements"
+    assert not reasons["k_by"]
+    keep = [i for i, name in enumerate(window.states) if name != "y2_dot"]
+    partial = replace(
+        window,
+        states=tuple(window.states[i] for i in keep),
+        correlation=window.correlation[:, keep][:, :, keep],
+        hop_correlation=window.hop_correlation[:, :, keep][:, :, :, keep],
+        spectrum=window.spectrum[:, keep][:, :, keep],
+        synchronous=None,
+    )
+    reasons = {reading.name: reading.reason for reading in monitor().diagnose(partial).parameters}
+    assert reasons["k_by"] == reasons["c_by"] == "not measured: y2_dot"
+    assert not reasons["k_bz"]
+    short = replace(window, lags_s=window.lags_s[:20])
+    with pytest.raises(EstimationError, match="correlations reach"):
+        learn_baseline([short])
+    assert all(reading.reason for reading in monitor().diagnose(short).parameters)
