@@ -22,7 +22,7 @@ N_COEFFICIENTS = N_TERMS - 1
 _ITERATIONS = 8
 _OWN_SPREAD = 1.0  # standard deviation expected beforehand of m1/k, in units of m2/k
 _SHAFT_SPREAD = 0.5  # the same of s
-_WORTH_A_TERM = 16.0  # χ² by which that term must improve the fit
+_FITS = 3.0  # standard deviations of χ² within which a relation is taken to fit
 _NO_SHAFT_SPREAD = 0.02  # the same where there is no such term
 
 
@@ -123,11 +123,11 @@ def learn_plane(windows: tuple[WindowStatistics, ...], plane: str) -> tuple[Plan
     lags = [lag_beyond_memory(part, np.concatenate([[1.0], -fitted[0]])) for part in parts]
     parts = [lag_moments(window, plane, lag) for window, lag in zip(windows, lags, strict=True)]
     b, covariance, chi2, freedom = _fit(parts, fitted[0], prior)
-    # Fewer terms unless the last one is plainly needed; its uncertainty counts in either case. With one source,
-    # y2 - y1 and the disc's acceleration can take each other's place, and the estimate wanders along that direction
-    # further than its covariance says.
+    # Without the last term where that fits; its uncertainty counts in either case. With one source, y2 - y1 and the
+    # disc's acceleration can take each other's place, and the estimate wanders along that direction further than its
+    # covariance says, to where the terms' own noise hides the misfit.
     minimal = _fit(parts, fitted[0], np.concatenate([prior[:3], [1 / _NO_SHAFT_SPREAD**2]]))
-    if minimal[2] <= chi2 + _WORTH_A_TERM:
+    if minimal[2] <= minimal[3] + _FITS * np.sqrt(2 * minimal[3]):
         b, _, chi2, freedom = minimal
         covariance = _fit(parts, b, prior, iterations=1)[1]
     spread = np.sqrt(np.diag(covariance))
