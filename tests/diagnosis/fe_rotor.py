@@ -81,9 +81,9 @@ def matrices(rotor: Rotor) -> tuple[FloatArray, FloatArray, FloatArray]:
         K1[at, at] += k_e
     M1[2 * rotor.bearings[0], 2 * rotor.bearings[0]] += rotor.housing_kg
     C1 = rotor.shaft_damping_s * K1
-    M: FloatArray = np.kron(np.eye(2), M1)
-    C: FloatArray = np.kron(np.eye(2), C1)
-    K: FloatArray = np.kron(np.eye(2), K1)
+    M = np.asarray(np.kron(np.eye(2), M1), dtype=np.float64)
+    C = np.asarray(np.kron(np.eye(2), C1), dtype=np.float64)
+    K = np.asarray(np.kron(np.eye(2), K1), dtype=np.float64)
     for node, mass, radius in zip(rotor.discs, rotor.disc_kg, rotor.disc_radius_m, strict=True):
         for plane in (0, n):
             M[plane + 2 * node, plane + 2 * node] += mass
