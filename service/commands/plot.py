@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import exit_codes, one_blas_thread
+from service.commands.running import FromOption, ToOption, exit_codes, one_blas_thread
 
 __all__ = ["register"]
 
@@ -44,11 +44,8 @@ def plot(
         str | None,
         typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several."),
     ] = None,
-    from_: Annotated[
-        str | None,
-        typer.Option("--from", metavar="TIME", help="Seconds after the start, or a time such as 2026-01-01T00:02:30Z."),
-    ] = None,
-    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same, without what comes then.")] = None,
+    from_: FromOption = None,
+    to: ToOption = None,
     at: Annotated[
         str | None,
         typer.Option("--at", metavar="TIME", help="Correlation, orbit, spectrum: the latest up to here. Else the end."),

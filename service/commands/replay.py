@@ -14,7 +14,7 @@ import typer
 
 from models.errors import MachineFileError, RecordingError, RotorwatchError
 from models.signals.link import NAMESPACE_PATTERN, LinkSettings
-from service.commands.running import ENDPOINT, exit_codes, one_blas_thread
+from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:  # these import numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
@@ -75,11 +75,8 @@ def replay(
         str | None,
         typer.Option("--key", metavar="SITE/MACHINE", help="Only this machine, if the recordings hold several."),
     ] = None,
-    from_: Annotated[
-        str | None,
-        typer.Option("--from", metavar="TIME", help="Seconds after the start, or a time such as 2026-01-01T00:02:30Z."),
-    ] = None,
-    to: Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same, without what comes then.")] = None,
+    from_: FromOption = None,
+    to: ToOption = None,
     prefix: Annotated[
         str | None,
         typer.Option(

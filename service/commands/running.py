@@ -9,7 +9,7 @@ import typer
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 
-__all__ = ["ENDPOINT", "ConnectOption", "ListenOption", "exit_codes", "one_blas_thread"]
+__all__ = ["ENDPOINT", "ConnectOption", "FromOption", "ListenOption", "ToOption", "exit_codes", "one_blas_thread"]
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
@@ -21,6 +21,12 @@ ConnectOption = Annotated[
 ListenOption = Annotated[
     list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Zenoh endpoint to listen on. Repeatable.")
 ]
+
+FromOption = Annotated[
+    str | None,
+    typer.Option("--from", metavar="TIME", help="Seconds after the start, or a time such as 2026-01-01T00:02:30Z."),
+]
+ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same, without what comes then.")]
 
 
 def one_blas_thread() -> None:
