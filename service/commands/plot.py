@@ -98,7 +98,7 @@ def plot(
     ] = None,
     dpi: Annotated[float, typer.Option("--dpi", min=30, max=600, help="Pixels per inch of a PNG.")] = 120.0,
 ) -> None:
-    """Draw what is in recordings: PNG or SVG by the end of the name. Needs matplotlib: pip install 'rotorwatch[plots]'.
+    """Draw what is in recordings: PNG or SVG by the end of the name. Needs matplotlib: the extra "plots".
 
     Times are UTC. --from, --to and --at are times of recording, as for replay. The same input gives the same file.
 
