@@ -42,7 +42,7 @@ _MOST_EXCESS = 100.0
 """Mean squared excess over its expectation, beyond which a window is not evaluated: a dead or clipped channel."""
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12
-"""Windows in a row that may be followed from one search before the next."""
+"""Windows in a row that may start from one window's units and slopes before a search takes its own."""
 
 
 class LikelihoodFit:
@@ -174,18 +174,19 @@ class LikelihoodFit:
         found = None
         line, self._line = self._line, None
         if line is not None and self._followed < _FOLLOWED and self._alike(line, window, excluded):
+            self._followed += 1
             found = line.follow(_observed(line.model, window), speed, _NEAR, _GAIN)
             if found is not None:
-                self._line, self._followed = line, self._followed + 1
+                self._line = line
                 return line.model, line.search, found
             search = self._search(line.model, window, speed, self._strength)
             # The same units, and the first step's derivatives are those at which the last search ended.
             model, found = line.model, _searched(search, line)
         if found is None:
             model, search, found = self._maximise(window, excluded, scale, speed)
+            self._followed = 0
         if self._follow:
-            self._line = Linearised(model, search, found)
-            self._line_segments, self._followed = window.n_segments, 0
+            self._line, self._line_segments = Linearised(model, search, found), window.n_segments
         return model, search, found
 
     def _alike(self, line: Linearised, window: WindowStatistics, excluded: npt.NDArray[np.bool_]) -> bool:
