@@ -16,6 +16,7 @@ import numpy.typing as npt
 from models.machine import Machine
 from models.physics.matrices import STATE_INDEX
 from models.signals.block import FloatArray
+from models.signals.channels import ACCELERATIONS
 
 __all__ = ["ComplexArray", "HopMoments", "Plan", "hop_moments", "plan_for"]
 
@@ -31,7 +32,8 @@ class Plan:
     rate_hz : float
         Sampling rate.
     states : tuple of str
-        Measured state variables (``y1`` … ``phi_dot``) in the order of the statistics' columns.
+        Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
+        statistics' columns.
     columns : ndarray of int
         Column of the stream for each of `states`.
     scales : ndarray
@@ -92,7 +94,7 @@ def plan_for(machine: Machine, *, lagged: bool = True) -> Plan:
     """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
-    states = tuple(name for name in STATE_INDEX if name in order)
+    states = tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in order)
     columns = np.array([order[name] for name in states], dtype=np.intp)
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)

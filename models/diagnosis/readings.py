@@ -99,6 +99,9 @@ class Diagnosis:
     covariance : ndarray, shape (m, m), or None
         Covariance of the m evaluable `parameters`' changes, in their order; None where a diagnostician knows only
         single standard errors.
+    common : ndarray, shape (m, m), or None
+        Part of `covariance` that every window shares, as the error of a commissioning does: further windows do not
+        remove it. None where there is no such part.
     misfit_z : float or None
         Over-identification: how far the window is from anything the model can explain, standard normal where the model
         holds; None where the diagnostician has no such test.
@@ -113,6 +116,7 @@ class Diagnosis:
     parameters: tuple[ParameterReading, ...] = ()
     equations: tuple[EquationReading, ...] = ()
     covariance: FloatArray | None = None
+    common: FloatArray | None = None
     misfit_z: float | None = None
     suspect: str = ""
     steps: int = 0

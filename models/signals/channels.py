@@ -7,7 +7,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["UNIT_TO_SI", "Channel", "ChannelDescriptor", "Quantity", "state_name"]
+__all__ = ["ACCELERATIONS", "UNIT_TO_SI", "Channel", "ChannelDescriptor", "Quantity", "state_name"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
@@ -17,6 +17,7 @@ class Quantity(StrEnum):
 
     DISPLACEMENT = "displacement"
     VELOCITY = "velocity"
+    ACCELERATION = "acceleration"
     TILT = "tilt"
     TILT_RATE = "tilt_rate"
     SHAFT_ANGLE = "shaft_angle"
@@ -25,6 +26,7 @@ class Quantity(StrEnum):
 UNIT_TO_SI: dict[Quantity, dict[str, float]] = {
     Quantity.DISPLACEMENT: {"m": 1.0, "mm": 1e-3, "um": 1e-6, "mil": 25.4e-6},
     Quantity.VELOCITY: {"m/s": 1.0, "mm/s": 1e-3, "in/s": 25.4e-3},
+    Quantity.ACCELERATION: {"m/s2": 1.0, "mm/s2": 1e-3, "g": 9.80665, "in/s2": 25.4e-3},
     Quantity.TILT: {"rad": 1.0, "mrad": 1e-3},
     Quantity.TILT_RATE: {"rad/s": 1.0, "mrad/s": 1e-3},
     Quantity.SHAFT_ANGLE: {"rad": 1.0},
@@ -44,8 +46,17 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
     (Quantity.VELOCITY, "bearing", "z"): "z1_dot",
     (Quantity.VELOCITY, "disc", "z"): "z2_dot",
     (Quantity.TILT_RATE, "disc", "z"): "phi_dot",
+    (Quantity.ACCELERATION, "bearing", "y"): "y1_ddot",
+    (Quantity.ACCELERATION, "disc", "y"): "y2_ddot",
+    (Quantity.ACCELERATION, "bearing", "z"): "z1_ddot",
+    (Quantity.ACCELERATION, "disc", "z"): "z2_ddot",
     (Quantity.SHAFT_ANGLE, "shaft", "rotation"): "theta",
 }
+
+ACCELERATIONS: tuple[str, ...] = tuple(
+    name for (quantity, _, _), name in _STATE_NAMES.items() if quantity is Quantity.ACCELERATION
+)
+"""What accelerometers measure: rates of states, in the order in which they follow the states in statistics."""
 
 
 class Channel(BaseModel):

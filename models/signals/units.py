@@ -8,10 +8,7 @@ import re
 
 from models.signals.channels import Quantity
 
-__all__ = ["ACCELERATION", "same_unit", "time_unit_ns", "unit_factor"]
-
-ACCELERATION = "acceleration"
-"""A quantity that can be imported, by integration, but that no recording holds."""
+__all__ = ["same_unit", "time_unit_ns", "unit_factor"]
 
 _INCH = 25.4e-3
 _DEGREE = 0.017453292519943295
@@ -26,7 +23,7 @@ _UNITS: dict[str, dict[str, float]] = {
         **{"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "µm/s": 1e-6},
         **{"in/s": _INCH, "ips": _INCH, "mil/s": 25.4e-6},
     },
-    ACCELERATION: {
+    Quantity.ACCELERATION: {
         **{"m/s^2": 1.0, "m/s²": 1.0, "m/s2": 1.0, "mm/s^2": 1e-3, "mm/s²": 1e-3, "mm/s2": 1e-3},
         **{"g": 9.80665, "mg": 9.80665e-3, "in/s^2": _INCH, "in/s²": _INCH, "in/s2": _INCH},
     },
@@ -46,7 +43,7 @@ def unit_factor(quantity: str, unit: str) -> float:
     Parameters
     ----------
     quantity : str
-        A `Quantity`, or `ACCELERATION`.
+        A `Quantity`.
     unit : str
         As a person or a measuring program writes it; both micro signs are understood.
 

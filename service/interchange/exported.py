@@ -29,6 +29,7 @@ _Row = dict[str, object]
 _SI_UNITS = {
     Quantity.DISPLACEMENT: "m",
     Quantity.VELOCITY: "m/s",
+    Quantity.ACCELERATION: "m/s2",
     Quantity.TILT: "rad",
     Quantity.TILT_RATE: "rad/s",
     Quantity.SHAFT_ANGLE: "rad",

@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from models.errors import MachineFileError
 from models.machine import Machine, read_toml, validation_text
 from models.signals.channels import Channel, Quantity
-from models.signals.units import ACCELERATION, time_unit_ns, unit_factor
+from models.signals.units import time_unit_ns, unit_factor
 
 __all__ = ["Column", "CsvFormat", "Keyphasor", "Mapping", "TimeBase", "load_mapping"]
 
@@ -204,7 +204,7 @@ class Mapping(BaseModel):
                 raise ValueError(
                     f"acceleration.channels.{name}: a {channel.quantity} is not what acceleration integrates to"
                 )
-            self._check_unit(f"acceleration.channels.{name}", ACCELERATION, self.accelerations[name])
+            self._check_unit(f"acceleration.channels.{name}", Quantity.ACCELERATION, self.accelerations[name])
         elif name in self.channels:
             self._check_unit(f"channels.{name}", channel.quantity, self.channels[name])
 

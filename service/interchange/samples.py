@@ -9,7 +9,7 @@ import numpy.typing as npt
 from models.machine import Machine
 from models.signals.block import FloatArray
 from models.signals.channels import Quantity
-from models.signals.units import ACCELERATION, same_unit, unit_factor
+from models.signals.units import same_unit, unit_factor
 from service.interchange.clock import Clock, check_order
 from service.interchange.mapping import Column, Mapping
 from service.interchange.source import Array, Reference, Source, SourceError, as_numbers
@@ -106,7 +106,7 @@ def signals_of(source: Source, mapping: Mapping, machine: Machine) -> list[Signa
         if column is None:
             continue
         reference = Reference(column.column, column.index)
-        quantity = ACCELERATION if integrated else channel.quantity
+        quantity = Quantity.ACCELERATION if integrated else channel.quantity
         unit = _unit(source, reference, column, channel.name, quantity)
         si = unit_factor(quantity, unit) / channel.to_si
         found.append(
