@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.pairs import MotionPair, motion_pairs, pair_powers
+from models.diagnosis.waveform import Waveform, waveform_of
 from models.machine import Machine
 from models.physics.matrices import STATE_INDEX
 from models.signals.block import FloatArray
@@ -75,6 +77,11 @@ class Plan:
         """Frequencies of the kept bins."""
         return np.asarray(self.bins * (self.rate_hz / self.segment), dtype=np.float64)
 
+    @property
+    def pairs(self) -> tuple[MotionPair, ...]:
+        """Columns that measure the same motion."""
+        return motion_pairs(self.states)
+
     def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
         """Measured states in SI units and, last, the shaft angle if there is one; shape (n_samples, n)."""
         states = samples[:, self.columns].astype(np.float64) * self.scales
@@ -132,6 +139,10 @@ class HopMoments:
         power spectral density per Hz.
     turned_rad : float
         Shaft angle covered in the hop (nan without a phase reference).
+    waveform : Waveform
+        What the samples of each measured state look like and, last, those of the shaft angle if there is one.
+    pair_powers : ndarray, shape (n_pairs, n_bands, 3)
+        Powers of the motions that are measured twice, their mean taken out (`models.diagnosis.pairs.pair_powers`).
     """
 
     start_ns: int
@@ -139,6 +150,8 @@ class HopMoments:
     products: FloatArray
     segments: ComplexArray
     turned_rad: float
+    waveform: Waveform
+    pair_powers: ComplexArray
 
 
 def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: int) -> HopMoments:
@@ -167,12 +180,18 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         a = np.hstack([x, ones, np.cos(theta)[:, None], np.sin(theta)[:, None]])
         steps = np.diff(theta[plan.preamble - 1 :])
         turned_rad = float(np.sum((steps + np.pi) % (2 * np.pi) - np.pi))
+    segments = _segment_spectra(a, plan)
+    waveform = waveform_of(samples[plan.preamble :])
+    # The mean leaks from zero frequency into the lowest bins; the rotation obeys v = jωx and stays.
+    level_left = (waveform.mean[:n_states] - level) * segments[:, :, n_states, None]
     return HopMoments(
         start_ns=start_ns,
         end_ns=start_ns + round(plan.hop * 1e9 / plan.rate_hz),
         products=_lagged_products(a, plan),
-        segments=_segment_spectra(a, plan),
+        segments=segments,
         turned_rad=turned_rad,
+        waveform=waveform,
+        pair_powers=pair_powers(segments[:, :, :n_states] - level_left, plan.frequencies_hz, plan.pairs),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan, hop_moments
+from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
 from models.signals.block import FloatArray
 
 __all__ = ["SlidingWindow", "WindowStatistics", "window_statistics"]
@@ -46,6 +47,10 @@ class WindowStatistics:
         Slowest and fastest hop, rad/s (nan without a phase reference).
     duration_s : float
         Length of the data in the window.
+    waveforms : tuple of Waveform
+        What the samples of each hop look like: of each of `states` and, last, of the shaft angle if there is one.
+    pair_powers : tuple of ndarray, each shape (n_pairs, n_bands, 3)
+        Powers of the motions that are measured twice, of each hop (`models.diagnosis.pairs`).
     """
 
     states: tuple[str, ...]
@@ -63,6 +68,18 @@ class WindowStatistics:
     speed_rad_s: float
     speed_range: tuple[float, float]
     duration_s: float
+    waveforms: tuple[Waveform, ...]
+    pair_powers: tuple[ComplexArray, ...]
+
+    @property
+    def hop_waveform(self) -> Waveform:
+        """The waveforms hop by hop, shape (n_hops, n)."""
+        return stacked_waveform(self.waveforms)
+
+    @property
+    def waveform(self) -> Waveform:
+        """The waveforms of the whole window, shape (n,)."""
+        return combined_waveform(self.hop_waveform)
 
 
 def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool = True) -> WindowStatistics:
@@ -107,6 +124,8 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         speed_rad_s=sum(turned) / duration_s,
         speed_range=(min(turned) / duration_s * len(hops), max(turned) / duration_s * len(hops)),
         duration_s=duration_s,
+        waveforms=tuple(hop.waveform for hop in hops),
+        pair_powers=tuple(hop.pair_powers for hop in hops),
     )
 
 
@@ -143,6 +162,11 @@ class SlidingWindow:
     def filled(self) -> float:
         """Fraction of a full window that is there."""
         return len(self._hops) / self.plan.hops
+
+    @property
+    def latest_hop(self) -> HopMoments | None:
+        """The hop that was completed last."""
+        return self._hops[-1] if self._hops else None
 
     def feed(self, samples: FloatArray, start_ns: int) -> Iterator[int]:
         """Add samples that continue the previous ones, stopping at every completed hop.

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.diagnosis.moments import Plan, hop_moments, plan_for
+from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform, waveform_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
@@ -55,11 +56,20 @@ def feed(window: SlidingWindow, samples: FloatArray, start: int = 0) -> list[Win
 
 def assert_identical(a: WindowStatistics, b: WindowStatistics) -> None:
     for field in fields(WindowStatistics):
-        x, y = getattr(a, field.name), getattr(b, field.name)
-        if isinstance(x, np.ndarray):
-            np.testing.assert_array_equal(x, y, err_msg=field.name)
-        else:
-            assert x == y or (x != x and y != y), field.name
+        assert_same(getattr(a, field.name), getattr(b, field.name), field.name)
+
+
+def assert_same(x: object, y: object, name: str) -> None:
+    if isinstance(x, np.ndarray):
+        np.testing.assert_array_equal(x, y, err_msg=name)
+    elif isinstance(x, Waveform) and isinstance(y, Waveform):
+        for field in fields(Waveform):
+            assert_same(getattr(x, field.name), getattr(y, field.name), f"{name}.{field.name}")
+    elif isinstance(x, tuple) and isinstance(y, tuple):
+        for one, other in zip(x, y, strict=True):
+            assert_same(one, other, name)
+    else:
+        assert x == y or (x != x and y != y), name
 
 
 def batch_correlation(plan: Plan, samples: FloatArray, end: int) -> FloatArray:
@@ -209,3 +219,45 @@ def test_plan_of_a_machine_names_its_states_in_the_order_of_the_theory() -> None
     np.testing.assert_allclose(si[:, :4], raw[:, order[:4]] * 1e-6)
     np.testing.assert_allclose(si[:, 4:8], raw[:, order[4:]] * 1e-3)
     np.testing.assert_allclose(si[:, 8], raw[:, 8])
+
+
+def test_waveform_is_its_definition() -> None:
+    x = np.array([[0.0, 1, 1, 2, 2, 2, -1, -1, 0, 2], [3.0] * 10, [0.5, 1.5, 0.25, 4, 3, 2, 1, 0, -1, -2]]).T
+    seen = waveform_of(x)
+    np.testing.assert_allclose(seen.mean, x.mean(axis=0))
+    np.testing.assert_allclose(seen.rms, x.std(axis=0))
+    np.testing.assert_array_equal(seen.minimum, [-1, 3, -2])
+    np.testing.assert_array_equal(seen.maximum, [2, 3, 4])
+    np.testing.assert_array_equal(seen.at_minimum, [2, 10, 0])
+    np.testing.assert_array_equal(seen.at_maximum, [3, 10, 0])  # the last sample stands alone
+    np.testing.assert_array_equal(seen.longest_run, [3, 10, 1])
+    np.testing.assert_array_equal(seen.step, [1, np.nan, np.nan])
+
+
+def test_waveforms_of_hops_make_that_of_the_window() -> None:
+    rng = np.random.default_rng(4)
+    x = np.round(2 * rng.standard_normal((600, 2)) + [5, -3]) / 2
+    x[:, 1] = np.clip(x[:, 1], -4, -2)
+    hops = stacked_waveform([waveform_of(x[start : start + 100]) for start in range(0, 600, 100)])
+    both, whole = combined_waveform(hops), waveform_of(x)
+    for name in ("mean", "rms", "minimum", "maximum", "step"):
+        np.testing.assert_allclose(getattr(both, name), getattr(whole, name), err_msg=name)
+    assert both.n_samples == 600
+    # A run across the end of a hop counts as two, so a few are lost, never gained.
+    for name in ("at_minimum", "at_maximum", "longest_run"):
+        assert np.all(getattr(both, name) <= getattr(whole, name)), name
+        assert np.all(getattr(both, name) >= getattr(whole, name) - 10), name
+
+
+def test_pairs_of_a_motion_and_its_rate_keep_their_powers() -> None:
+    """A gain of 0.8 and a sign on the rate of an otherwise exact sine, whatever the offset."""
+    plan = replace(small_plan(), states=("y1", "y1_dot"))
+    t, w = np.arange(1000) / RATE, 2 * np.pi * 8.0
+    samples = np.column_stack([3 * np.sin(w * t) + 1e4, -0.8 * 3 * w * np.cos(w * t), np.mod(t, 2 * np.pi)])
+    statistics = feed(SlidingWindow(plan), samples)[-1]
+    (powers,) = np.sum(statistics.pair_powers, axis=0)
+    gain = powers[:, 1].sum() / powers[:, 0].sum()
+    # Hann segments of four periods smear the line over three bins, whose jω differ: 1 / (1 + 1/3 · (1/4)²) of the gain.
+    assert gain.real == pytest.approx(-0.8 / (1 + 1 / 48), rel=1e-3)
+    assert abs(gain.imag) < 1e-3
+    assert len(statistics.pair_powers) == 4

@@ -1,0 +1,125 @@
+"""What the samples of a channel look like before anything is averaged: level, range, flat tops, standing still.
+
+A stuck or clipped sensor shows in single samples, not in correlations. What is kept per hop is small and is carried to
+the window beside the moments.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.signals.block import FloatArray
+
+__all__ = ["CountArray", "Waveform", "combined_waveform", "stacked_waveform", "waveform_of"]
+
+CountArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Waveform:
+    """Statistics of single channels, without any model; shape (n_channels,), or (n_hops, n_channels) hop by hop.
+
+    Attributes
+    ----------
+    n_samples : int
+        Samples each value stands for.
+    mean, rms : ndarray
+        Mean, and root mean square about it, SI units.
+    minimum, maximum : ndarray
+        Smallest and largest sample.
+    at_minimum, at_maximum : ndarray of int
+        Samples exactly at the minimum or maximum that have an equal neighbour: flat tops.
+    longest_run : ndarray of int
+        Most samples in a row that are exactly equal; 1 if no neighbours are.
+    step : ndarray
+        Smallest difference between unequal neighbours: the quantisation step, if there is one. Nan where no neighbours
+        are equal (not quantised) or all are.
+    """
+
+    n_samples: int
+    mean: FloatArray
+    rms: FloatArray
+    minimum: FloatArray
+    maximum: FloatArray
+    at_minimum: CountArray
+    at_maximum: CountArray
+    longest_run: CountArray
+    step: FloatArray
+
+
+def waveform_of(samples: FloatArray) -> Waveform:
+    """Look at the samples of one hop.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (n_samples, n_channels)
+        Finite, at least one sample.
+    """
+    x = np.array(samples.T, order="C")  # a copy: the mean is taken out of it below
+    n, n_samples = x.shape
+    mean = x.mean(axis=1)
+    minimum, maximum = x.min(axis=1), x.max(axis=1)
+    equal = x[:, 1:] == x[:, :-1]
+    at_minimum, at_maximum = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+    longest_run, step = np.ones(n, dtype=np.int64), np.full(n, np.nan)
+    for row in np.flatnonzero(equal.any(axis=1)):
+        first = np.flatnonzero(equal[row])  # each is equal to its successor
+        runs = np.split(first, np.flatnonzero(np.diff(first) != 1) + 1) if first.size < n_samples - 1 else [first]
+        lengths = np.array([run.size + 1 for run in runs])
+        levels = x[row, [run[0] for run in runs]]
+        at_minimum[row] = lengths[levels == minimum[row]].sum()
+        at_maximum[row] = lengths[levels == maximum[row]].sum()
+        longest_run[row] = lengths.max()
+        if first.size < n_samples - 1:
+            step[row] = np.abs(np.diff(x[row])[~equal[row]]).min()
+    x -= mean[:, None]
+    return Waveform(
+        n_samples=n_samples,
+        mean=mean,
+        rms=np.sqrt(np.einsum("ij,ij->i", x, x) / n_samples),
+        minimum=minimum,
+        maximum=maximum,
+        at_minimum=at_minimum,
+        at_maximum=at_maximum,
+        longest_run=longest_run,
+        step=step,
+    )
+
+
+def stacked_waveform(hops: Sequence[Waveform]) -> Waveform:
+    """Put hops of equal length below each other, shape (n_hops, n_channels)."""
+    return Waveform(
+        n_samples=hops[0].n_samples,
+        mean=np.stack([hop.mean for hop in hops]),
+        rms=np.stack([hop.rms for hop in hops]),
+        minimum=np.stack([hop.minimum for hop in hops]),
+        maximum=np.stack([hop.maximum for hop in hops]),
+        at_minimum=np.stack([hop.at_minimum for hop in hops]),
+        at_maximum=np.stack([hop.at_maximum for hop in hops]),
+        longest_run=np.stack([hop.longest_run for hop in hops]),
+        step=np.stack([hop.step for hop in hops]),
+    )
+
+
+def combined_waveform(hops: Waveform) -> Waveform:
+    """Take the hops of a window together, shape (n_channels,).
+
+    Flat tops count where they are the window's own: at its minimum or maximum. A run that goes on into the next hop
+    counts as two.
+    """
+    minimum, maximum = hops.minimum.min(axis=0), hops.maximum.max(axis=0)
+    mean = hops.mean.mean(axis=0)
+    step = np.where(np.isnan(hops.step), np.inf, hops.step).min(axis=0)
+    return Waveform(
+        n_samples=hops.n_samples * hops.mean.shape[0],
+        mean=mean,
+        rms=np.sqrt((hops.rms**2 + (hops.mean - mean) ** 2).mean(axis=0)),
+        minimum=minimum,
+        maximum=maximum,
+        at_minimum=np.where(hops.minimum == minimum, hops.at_minimum, 0).sum(axis=0),
+        at_maximum=np.where(hops.maximum == maximum, hops.at_maximum, 0).sum(axis=0),
+        longest_run=hops.longest_run.max(axis=0),
+        step=np.where(np.isinf(step), np.nan, step),
+    )
