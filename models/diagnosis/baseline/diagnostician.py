@@ -1,16 +1,27 @@
 """The diagnosis of a window against a baseline."""
 
+import itertools
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
-from models.diagnosis.baseline.lag_moments import absent, shared_covariance
-from models.diagnosis.baseline.learned import PLANES, Baseline, positive, unsuitable
-from models.diagnosis.baseline.relation import N_COEFFICIENTS, PlaneChange, PlaneRelation, read_plane
+from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
+from models.diagnosis.baseline.learned import (
+    Baseline,
+    coefficient_slices,
+    learned_rows,
+    positive,
+    unsuitable,
+)
+from models.diagnosis.baseline.relation import Relation, RowChange, read_row
+from models.diagnosis.baseline.rows import ROWS, Row, parameters_of
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
+    ForceRow,
     Rotation,
     SynchronousState,
     relative_force,
@@ -24,10 +35,43 @@ from models.signals.block import FloatArray
 
 __all__ = ["BASELINE_PARAMETERS", "BaselineDiagnostician"]
 
-BASELINE_PARAMETERS = ("k_by", "c_by", "k_bz", "c_bz", "e")
+BASELINE_PARAMETERS = parameters_of(ROWS)
 """What can be read without any parameter of the machine; the shaft cannot."""
 
 _WORST_ERROR = 0.2
+_RPM = 30 / math.pi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bearing:
+    """Changes of all rows' own parameters.
+
+    Attributes
+    ----------
+    values : ndarray, shape (n_own,)
+    noise : ndarray, shape (n_own, n_own)
+        Covariance from the window alone.
+    sensitivity : ndarray, shape (n_own, n_coefficients)
+        To the relations' coefficients.
+    common : ndarray, shape (n_own, n_own)
+        Covariance from the commissioning.
+    """
+
+    values: FloatArray
+    noise: FloatArray
+    sensitivity: FloatArray
+    common: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Unbalance:
+    """Change of the unbalance, its covariance with the others, its variance, and the commissioning's part of both."""
+
+    value: float
+    covariance: FloatArray
+    variance: float
+    common_covariance: FloatArray
+    common_variance: float
 
 
 class BaselineDiagnostician:
@@ -39,10 +83,27 @@ class BaselineDiagnostician:
     Parameters
     ----------
     baseline : Baseline
+    rows : sequence of Row
+        The table it was learned by.
     """
 
-    def __init__(self, baseline: Baseline) -> None:
+    def __init__(self, baseline: Baseline, rows: Sequence[Row] = ROWS) -> None:
         self._baseline = baseline
+        self._rows = learned_rows(rows)
+        self._slices = coefficient_slices(self._rows)
+        ends = np.cumsum([0, *(len(row.own) for row in self._rows)]).tolist()
+        self._own = tuple(slice(a, b) for a, b in itertools.pairwise(ends))
+        self._forces = {
+            row.name: ForceRow(row, at, own)
+            for row, at, own in zip(self._rows, self._slices, self._own, strict=True)
+            if any(other.rests_on == row.name for other in rows)
+        }
+        self._names = tuple(own.parameter for row in self._rows for own in row.own)
+        self._parameters = parameters_of(rows)
+        self._coefficients = np.zeros(self._slices[-1].stop)
+        for at, relation in zip(self._slices, baseline.relations, strict=True):
+            if relation is not None:
+                self._coefficients[at] = relation.coefficients
 
     @property
     def by(self) -> str:
@@ -53,142 +114,161 @@ class BaselineDiagnostician:
         """Judge one window; never raises: what cannot be read carries its reason."""
         reason = unsuitable(window)
         if reason:
-            return Diagnosis(self.by, tuple(ParameterReading(n, self.by, reason=reason) for n in BASELINE_PARAMETERS))
-        changes: list[PlaneChange | None] = []
+            return Diagnosis(self.by, tuple(ParameterReading(n, self.by, reason=reason) for n in self._parameters))
+        changes: list[RowChange | None] = []
         reasons: dict[str, str] = {}
-        for plane, relation, why in zip(PLANES, self._baseline.relations, self._baseline.reasons, strict=True):
-            change, why_not = _read(relation, window, plane, why)
+        for row, relation, why in zip(self._rows, self._baseline.relations, self._baseline.reasons, strict=True):
+            change, why_not = _read(row, relation, window, why)
             changes.append(change)
-            reasons |= {f"k_b{plane}": why_not, f"c_b{plane}": why_not}
-        values, total, couplings = _bearing(changes, self._baseline, window)
-        reasons["e"] = ""
-        try:
-            value, row, variance = _unbalance(changes, values, total, couplings, self._baseline, window)
-        except EstimationError as error:
-            reasons["e"] = str(error)
-        else:
-            values = np.append(values, value)
-            total = np.block([[total, row[:, None]], [row[None, :], np.array([[variance]])]])
-        known = [n for n, name in enumerate(BASELINE_PARAMETERS) if not reasons[name]]
+            reasons |= {own.parameter: why_not for own in row.own}
+        bearing = self._bearing(changes)
+        names = list(self._names)
+        values, total, common = bearing.values, bearing.noise + bearing.common, bearing.common
+        if "e" in self._parameters:
+            names.append("e")
+            reasons["e"] = ""
+            try:
+                e = self._unbalance(changes, bearing, window)
+            except EstimationError as error:
+                reasons["e"] = str(error)
+            else:
+                values = np.append(values, e.value)
+                total = _bordered(total, e.covariance, e.variance)
+                common = _bordered(common, e.common_covariance, e.common_variance)
+        known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
         errors = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
         parameters = tuple(
-            ParameterReading(name, self.by, float(values[n]), errors[n])
-            if n in errors
-            else ParameterReading(name, self.by, reason=reasons[name])
-            for n, name in enumerate(BASELINE_PARAMETERS)
+            ParameterReading(name, self.by, reason=reasons[name])
+            if reasons[name]
+            else ParameterReading(name, self.by, float(values[names.index(name)]), errors[names.index(name)])
+            for name in self._parameters
         )
-        return Diagnosis(self.by, parameters, covariance=covariance if known else None, misfit_z=_misfit(changes))
+        return Diagnosis(
+            by=self.by,
+            parameters=parameters,
+            covariance=covariance if known else None,
+            common=positive(common[np.ix_(known, known)]) if known else None,
+            misfit_z=_misfit(changes),
+        )
+
+    def _bearing(self, changes: list[RowChange | None]) -> _Bearing:
+        n = len(self._names)
+        values, noise, sensitivity = np.zeros(n), np.zeros((n, n)), np.zeros((n, self._coefficients.size))
+        for i, a in enumerate(changes):
+            if a is None:
+                continue
+            values[self._own[i]] = a.change
+            sensitivity[self._own[i], self._slices[i]] = a.sensitivity
+            for j, b in enumerate(changes[: i + 1]):
+                if b is None:
+                    continue
+                own = a.moments.covariance(a.combination) if i == j else _between(a, b)
+                own = a.projection @ own @ b.projection.T * math.sqrt(a.widening * b.widening)
+                noise[self._own[i], self._own[j]] = own
+                noise[self._own[j], self._own[i]] = own.T
+        common = sensitivity @ self._baseline.covariance @ sensitivity.T
+        for i, change in enumerate(changes):
+            relation = self._baseline.relations[i]
+            if change is None or relation is None:
+                continue
+            for number, parameter in enumerate(self._rows[i].own):
+                learned = [term - 1 for term in parameter.terms if term]
+                if len(learned) == 1 and 0 not in parameter.terms:
+                    # a relative change of damping is in units of a damping that is itself only estimated
+                    at = learned[0]
+                    relative = relation.covariance[at, at] / relation.coefficients[at] ** 2
+                    place = self._own[i].start + number
+                    common[place, place] += max(0.0, (1 + values[place]) ** 2 - 1) * relative
+        return _Bearing(values, noise, sensitivity, common)
+
+    def _unbalance(self, changes: list[RowChange | None], bearing: _Bearing, window: WindowStatistics) -> _Unbalance:
+        """Read the unbalance.
+
+        Raises
+        ------
+        EstimationError
+            With the reason why it cannot be read.
+        """
+        rows = [
+            self._forces[row.name]
+            for row, change in zip(self._rows, changes, strict=True)
+            if change is not None and row.name in self._forces
+        ]
+        if not rows:
+            raise EstimationError("no relation could be read")
+        coordinates = tuple(sorted({motion.coordinate for one in rows for motion in one.row.motions}))
+        healthy, now = self._rotations(coordinates, window)
+        cov = self._baseline.covariance
+        state = SynchronousState(self._coefficients, bearing.values, now.vectors, healthy.vectors)
+        to_b, to_d, to_now, to_healthy = slopes(rows, state, now, healthy)
+        # the error of the coefficients comes in directly and through the bearing's changes
+        through = to_d @ bearing.sensitivity + to_b
+        extra = bearing.common - bearing.sensitivity @ cov @ bearing.sensitivity.T
+        shared = through @ cov @ through.T + to_d @ extra @ to_d.T + to_healthy @ healthy.covariance @ to_healthy.T
+        spread = shared + to_d @ bearing.noise @ to_d.T + to_now @ now.covariance @ to_now.T
+        shared_with = bearing.sensitivity @ cov @ through.T + extra @ to_d.T
+        with_bearing = shared_with + bearing.noise @ to_d.T
+        observed = relative_force(rows, state, now, healthy)
+        if not (np.all(np.isfinite(observed)) and np.all(np.isfinite(spread))):
+            raise EstimationError("no unbalance in the healthy recording")
+        design = np.kron(np.eye(2), np.ones((len(rows), 1)))
+        # weighted as if the bearing were known: sharpest where the verdict is that nothing else changed
+        total = positive(bearing.noise + bearing.common)
+        known = with_bearing.T @ np.linalg.pinv(total, hermitian=True) @ with_bearing
+        weight = np.linalg.inv(positive(spread - known))
+        combine = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
+        vector = combine @ observed
+        size = math.hypot(1 + vector[0], vector[1])
+        along = np.array([1 + vector[0], vector[1]]) / max(size, 1e-9) @ combine
+        variance = float(along @ spread @ along)
+        if variance > (_WORST_ERROR * max(1.0, size)) ** 2:
+            raise EstimationError(f"unbalance not seen well enough: standard error {100 * math.sqrt(variance):.0f} %")
+        return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, float(along @ shared @ along))
+
+    def _rotations(self, coordinates: tuple[str, ...], window: WindowStatistics) -> tuple[Rotation, Rotation]:
+        now = rotation_of(window, coordinates)
+        if not self._baseline.rotations:
+            raise EstimationError("the baseline has no phase reference")
+        if now is None:
+            raise EstimationError("no phase reference")
+        healthy = min(self._baseline.rotations, key=lambda one: abs(now.speed_rad_s / one.speed_rad_s - 1))
+        if abs(now.speed_rad_s / healthy.speed_rad_s - 1) > SPEED_TOLERANCE:
+            learned = ", ".join(f"{one.speed_rad_s * _RPM:.0f}" for one in self._baseline.rotations)
+            raise EstimationError(f"speed {now.speed_rad_s * _RPM:.0f} rpm, the baseline was learned at {learned} rpm")
+        return healthy.of(coordinates), now
 
 
-def _read(
-    relation: PlaneRelation | None, window: WindowStatistics, plane: str, why: str
-) -> tuple[PlaneChange | None, str]:
+def _bordered(matrix: FloatArray, border: FloatArray, corner: float) -> FloatArray:
+    return np.block([[matrix, border[:, None]], [border[None, :], np.array([[corner]])]])
+
+
+def _between(a: RowChange, b: RowChange) -> FloatArray:
+    return shared_covariance(a.moments, a.combination, b.moments, b.combination)
+
+
+def _read(row: Row, relation: Relation | None, window: WindowStatistics, why: str) -> tuple[RowChange | None, str]:
     if relation is None:
         return None, why
-    lacking = absent(window.states, plane)
+    lacking = [name for name in relation.states if name not in window.states]
     if lacking:
-        return None, f"not measured: {', '.join(lacking)}"
+        return None, f"not measured: {', '.join(lacking)}, which the baseline was learned with"
+    if row.needs_speed and not np.isfinite(window.speed_rad_s):
+        return None, "no phase reference"
+    references = tuple(name for name in relation.references if name in window.states)
     try:
-        return read_plane(relation, window), ""
-    except (EstimationError, np.linalg.LinAlgError) as error:
+        return read_row(row, relation, row_window(row, window, relation.states, references)), ""
+    except EstimationError as error:
         return None, str(error)
+    except np.linalg.LinAlgError:
+        return None, f"{row.title}: a channel hardly moves in this window"
 
 
-def _bearing(
-    changes: list[PlaneChange | None], baseline: Baseline, window: WindowStatistics
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Changes of both planes, their covariance, and their sensitivity to the relations' coefficients."""
-    values, noise, sensitivity = np.zeros(4), np.zeros((4, 4)), np.zeros((4, 2 * N_COEFFICIENTS))
-    for i, a in enumerate(changes):
-        if a is None:
-            continue
-        values[2 * i : 2 * i + 2] = a.change
-        sensitivity[2 * i : 2 * i + 2, N_COEFFICIENTS * i : N_COEFFICIENTS * (i + 1)] = a.sensitivity
-        for j, b in enumerate(changes):
-            if b is None:
-                continue
-            between = shared_covariance(a.moments, a.combination, b.moments, b.combination, window)
-            between *= math.sqrt(a.widening * b.widening)
-            noise[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = a.projection @ between @ b.projection.T
-    total = noise + sensitivity @ baseline.covariance @ sensitivity.T
-    for i, (change, relation) in enumerate(zip(changes, baseline.relations, strict=True)):
-        if change is not None and relation is not None:
-            # a relative change of damping is in units of a damping that is itself only estimated
-            relative = relation.covariance[0, 0] / relation.coefficients[0] ** 2
-            total[2 * i + 1, 2 * i + 1] += max(0.0, (1 + change.change[1]) ** 2 - 1) * relative
-    return values, total, sensitivity
-
-
-def _unbalance(
-    changes: list[PlaneChange | None],
-    values: FloatArray,
-    total: FloatArray,
-    sensitivity: FloatArray,
-    baseline: Baseline,
-    window: WindowStatistics,
-) -> tuple[float, FloatArray, float]:
-    """Change of the unbalance, its covariance with the bearing's changes, and its variance.
-
-    Raises
-    ------
-    EstimationError
-        With the reason why it cannot be read.
-    """
-    healthy, now = _rotations(baseline, window)
-    used = [plane for plane, change in enumerate(changes) if change is not None]
-    if not used:
-        raise EstimationError("no relation could be read")
-    state = SynchronousState(baseline.coefficients, values, now.vectors, healthy.vectors)
-    speeds = (now.speed_rad_s, healthy.speed_rad_s)
-    to_b, to_d, to_now, to_healthy = slopes(state, *speeds)
-    rows = [*used, *(plane + 2 for plane in used)]
-    # the error of the coefficients comes in directly and through the bearing's changes
-    through = to_d @ sensitivity + to_b
-    own = total - sensitivity @ baseline.covariance @ sensitivity.T
-    spread = (
-        to_d @ own @ to_d.T
-        + through @ baseline.covariance @ through.T
-        + to_now @ now.covariance @ to_now.T
-        + to_healthy @ healthy.covariance @ to_healthy.T
-    )[np.ix_(rows, rows)]
-    with_bearing = (own @ to_d.T + sensitivity @ baseline.covariance @ through.T)[:, rows]
-    observed = relative_force(state, *speeds)[rows]
-    if not (np.all(np.isfinite(observed)) and np.all(np.isfinite(spread))):
-        raise EstimationError("no unbalance in the healthy recording")
-    design = np.kron(np.eye(2), np.ones((len(used), 1)))
-    # weighted as if the bearing were known: sharpest where the verdict is that nothing else changed
-    known = with_bearing.T @ np.linalg.pinv(positive(total), hermitian=True) @ with_bearing
-    weight = np.linalg.inv(positive(spread - known))
-    combine = np.linalg.solve(design.T @ weight @ design, design.T @ weight)
-    vector = combine @ observed
-    size = math.hypot(1 + vector[0], vector[1])
-    along = np.array([1 + vector[0], vector[1]]) / max(size, 1e-9) @ combine
-    variance = float(along @ spread @ along)
-    if variance > (_WORST_ERROR * max(1.0, size)) ** 2:
-        raise EstimationError(f"unbalance not seen well enough: standard error {100 * math.sqrt(variance):.0f} %")
-    return size - 1, with_bearing @ along, variance
-
-
-def _rotations(baseline: Baseline, window: WindowStatistics) -> tuple[Rotation, Rotation]:
-    healthy, now = baseline.rotation, rotation_of(window)
-    if healthy is None:
-        raise EstimationError("the baseline has no phase reference or not all displacements")
-    if now is None:
-        raise EstimationError("no phase reference or not all displacements")
-    if abs(now.speed_rad_s / healthy.speed_rad_s - 1) > SPEED_TOLERANCE:
-        rpm = 30 / math.pi
-        raise EstimationError(
-            f"speed {now.speed_rad_s * rpm:.0f} rpm, the baseline was learned at {healthy.speed_rad_s * rpm:.0f} rpm"
-        )
-    return healthy, now
-
-
-def _misfit(changes: list[PlaneChange | None]) -> float | None:
-    """What the worse of both planes leaves, as a standard normal variable that knows it is the worse of two."""
+def _misfit(changes: list[RowChange | None]) -> float | None:
+    """What the worst of the rows leaves, as a standard normal variable that knows it is the worst of several."""
     used = [change for change in changes if change is not None]
     if not used:
         return None
     tail = min(float(chi2_distribution.sf(change.chi2, change.degrees_of_freedom)) for change in used)
-    tail = tail if len(used) == 1 else tail * (2 - tail)
+    tail = -math.expm1(len(used) * math.log1p(-min(tail, 1 - 1e-16)))
     return float(norm.isf(np.clip(tail, 1e-300, 1 - 1e-16)))

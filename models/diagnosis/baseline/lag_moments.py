@@ -1,98 +1,84 @@
-"""Moments of one plane: every term of the bearing's equation of motion, correlated with past displacements.
+"""Moments of one row in one window: every term, correlated with past motions.
 
-The sum of the rows of bearing and disc holds no shaft force and no tilt. Divided by the bearing's stiffness to ground,
+Correlated with any motion that lies further back than the force remembers, a row of motion is zero. Sensor noise of
+shorter memory is gone as well. Nothing is differentiated: each moment is a correlation function under a smooth kernel
+over lags, and derivatives stand on the kernel.
 
-    y1 + (c/k) ẏ1 + (m2/k) ÿ2 + (m1/k) ÿ1 + s (y2 - y1) = f / k,
-
-where s is zero on the six-degree-of-freedom machine and takes up a shaft that is held elsewhere too. Correlated with
-any displacement that lies further back than the force f remembers, the right side is zero. Sensor noise of shorter
-memory is gone as well.
-
-Accelerations are not formed: each moment is a correlation function under a smooth kernel over lags, and the derivative
-stands on the kernel. What the moments scatter by follows from the window's spectra (Bartlett's formula), without
-assuming a model of the machine.
+What the moments scatter by follows from the window's spectra (Bartlett's formula), without assuming a model of the
+machine. As the kernels are shifted copies of one another, every covariance is made of blocks that depend on the
+distance of two kernels alone; they are summed over frequency once, for all combinations of terms.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
+from models.diagnosis.baseline.kernels import Kernels, gain, kernels
+from models.diagnosis.baseline.kinematics import Formation, formation_of
+from models.diagnosis.baseline.rows import Row
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
 __all__ = [
     "LAG_FROM_S",
-    "N_TERMS",
-    "REFERENCES",
-    "TERMS",
+    "LONGEST_LAG_FROM_S",
+    "SHORTEST_LAG_FROM_S",
     "LagMoments",
-    "absent",
+    "RowWindow",
     "inverse",
-    "lag_moments",
+    "row_window",
     "shared_covariance",
 ]
-
-REFERENCES = ("y1", "y2", "z1", "z2")
-"""Displacements that serve as references, where they are measured."""
-
-TERMS = ("y1", "y1'", "y2''", "y1''", "y2 - y1")
-"""Terms of the relation in the horizontal plane; the first is the target."""
-
-N_TERMS = len(TERMS)
 
 LAG_FROM_S = 0.036
 """Shortest lag where the memory of the excitation is not known yet: enough for a cutoff of 25 Hz."""
 
-_WIDTH_S = 0.010
-_SPACING_S = 0.004
+SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S = 0.014, 0.045
+"""What the shortest lag may be once the memory is known."""
+
 _RANK = 1e-4
-# y1, y1', y2'', y1'' and y2 as measured; the last column becomes y2 - y1
-_MIX = np.eye(N_TERMS)
-_MIX[0, -1] = -1.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LagMoments:
-    """Moments of one plane in one window.
+    """Moments of one row in one window beyond a shortest lag.
 
     Attributes
     ----------
-    values : ndarray, shape (n_moments, 5)
-        One row per reference and kernel, one column per term of `TERMS`, SI units.
-    hop_values : ndarray, shape (n_hops, n_moments, 5)
+    of : RowWindow
+    kernels : Kernels
+    values : ndarray, shape (n_moments, n_terms)
+        One row per reference and kernel, SI units.
+    hop_values : ndarray, shape (n_hops, n_moments, n_terms)
         The same of every hop.
-    factor : ndarray of complex, shape (n_bins, n_moments, n_references)
-        Square root of the references' spectra seen through the kernels, per √(two-sided bin over duration).
-    spectra : ndarray of complex, shape (n_bins, 5, 5)
-        Cross-spectra of the terms.
-    frequencies_hz : ndarray, shape (n_bins,)
-    terms : ndarray of complex, shape (n_bins, n_states, 5)
-        The terms as combinations of the measured states.
     """
 
+    of: "RowWindow"
+    kernels: Kernels
     values: FloatArray
     hop_values: FloatArray
-    factor: ComplexArray
-    spectra: ComplexArray
-    frequencies_hz: FloatArray
-    terms: ComplexArray
-
-    def residual_spectrum(self, combination: FloatArray) -> FloatArray:
-        """Power spectral density of a combination of the terms, shape (n_bins,)."""
-        density = np.einsum("i,fij,j->f", combination, self.spectra, combination, optimize=True).real
-        return np.asarray(np.clip(density, 0.0, None), dtype=np.float64)
 
     def covariance(self, combination: FloatArray) -> FloatArray:
         """Covariance of the combination's moments where it is unrelated to the past, shape (n_moments, n_moments)."""
-        weighted = self.factor * np.sqrt(self.residual_spectrum(combination))[:, None, None]
-        flat = weighted.transpose(1, 0, 2).reshape(self.values.shape[0], -1)
-        return np.asarray(flat.real @ flat.real.T + flat.imag @ flat.imag.T, dtype=np.float64)
+        pairs = self.of.pairs
+        weights = combination[pairs[0]] * combination[pairs[1]] * np.where(pairs[0] == pairs[1], 1.0, 2.0)
+        blocks = np.tensordot(weights, self.of.blocks, axes=1)
+        n = self.values.shape[0]
+        return np.asarray(blocks.reshape(-1)[self._index].reshape(n, n), dtype=np.float64)
 
     def noise(self, weight: FloatArray) -> FloatArray:
-        """Mean of values' W values that scatter alone would give, shape (5, 5): the errors in the variables."""
-        through = np.einsum("fmr,fmr->f", self.factor.conj(), np.matmul(weight, self.factor)).real
-        return np.asarray(np.einsum("f,fij->ij", through, self.spectra).real, dtype=np.float64)
+        """Mean of values' W values that scatter alone would give, shape (n_terms, n_terms): errors in the variables."""
+        blocks = self.of.blocks
+        summed = np.bincount(self._index, weight.reshape(-1), blocks[0].size)
+        found = blocks.reshape(blocks.shape[0], -1) @ summed
+        n_terms = self.values.shape[1]
+        matrix = np.empty((n_terms, n_terms))
+        matrix[self.of.pairs[0], self.of.pairs[1]] = found
+        matrix[self.of.pairs[1], self.of.pairs[0]] = found
+        return matrix
 
     def scatter(self, combination: FloatArray, weight: FloatArray, rank: int) -> float:
         """Scatter of the combination from hop to hop in units of what `weight` (the inverse covariance) expects."""
@@ -101,73 +87,161 @@ class LagMoments:
         count = hops.shape[0]
         if count < 3:
             return 1.0
-        return float(np.einsum("hm,mn,hn->", hops, weight, hops, optimize=True) / (count * (count - 1) * rank))
+        return float(np.sum((hops @ weight) * hops) / (count * (count - 1) * rank))
+
+    @property
+    def _index(self) -> npt.NDArray[np.intp]:
+        blocks = self.of.blocks
+        return _block_index(blocks.shape[1], self.kernels.centres_s.size, blocks.shape[3])
 
 
-def absent(states: tuple[str, ...], plane: str) -> tuple[str, ...]:
-    """States that the relation of a plane (``y`` or ``z``) needs and that are not measured."""
-    return tuple(name for name in (f"{plane}1", f"{plane}1_dot", f"{plane}2", f"{plane}2_dot") if name not in states)
+@dataclass(frozen=True, slots=True, eq=False)
+class RowWindow:
+    """One row in one window: what does not depend on the shortest lag.
+
+    Attributes
+    ----------
+    window : WindowStatistics
+    formation : Formation
+    references : tuple of str
+        States that serve as references.
+    terms : ndarray of complex, shape (n_bins, n_states, n_terms)
+        The terms as combinations of the measured states.
+    spectra : ndarray of complex, shape (n_bins, n_terms, n_terms)
+        Cross-spectra of the terms.
+    blocks : ndarray, shape (n_pairs, n_references, n_references, 2 n_distances - 1)
+        Covariance of moments of a pair of terms by references and by distance of the kernels.
+    pairs : ndarray of int, shape (2, n_pairs)
+        The pairs of terms.
+    factors : ndarray, shape (n_terms,)
+        The speed for terms whose coefficient is proportional to it, else one.
+    """
+
+    window: WindowStatistics
+    formation: Formation
+    references: tuple[str, ...]
+    terms: ComplexArray
+    spectra: ComplexArray
+    blocks: FloatArray
+    pairs: npt.NDArray[np.intp]
+    factors: FloatArray
+
+    def beyond(self, lag_from_s: float) -> LagMoments:
+        """Moments beyond a shortest lag."""
+        window, formation = self.window, self.formation
+        index = {name: position for position, name in enumerate(window.states)}
+        references = [index[name] for name in self.references]
+        over = kernels(window.lags_s, lag_from_s, formation.deepest)
+
+        def moments(correlation: FloatArray) -> FloatArray:
+            seen: dict[tuple[str, int], FloatArray] = {}
+            columns = []
+            for term, factor in zip(formation.terms, self.factors, strict=True):
+                total: FloatArray | float = 0.0
+                for source in term:
+                    key = source.state, source.derivatives
+                    if key not in seen:
+                        seen[key] = over.values[source.derivatives] @ correlation[..., references, index[source.state]]
+                    total = total + source.factor * factor * seen[key]
+                columns.append(np.swapaxes(np.asarray(total), -2, -1))
+            stacked = np.stack(columns, axis=-1)
+            return np.asarray(stacked.reshape(*stacked.shape[:-3], -1, len(columns)), dtype=np.float64)
+
+        return LagMoments(self, over, moments(window.correlation), moments(window.hop_correlation))
+
+    def residual_spectrum(self, combination: FloatArray) -> FloatArray:
+        """Power spectral density of a combination of the terms, shape (n_bins,)."""
+        density = np.einsum("i,fij,j->f", combination, self.spectra, combination, optimize=True).real
+        return np.asarray(np.clip(density, 0.0, None), dtype=np.float64)
 
 
-def lag_moments(window: WindowStatistics, plane: str, lag_from_s: float) -> LagMoments:
-    """Moments of one plane.
+def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], references: tuple[str, ...]) -> RowWindow:
+    """Prepare a row in a window.
 
     Parameters
     ----------
+    row : Row
     window : WindowStatistics
         With correlations at lags up to 0.1 s or more.
-    plane : str
-        ``y`` or ``z``.
-    lag_from_s : float
-        Shortest lag that is used.
+    states : tuple of str
+        Measured states that the row may be formed from.
+    references : tuple of str
+        Measured states that may serve as references.
     """
+    formation = formation_of([term.motions for term in row.terms], states)
     index = {name: position for position, name in enumerate(window.states)}
-    references = [index[name] for name in REFERENCES if name in index]
-    one, two, rate_1, rate_2 = (index[f"{plane}{name}"] for name in ("1", "2", "1_dot", "2_dot"))
-    columns = [one, rate_1, rate_2, rate_1, two]
-    derived = [False, False, True, True, False]
-    kernel, slope = _kernels(window.lags_s, lag_from_s)
+    f = window.frequencies_hz
+    n_terms = len(row.terms)
+    factors = np.array([window.speed_rad_s if term.times_speed else 1.0 for term in row.terms])
+    terms = np.zeros((f.size, len(window.states), n_terms), dtype=np.complex128)
+    for number, sources in enumerate(formation.terms):
+        for source in sources:
+            rate = (2j * np.pi * f) ** source.derivatives
+            terms[:, index[source.state], number] += source.factor * factors[number] * rate
+    spectra = terms.transpose(0, 2, 1) @ window.spectrum @ terms.conj()
+    columns = [index[name] for name in references]
+    pairs = np.array(np.triu_indices(n_terms))
+    own = spectra[:, pairs[0], pairs[1]].real
+    between = _reference_spectra(window, columns, formation.deepest)
+    nearest = kernels(window.lags_s, SHORTEST_LAG_FROM_S, formation.deepest)
+    cosine, sine = _waves(f.tobytes(), nearest.spacing_s, nearest.centres_s.size)
+    flat = between.reshape(f.size, -1)
+    # one product for each reference pair: what the distance does to it, weighted by the pairs of terms
+    even = own.T @ (flat.real[:, :, None] * cosine[:, None, :]).reshape(f.size, -1)
+    odd = own.T @ (flat.imag[:, :, None] * sine[:, None, :]).reshape(f.size, -1)
+    blocks = (even - odd).reshape(pairs.shape[1], len(columns), len(columns), -1)
+    return RowWindow(window, formation, references, terms, spectra, blocks, pairs, factors)
 
-    def moments(correlation: FloatArray) -> FloatArray:
-        terms = [
-            (-slope if derive else kernel) @ correlation[..., references, column]
-            for column, derive in zip(columns, derived, strict=True)
-        ]
-        stacked = np.stack(terms, axis=-1)  # (..., n_kernels, n_references, 5)
-        swapped = np.swapaxes(stacked, -3, -2)
-        return np.asarray(swapped.reshape(*stacked.shape[:-3], -1, N_TERMS) @ _MIX, dtype=np.float64)
 
+def _reference_spectra(window: WindowStatistics, columns: list[int], deepest: int) -> ComplexArray:
+    """Cross-spectra of the references seen through the kernels, by frequency, per resolution of the window."""
     f = window.frequencies_hz
     step_hz = f[1] - f[0]
     bins_hz = np.full(f.size, step_hz)
     bins_hz[0] += f[0] - step_hz / 2  # below the band the spectra are taken as level
-    rate = np.where(np.array(derived)[None, :], 2j * np.pi * f[:, None], 1.0)
-    terms = np.zeros((f.size, len(window.states), N_TERMS), dtype=np.complex128)
-    terms[:, columns, range(N_TERMS)] = rate
-    terms = terms @ _MIX
-    root = _square_root(window.spectrum[:, references][:, :, references].conj())
-    through = np.exp(2j * np.pi * f[:, None] * window.lags_s) @ kernel.T
-    factor = root[:, :, None, :] * through[:, None, :, None]
-    factor = factor * np.sqrt(2 * bins_hz / window.duration_s)[:, None, None, None]
-    return LagMoments(
-        values=moments(window.correlation),
-        hop_values=moments(window.hop_correlation),
-        factor=factor.reshape(f.size, -1, len(references)),
-        spectra=terms.transpose(0, 2, 1) @ window.spectrum @ terms.conj(),
-        frequencies_hz=f,
-        terms=terms,
-    )
+    weight = 2 * bins_hz / window.duration_s * gain(f, deepest) ** 2
+    return np.asarray(window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None], dtype=np.complex128)
 
 
-def shared_covariance(
-    a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: FloatArray, window: WindowStatistics
-) -> FloatArray:
+@lru_cache(maxsize=16)
+def _waves(frequencies: bytes, spacing_s: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Cosine and sine of 2π f Δ for every distance Δ of two out of `count` kernels, shape (n_bins, 2 count - 1)."""
+    phase = 2 * np.pi * np.frombuffer(frequencies)[:, None] * spacing_s * np.arange(-count + 1, count)
+    return np.cos(phase), np.sin(phase)
+
+
+@lru_cache(maxsize=64)
+def _block_index(n_references: int, n_kernels: int, n_distances: int) -> npt.NDArray[np.intp]:
+    """Where a covariance's elements stand in its blocks, flat."""
+    middle = n_distances // 2
+    k = np.arange(n_kernels)
+    distance = middle + k[:, None] - k[None, :]
+    r = np.arange(n_references)
+    which = r[:, None] * n_references + r[None, :]
+    index = which[:, None, :, None] * n_distances + distance[None, :, None, :]
+    return np.asarray(index.reshape(-1), dtype=np.intp)
+
+
+def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: FloatArray) -> FloatArray:
     """Covariance between the moments of two combinations in one window, shape (n_moments of a, n_moments of b)."""
-    left, right = a.terms @ of_a, b.terms @ of_b
+    window = a.of.window
+    index = {name: position for position, name in enumerate(window.states)}
+    f = window.frequencies_hz
+    left, right = a.of.terms @ of_a, b.of.terms @ of_b
     density = np.einsum("fi,fij,fj->f", left, window.spectrum, right.conj(), optimize=True)
-    first = (a.factor * density[:, None, None]).transpose(1, 0, 2).reshape(a.values.shape[0], -1)
-    second = b.factor.transpose(1, 0, 2).reshape(b.values.shape[0], -1)
-    return np.asarray((first @ second.conj().T).real, dtype=np.float64)
+    rows, columns = ([index[name] for name in one.of.references] for one in (a, b))
+    step_hz = f[1] - f[0]
+    bins_hz = np.full(f.size, step_hz)
+    bins_hz[0] += f[0] - step_hz / 2
+    weight = 2 * bins_hz / window.duration_s
+    weight = weight * gain(f, a.of.formation.deepest) * gain(f, b.of.formation.deepest) * density
+    between = window.spectrum[:, rows][:, :, columns].conj() * weight[:, None, None]
+    first, second = (np.exp(2j * np.pi * f[:, None] * one.kernels.centres_s) for one in (a, b))
+    found = np.empty((len(rows), first.shape[1], len(columns), second.shape[1]))
+    for r in range(len(rows)):
+        for s in range(len(columns)):
+            found[r, :, s, :] = ((first * between[:, r, s, None]).T @ second.conj()).real
+    return found.reshape(a.values.shape[0], b.values.shape[0])
 
 
 def inverse(covariance: FloatArray) -> tuple[FloatArray, int]:
@@ -181,21 +255,3 @@ def inverse(covariance: FloatArray) -> tuple[FloatArray, int]:
     kept = values > _RANK * values[-1]
     basis = vectors[:, kept] / scale[:, None]
     return np.asarray((basis / values[kept]) @ basis.T, dtype=np.float64), int(kept.sum())
-
-
-def _kernels(lags_s: FloatArray, lag_from_s: float) -> tuple[FloatArray, FloatArray]:
-    """Smooth kernels cos⁴ over lags, and their slopes, each shape (n_kernels, n_lags), with the lags' spacing."""
-    centres = np.arange(lag_from_s + _WIDTH_S / 2, lags_s[-1] - _WIDTH_S / 2 + 1e-9, _SPACING_S)
-    u = (lags_s[None, :] - centres[:, None]) / _WIDTH_S
-    inside = np.abs(u) < 0.5
-    spacing = (lags_s[1] - lags_s[0]) / _WIDTH_S
-    kernel = np.where(inside, np.cos(np.pi * u) ** 4, 0.0) * spacing
-    slope = np.where(inside, -4 * np.pi * np.cos(np.pi * u) ** 3 * np.sin(np.pi * u), 0.0) * spacing / _WIDTH_S
-    return kernel, slope
-
-
-def _square_root(spectra: ComplexArray) -> ComplexArray:
-    """Lower factor of Hermitian matrices, which may be singular (one source)."""
-    scale = np.sqrt(np.maximum(np.einsum("fii->fi", spectra).real, np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(spectra / scale[:, :, None] / scale[:, None, :])
-    return np.asarray(scale[:, :, None] * vectors * np.sqrt(np.clip(values, 0, None))[:, None, :], dtype=np.complex128)

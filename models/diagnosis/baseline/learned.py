@@ -1,144 +1,192 @@
 """The baseline of a machine without parameters: what its healthy windows teach."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.baseline.lag_moments import absent, shared_covariance
-from models.diagnosis.baseline.relation import N_COEFFICIENTS, Contribution, PlaneRelation, learn_plane
-from models.diagnosis.baseline.unbalance import SPEED_TOLERANCE, Rotation, rotation_of
+from models.diagnosis.baseline.kernels import LONGEST_LAG_STEP_S
+from models.diagnosis.baseline.kinematics import not_measured, state_of
+from models.diagnosis.baseline.lag_moments import LagMoments, RowWindow, row_window, shared_covariance
+from models.diagnosis.baseline.relation import Contribution, Relation, lags_of, learn_row
+from models.diagnosis.baseline.rows import ROWS, Row
+from models.diagnosis.baseline.unbalance import Rotation, rotation_of, rotations_by_speed
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["PLANES", "Baseline", "learn_baseline", "positive", "unsuitable"]
-
-PLANES = ("y", "z")
-"""Horizontal and vertical."""
+__all__ = ["Baseline", "coefficient_slices", "learn_baseline", "learned_rows", "positive", "unsuitable"]
 
 _SHORTEST_LAG_RANGE_S = 0.1
 _FEWEST_HOPS = 2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Baseline:
     """What was learned on a healthy machine.
 
     Attributes
     ----------
-    relations : tuple of PlaneRelation or None
-        In y and z; None where channels are missing.
+    relations : tuple of Relation or None
+        One for each learned row of the table; None where there is none.
     reasons : tuple of str
         Why there is no relation; empty where there is one.
-    covariance : ndarray, shape (8, 8)
-        Of the coefficients in y, then in z; zero where there is no relation.
-    rotation : Rotation or None
-        Synchronous vectors of the healthy machine.
+    covariance : ndarray, shape (n, n)
+        Of the coefficients of all rows one after the other; zero where there is no relation.
+    rotations : tuple of Rotation
+        Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
     duration_s : float
         Healthy data.
     """
 
-    relations: tuple[PlaneRelation | None, ...]
+    relations: tuple[Relation | None, ...]
     reasons: tuple[str, ...]
     covariance: FloatArray
-    rotation: Rotation | None
+    rotations: tuple[Rotation, ...]
     duration_s: float
 
     @property
-    def coefficients(self) -> FloatArray:
-        """Of both planes, shape (8,)."""
-        parts = [np.zeros(N_COEFFICIENTS) if one is None else one.coefficients for one in self.relations]
-        return np.concatenate(parts)
+    def states(self) -> tuple[str, ...]:
+        """Measured states that it was learned with and that later windows must have."""
+        return tuple(sorted({name for one in self.relations if one is not None for name in one.states}))
 
 
-def learn_baseline(windows: Sequence[WindowStatistics]) -> Baseline:
+def learned_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
+    """Rows that are learned on the stochastic part."""
+    return tuple(row for row in rows if not row.synchronous)
+
+
+def coefficient_slices(rows: Sequence[Row]) -> tuple[slice, ...]:
+    """Where the coefficients of each row stand among those of all."""
+    ends = np.cumsum([0, *(row.n_coefficients for row in rows)]).tolist()
+    return tuple(slice(a, b) for a, b in itertools.pairwise(ends))
+
+
+def learn_baseline(
+    windows: Sequence[WindowStatistics],
+    conditions: Sequence[Hashable] | None = None,
+    rows: Sequence[Row] = ROWS,
+) -> Baseline:
     """Learn a baseline from healthy windows.
 
     Parameters
     ----------
     windows : sequence of WindowStatistics
         They must not overlap; a long recording is best cut into windows of about a minute. Each window weighs by its
-        own spectra, so that they may differ in level, colour and layout of the excitation. Unbalance is learned from
-        those within 3 % of the median speed.
+        own spectra, so that they may differ in speed, load, and level, colour and layout of the excitation.
+    conditions : sequence, optional
+        What each window belongs to, for example the recording it was cut from; one condition without it.
+    rows : sequence of Row
+        Table of rows.
 
     Raises
     ------
     EstimationError
-        If there is nothing to learn from, or if neither plane has a relation.
+        If there is nothing to learn from, or if no row has a relation.
     """
     if not windows:
         raise EstimationError("no healthy window to learn from")
+    if conditions is not None and len(conditions) != len(windows):
+        raise EstimationError(f"{len(conditions)} conditions are given for {len(windows)} healthy windows")
     for window in windows:
         reason = unsuitable(window)
         if reason:
             raise EstimationError(f"healthy window: {reason}")
-    relations: list[PlaneRelation | None] = []
+    states = tuple(name for name in windows[0].states if all(name in window.states for window in windows))
+    learned = learned_rows(rows)
+    relations: list[Relation | None] = []
     reasons, parts = [], []
-    for plane in PLANES:
-        relation, contributions, reason = _learn(tuple(windows), plane)
+    for row in learned:
+        relation, contributions, reason = _learn(row, windows, states)
         relations.append(relation)
         reasons.append(reason)
         parts.append(contributions)
     if all(relation is None for relation in relations):
-        raise EstimationError("; ".join(reasons))
-    covariance = np.zeros((2 * N_COEFFICIENTS, 2 * N_COEFFICIENTS))
-    for number, relation in enumerate(relations):
-        if relation is not None:
-            own = slice(N_COEFFICIENTS * number, N_COEFFICIENTS * (number + 1))
-            covariance[own, own] = relation.covariance
-    first, second = relations
-    if first is not None and second is not None:
-        shared = np.zeros((N_COEFFICIENTS, N_COEFFICIENTS))
-        for a, b, window in zip(*parts, windows, strict=True):
-            between = shared_covariance(a.moments, first.combination, b.moments, second.combination, window)
-            shared += a.projection @ between @ b.projection.T
-        covariance[:N_COEFFICIENTS, N_COEFFICIENTS:] = shared
-        covariance[N_COEFFICIENTS:, :N_COEFFICIENTS] = shared.T
+        raise EstimationError("; ".join(dict.fromkeys(reasons)))
+    coordinates = _coordinates(rows, learned, relations)
+    found = [rotation_of(window, coordinates) for window in windows]
     return Baseline(
         relations=tuple(relations),
         reasons=tuple(reasons),
-        covariance=positive(covariance),
-        rotation=_healthy_rotation(windows),
+        covariance=_covariance(learned, relations, parts),
+        rotations=rotations_by_speed([one for one in found if one is not None]),
         duration_s=sum(window.duration_s for window in windows),
     )
 
 
-def _learn(windows: tuple[WindowStatistics, ...], plane: str) -> tuple[PlaneRelation | None, list[Contribution], str]:
-    lacking = absent(windows[0].states, plane)
-    if lacking:
-        return None, [], f"not measured: {', '.join(lacking)}"
+def _learn(
+    row: Row, windows: Sequence[WindowStatistics], states: tuple[str, ...]
+) -> tuple[Relation | None, list[Contribution], str]:
+    reason = not_measured(row.motions, states)
+    if not reason and row.needs_speed and not all(np.isfinite(window.speed_rad_s) for window in windows):
+        reason = "no phase reference"
+    if reason:
+        return None, [], reason
     try:
-        relation, contributions = learn_plane(windows, plane)
-    except (EstimationError, np.linalg.LinAlgError) as error:
+        relation, contributions = learn_row(row, _moments(row, windows, states))
+    except EstimationError as error:
         return None, [], str(error)
+    except np.linalg.LinAlgError:
+        return None, [], f"{row.title}: the healthy recording does not determine it; a channel may hardly move"
     return relation, contributions, ""
+
+
+def _moments(row: Row, windows: Sequence[WindowStatistics], states: tuple[str, ...]) -> list[LagMoments]:
+    references = references_of(states)
+    prepared: list[RowWindow] = [row_window(row, window, states, references) for window in windows]
+    return [one.beyond(lag) for one, lag in zip(prepared, lags_of(row, prepared), strict=True)]
+
+
+def references_of(states: tuple[str, ...]) -> tuple[str, ...]:
+    """States that serve as references: the lowest derivative of bearing and disc in both planes."""
+    found = []
+    for coordinate in ("y1", "y2", "z1", "z2"):
+        measured = [state_of(coordinate, order) for order in range(3) if state_of(coordinate, order) in states]
+        found += measured[:1]
+    return tuple(found)
+
+
+def _coordinates(
+    rows: Sequence[Row], learned: tuple[Row, ...], relations: Sequence[Relation | None]
+) -> tuple[str, ...]:
+    """Whose synchronous vectors are kept: of all rows that the unbalance can be read by."""
+    there = {row.name for row, relation in zip(learned, relations, strict=True) if relation is not None}
+    used = [row for row in rows if row.synchronous and row.rests_on in there]
+    return tuple(sorted({motion.coordinate for row in used for motion in row.motions}))
+
+
+def _covariance(
+    rows: tuple[Row, ...], relations: Sequence[Relation | None], parts: Sequence[list[Contribution]]
+) -> FloatArray:
+    slices = coefficient_slices(rows)
+    total = np.zeros((slices[-1].stop, slices[-1].stop))
+    for i, first in enumerate(relations):
+        if first is None:
+            continue
+        total[slices[i], slices[i]] = first.covariance
+        for j, second in enumerate(relations[:i]):
+            if second is None:
+                continue
+            for a, b in zip(parts[i], parts[j], strict=True):
+                between = shared_covariance(a.moments, first.combination, b.moments, second.combination)
+                total[slices[i], slices[j]] += a.projection @ between @ b.projection.T
+            total[slices[j], slices[i]] = total[slices[i], slices[j]].T
+    return positive(total)
 
 
 def unsuitable(window: WindowStatistics) -> str:
     """Why a window cannot be used at all; empty if it can."""
     if window.lags_s[-1] < _SHORTEST_LAG_RANGE_S:
         return f"correlations reach {window.lags_s[-1]:g} s, {_SHORTEST_LAG_RANGE_S:g} s are needed"
+    step_s = float(window.lags_s[1] - window.lags_s[0])
+    if step_s > LONGEST_LAG_STEP_S:
+        return f"lags are {1e3 * step_s:g} ms apart, at most {1e3 * LONGEST_LAG_STEP_S:g} ms are needed"
     if window.hop_correlation.shape[0] < _FEWEST_HOPS:
         return f"it has one hop, {_FEWEST_HOPS} are needed"
     if not np.all(np.isfinite(window.correlation)):
         return "its correlations are not finite"
     return ""
-
-
-def _healthy_rotation(windows: Sequence[WindowStatistics]) -> Rotation | None:
-    rotations = [rotation for rotation in map(rotation_of, windows) if rotation is not None]
-    if not rotations:
-        return None
-    middle = float(np.median([rotation.speed_rad_s for rotation in rotations]))
-    near = [one for one in rotations if abs(one.speed_rad_s / middle - 1) <= SPEED_TOLERANCE]
-    if not near:
-        return None
-    return Rotation(
-        vectors=np.mean([one.vectors for one in near], axis=0),
-        covariance=np.sum([one.covariance for one in near], axis=0) / len(near) ** 2,
-        speed_rad_s=float(np.mean([one.speed_rad_s for one in near])),
-    )
 
 
 def positive(covariance: FloatArray) -> FloatArray:

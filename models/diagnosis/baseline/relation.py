@@ -1,49 +1,53 @@
-"""The relation of one plane: learned on healthy windows, and what a later window adds to it.
+"""The relation of one row: learned on healthy windows, and what a later window adds to it.
 
 Both are least squares in which every variable has errors: the moments of the terms scatter with the same force as the
 residual. Left alone that pulls the coefficients towards zero (many weak instruments), so the known part of the scatter
 is taken out of the normal equations (k-class estimator, k the smallest root and at most one).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
 
 from models.diagnosis.baseline.excitation import lag_beyond_memory
-from models.diagnosis.baseline.lag_moments import LAG_FROM_S, N_TERMS, LagMoments, inverse, lag_moments
-from models.diagnosis.window import WindowStatistics
+from models.diagnosis.baseline.lag_moments import LAG_FROM_S, LagMoments, RowWindow, inverse
+from models.diagnosis.baseline.rows import Row
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["N_COEFFICIENTS", "Contribution", "PlaneChange", "PlaneRelation", "learn_plane", "read_plane"]
+__all__ = ["Contribution", "Relation", "RowChange", "change_of", "fit_row", "lags_of", "learn_row", "read_row"]
 
-N_COEFFICIENTS = N_TERMS - 1
 _ITERATIONS = 8
-_OWN_SPREAD = 1.0  # standard deviation expected beforehand of m1/k, in units of m2/k
-_SHAFT_SPREAD = 0.5  # the same of s
 _FITS = 3.0  # standard deviations of χ² within which a relation is taken to fit
-_NO_SHAFT_SPREAD = 0.02  # the same where there is no such term
+_CONVERGED = 1e-4  # standard errors
 
 
-@dataclass(frozen=True, slots=True)
-class PlaneRelation:
-    """What holds between the correlation functions of one plane on the healthy machine.
+@dataclass(frozen=True, slots=True, eq=False)
+class Relation:
+    """What holds between the correlation functions of one row on the healthy machine.
 
     Attributes
     ----------
-    plane : str
-        ``y`` or ``z``.
-    coefficients : ndarray, shape (4,)
-        Of ẏ1, ÿ2, ÿ1 and y2 - y1 in y1 = Σ b x: minus c/k, m2/k, m1/k and s.
-    covariance : ndarray, shape (4, 4)
+    row : str
+        Name in the table of rows.
+    states : tuple of str
+        Measured states the terms are formed from.
+    references : tuple of str
+        Measured states they were correlated with.
+    coefficients : ndarray, shape (n,)
+        Of every term but the first in term₀ = Σ b term; for the bearing's row minus c/k, m2/k, m1/k and s.
+    covariance : ndarray, shape (n, n)
         Theirs, widened where the relation did not fit.
     misfit : float
         χ² of the fit per degree of freedom.
     degrees_of_freedom : int
     """
 
-    plane: str
+    row: str
+    states: tuple[str, ...]
+    references: tuple[str, ...]
     coefficients: FloatArray
     covariance: FloatArray
     misfit: float
@@ -55,14 +59,14 @@ class PlaneRelation:
         return np.concatenate([[1.0], -self.coefficients])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
-    """What one healthy window adds to the coefficients of a plane.
+    """What one healthy window adds to the coefficients of a row.
 
     Attributes
     ----------
     moments : LagMoments
-    projection : ndarray, shape (4, n_moments)
+    projection : ndarray, shape (n_coefficients, n_moments)
         From its moments to the coefficients.
     """
 
@@ -70,20 +74,20 @@ class Contribution:
     projection: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
-class PlaneChange:
-    """What one window says of one plane.
+@dataclass(frozen=True, slots=True, eq=False)
+class RowChange:
+    """What one window says of one row.
 
     Attributes
     ----------
-    change : ndarray, shape (2,)
-        Relative change of stiffness to ground and of damping.
-    projection : ndarray, shape (2, n_moments)
+    change : ndarray, shape (n_own,)
+        Relative change of the row's own parameters.
+    projection : ndarray, shape (n_own, n_moments)
         From the window's moments to the change.
-    sensitivity : ndarray, shape (2, 4)
+    sensitivity : ndarray, shape (n_own, n_coefficients)
         Of the change to the relation's coefficients.
     moments : LagMoments
-    combination : ndarray, shape (5,)
+    combination : ndarray, shape (n_terms,)
         The window's own force.
     widening : float
         Scatter from hop to hop over what the spectra expect, at least 1.
@@ -102,42 +106,119 @@ class PlaneChange:
     degrees_of_freedom: int
 
 
-def learn_plane(windows: tuple[WindowStatistics, ...], plane: str) -> tuple[PlaneRelation, list[Contribution]]:
-    """Learn the relation of a plane.
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Least squares over windows.
+
+    Attributes
+    ----------
+    coefficients : ndarray, shape (n,)
+    covariance : ndarray, shape (n, n)
+    chi2 : float
+    degrees_of_freedom : int
+    """
+
+    coefficients: FloatArray
+    covariance: FloatArray
+    chi2: float
+    degrees_of_freedom: int
+
+    @property
+    def fits(self) -> bool:
+        """Whether what is left is within what scatter explains."""
+        return bool(self.chi2 <= self.degrees_of_freedom + _FITS * np.sqrt(2 * self.degrees_of_freedom))
+
+
+def _prior(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
+    """Precision of the coefficients expected beforehand; `minimal` leaves out what can be left out."""
+    precision = np.zeros(row.n_coefficients)
+    for number, term in enumerate(row.terms[1:]):
+        spread = term.without if minimal and term.without is not None else term.spread
+        if spread is not None:
+            unit = 1.0 if term.in_units_of is None else start[term.in_units_of - 1]
+            precision[number] = 1 / (spread * unit) ** 2
+    return precision
+
+
+def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
+    """First coefficients, from the terms of which nothing is expected beforehand."""
+    rows = []
+    for part in parts:
+        ones = part.covariance(np.eye(len(row.terms))[0])
+        rows.append(part.values / np.sqrt(np.diag(ones))[:, None])
+    stacked = np.concatenate(rows)
+    free = [number for number, term in enumerate(row.terms) if number and term.spread is None]
+    b = np.zeros(row.n_coefficients)
+    b[[number - 1 for number in free]] = np.linalg.lstsq(stacked[:, free], stacked[:, 0], rcond=None)[0]
+    return b
+
+
+def lags_of(row: Row, windows: Sequence[RowWindow]) -> list[float]:
+    """Shortest lag of every window, beyond its excitation's memory, from a first fit."""
+    parts = [window.beyond(LAG_FROM_S) for window in windows]
+    start = _start(row, parts)
+    combination = np.concatenate([[1.0], -_fit(parts, start, _prior(row, start, minimal=False)).coefficients])
+    return [lag_beyond_memory(window, combination) for window in windows]
+
+
+def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
+    """Fit a row without its optional terms and with them.
 
     Parameters
     ----------
-    windows : tuple of WindowStatistics
-        Healthy windows that do not overlap, each in one condition; they may differ from each other.
-    plane : str
-        ``y`` or ``z``.
+    row : Row
+    parts : sequence of LagMoments
+        One of each healthy window.
+    """
+    start = _start(row, parts)
+    full = _fit(parts, start, _prior(row, start, minimal=False))
+    return _fit(parts, full.coefficients, _prior(row, start, minimal=True)), full
+
+
+def learn_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Relation, list[Contribution]]:
+    """Learn the relation of a row.
+
+    Parameters
+    ----------
+    row : Row
+    parts : sequence of LagMoments
+        One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
 
     Raises
     ------
     EstimationError
-        If the windows do not determine stiffness and damping.
+        If the windows do not determine the row's own parameters.
     """
-    parts = [lag_moments(window, plane, LAG_FROM_S) for window in windows]
-    b, prior = _start(parts)
-    fitted = _fit(parts, b, prior)
-    lags = [lag_beyond_memory(part, np.concatenate([[1.0], -fitted[0]])) for part in parts]
-    parts = [lag_moments(window, plane, lag) for window, lag in zip(windows, lags, strict=True)]
-    b, covariance, chi2, freedom = _fit(parts, fitted[0], prior)
-    # Without the last term where that fits; its uncertainty counts in either case. With one source, y2 - y1 and the
-    # disc's acceleration can take each other's place, and the estimate wanders along that direction further than its
-    # covariance says, to where the terms' own noise hides the misfit.
-    minimal = _fit(parts, fitted[0], np.concatenate([prior[:3], [1 / _NO_SHAFT_SPREAD**2]]))
-    if minimal[2] <= minimal[3] + _FITS * np.sqrt(2 * minimal[3]):
-        b, _, chi2, freedom = minimal
-        covariance = _fit(parts, b, prior, iterations=1)[1]
+    # Without the optional terms where that fits; their uncertainty counts in either case. With one source, y2 - y1 and
+    # the disc's acceleration can take each other's place, and the estimate wanders along that direction further than
+    # its covariance says, to where the terms' own noise hides the misfit.
+    minimal, full = fit_row(row, parts)
+    chosen, covariance = full, full.covariance
+    if minimal.fits:
+        start = _start(row, parts)
+        chosen = minimal
+        covariance = _fit(parts, minimal.coefficients, _prior(row, start, minimal=False), iterations=1).covariance
+    b = chosen.coefficients
     spread = np.sqrt(np.diag(covariance))
-    if not (np.all(np.isfinite(b)) and b[0] < 0 and b[0] < -2 * spread[0]):
-        raise EstimationError(
-            f"plane {plane}: the healthy recording does not determine the bearing's damping; record longer, or while "
-            "more than the unbalance moves the machine"
-        )
-    misfit = chi2 / freedom
-    relation = PlaneRelation(plane, b, covariance * max(1.0, misfit), misfit, freedom)
+    for own in row.own:
+        for number in (term for term in own.terms if term):
+            known = abs(b[number - 1]) > 2 * spread[number - 1] and (b[number - 1] < 0 or not own.resists)
+            if not (np.all(np.isfinite(b)) and known):
+                raise EstimationError(
+                    f"{row.title}: the healthy recording does not determine {own.parameter}; record longer, or while "
+                    "more than the unbalance moves the machine"
+                )
+    misfit = chosen.chi2 / chosen.degrees_of_freedom
+    first = parts[0].of
+    relation = Relation(
+        row=row.name,
+        states=first.formation.states,
+        references=first.references,
+        coefficients=b,
+        covariance=covariance * max(1.0, misfit),
+        misfit=misfit,
+        degrees_of_freedom=chosen.degrees_of_freedom,
+    )
     contributions = []
     for part in parts:
         W, kept = inverse(part.covariance(relation.combination))
@@ -146,35 +227,23 @@ def learn_plane(windows: tuple[WindowStatistics, ...], plane: str) -> tuple[Plan
     return relation, contributions
 
 
-def _start(parts: list[LagMoments]) -> tuple[FloatArray, FloatArray]:
-    """First coefficients from damping and disc alone, and the precision expected beforehand of the other two."""
-    rows = []
-    for part in parts:
-        scale = 1 / np.sqrt(np.sum(np.abs(part.factor) ** 2, axis=(0, 2)))
-        rows.append(part.values * scale[:, None])
-    stacked = np.concatenate(rows)
-    first = np.linalg.lstsq(stacked[:, 1:3], stacked[:, 0], rcond=None)[0]
-    prior = np.array([0.0, 0.0, 1 / (_OWN_SPREAD * first[1]) ** 2, 1 / _SHAFT_SPREAD**2])
-    return np.concatenate([first, [0.0, 0.0]]), prior
-
-
-def _fit(
-    parts: list[LagMoments], b: FloatArray, prior: FloatArray, iterations: int = _ITERATIONS
-) -> tuple[FloatArray, FloatArray, float, int]:
-    """Coefficients, covariance, χ² and its degrees of freedom."""
+def _fit(parts: Sequence[LagMoments], b: FloatArray, prior: FloatArray, iterations: int = _ITERATIONS) -> Fit:
+    n = b.size + 1
     for _ in range(iterations):
         combination = np.concatenate([[1.0], -b])
-        Q, C, rank = np.zeros((N_TERMS, N_TERMS)), np.zeros((N_TERMS, N_TERMS)), 0
+        Q, C, rank = np.zeros((n, n)), np.zeros((n, n)), 0
         for part in parts:
-            V = part.covariance(combination)
-            W, kept = inverse(V)
+            W, kept = inverse(part.covariance(combination))
             widening = max(1.0, part.scatter(combination, W, kept))
             Q += part.values.T @ W @ part.values / widening
             C += part.noise(W) / widening
             rank += kept
+        before = b
         b, covariance = _least_squares(Q, C, prior)
+        if np.all(np.abs(b - before) <= _CONVERGED * np.sqrt(np.abs(np.diag(covariance)))):
+            break
     left = np.concatenate([[1.0], -b])
-    return b, covariance, float(left @ Q @ left), max(1, rank - N_COEFFICIENTS)
+    return Fit(b, covariance, float(left @ Q @ left), max(1, rank - b.size))
 
 
 def _least_squares(Q: FloatArray, C: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -188,8 +257,8 @@ def _least_squares(Q: FloatArray, C: FloatArray, prior: FloatArray) -> tuple[Flo
     return covariance @ (Q[1:, 0] - k * C[1:, 0]), covariance
 
 
-def read_plane(relation: PlaneRelation, window: WindowStatistics) -> PlaneChange:
-    """Read the change of stiffness and damping in one window.
+def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
+    """Read the change of a row's own parameters in one window.
 
     Moments are weighted by all that is uncertain, the relation included: where the healthy recording did not determine
     the relation, a window is not asked.
@@ -199,34 +268,45 @@ def read_plane(relation: PlaneRelation, window: WindowStatistics) -> PlaneChange
     EstimationError
         If the window does not determine them.
     """
-    first = _read(relation, lag_moments(window, relation.plane, LAG_FROM_S))
-    lag = lag_beyond_memory(first.moments, first.combination)
-    return _read(relation, lag_moments(window, relation.plane, lag))
+    first = change_of(row, relation, window.beyond(LAG_FROM_S))
+    return change_of(row, relation, window.beyond(lag_beyond_memory(window, first.combination)))
 
 
-def _read(relation: PlaneRelation, moments: LagMoments) -> PlaneChange:
-    beta = -relation.coefficients[0]
+def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
+    """Read the change from given moments.
+
+    Raises
+    ------
+    EstimationError
+        If they do not determine it.
+    """
+    combination = relation.combination
     X = moments.values[:, 1:]
-    signatures = np.zeros((N_TERMS, 3))
-    signatures[:, 0] = relation.combination
-    signatures[0, 1], signatures[1, 2] = -1.0, -beta
+    signatures = np.zeros((combination.size, 1 + len(row.own)))
+    signatures[:, 0] = combination
+    for number, own in enumerate(row.own, start=1):
+        terms = list(own.terms)
+        signatures[terms, number] = -combination[terms]
     Z = moments.values @ signatures
     uncertain = X @ relation.covariance @ X.T
-    d, widening = np.zeros(2), 1.0
+    d, widening = np.zeros(len(row.own)), 1.0
     for _ in range(_ITERATIONS // 2):
         combination = signatures @ np.concatenate([[1.0], -d])
-        own = moments.covariance(combination)
-        W_own, own_rank = inverse(own)
+        own_covariance = moments.covariance(combination)
+        W_own, own_rank = inverse(own_covariance)
         widening = max(1.0, moments.scatter(combination, W_own, own_rank))
-        W, rank = inverse(own * widening + uncertain)
+        W, rank = inverse(own_covariance * widening + uncertain)
         Q = Z.T @ W @ Z
         C = signatures.T @ moments.noise(W) @ signatures * widening
-        d, covariance = _least_squares(Q, C, np.zeros(2))
+        before = d
+        d, covariance = _least_squares(Q, C, np.zeros(d.size))
+        if np.all(np.abs(d - before) <= _CONVERGED * np.sqrt(np.abs(np.diag(covariance)))):
+            break
     if not np.all(np.diag(covariance) > 0):
-        raise EstimationError(f"plane {relation.plane}: the bearing hardly moves in this window")
+        raise EstimationError(f"{row.title}: the bearing hardly moves in this window")
     projection = covariance @ Z[:, 1:].T @ W
     left = Z[:, 0] - Z[:, 1:] @ d
-    return PlaneChange(
+    return RowChange(
         change=d,
         projection=projection,
         sensitivity=-projection @ X,
@@ -234,5 +314,5 @@ def _read(relation: PlaneRelation, moments: LagMoments) -> PlaneChange:
         combination=combination,
         widening=widening,
         chi2=float(left @ W @ left),
-        degrees_of_freedom=max(1, rank - 2),
+        degrees_of_freedom=max(1, rank - d.size),
     )

@@ -3,56 +3,95 @@
 With the phase reference as reference channel the stochastic force drops out of the relation, and what is left of the
 synchronous vectors is the unbalance force over the stiffness to ground, F = Y1 + jΩ(c/k) Y1 - Ω²(m2/k) Y2 - …, in both
 planes. A bearing that changed enters with its own reading, so that its effect on the 1x amplitude is not taken for
-unbalance.
+unbalance. Velocities and accelerations are displacements times jΩ and -Ω².
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.baseline.relation import N_COEFFICIENTS
+from models.diagnosis.baseline.kinematics import lowest, state_of
+from models.diagnosis.baseline.rows import Row
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-__all__ = ["SPEED_TOLERANCE", "Rotation", "SynchronousState", "relative_force", "rotation_of", "slopes"]
+__all__ = [
+    "SPEED_TOLERANCE",
+    "ForceRow",
+    "Rotation",
+    "SynchronousState",
+    "relative_force",
+    "rotation_of",
+    "rotations_by_speed",
+    "slopes",
+]
 
 SPEED_TOLERANCE = 0.03
 """Relative deviation of the speed within which synchronous vectors are compared."""
 
-_CHANNELS = ("y1", "y2", "z1", "z2")
 _NEIGHBOURS = (2, 8)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Rotation:
-    """Synchronous vectors of one window, or of a baseline.
+    """Synchronous vectors of one window, or of a baseline at one speed.
 
     Attributes
     ----------
-    vectors : ndarray, shape (8,)
-        Real parts of y1, y2, z1, z2, then their imaginary parts, m.
-    covariance : ndarray, shape (8, 8)
+    coordinates : tuple of str
+        Whose they are, for example y1, y2, z1, z2.
+    vectors : ndarray, shape (2 n,)
+        Real parts of the displacements, then their imaginary parts, m.
+    covariance : ndarray, shape (2 n, 2 n)
         From the stochastic part near the speed.
     speed_rad_s : float
     """
 
+    coordinates: tuple[str, ...]
     vectors: FloatArray
     covariance: FloatArray
     speed_rad_s: float
 
+    def of(self, coordinates: tuple[str, ...]) -> "Rotation":
+        """The same of some of the coordinates."""
+        n = len(self.coordinates)
+        keep = [self.coordinates.index(name) for name in coordinates]
+        keep = [*keep, *(n + number for number in keep)]
+        return Rotation(coordinates, self.vectors[keep], self.covariance[np.ix_(keep, keep)], self.speed_rad_s)
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceRow:
+    """A row that the unbalance is read by, and where its numbers stand among those of all rows.
+
+    Attributes
+    ----------
+    row : Row
+        Learned on the stochastic part.
+    coefficients : slice
+        Of its relation among all coefficients.
+    own : slice
+        Of its parameters among all changes.
+    """
+
+    row: Row
+    coefficients: slice
+    own: slice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SynchronousState:
     """All that the unbalance depends on.
 
     Attributes
     ----------
-    coefficients : ndarray, shape (8,)
-        Of the relation in y, then in z.
-    change : ndarray, shape (4,)
-        Of stiffness and damping in y, then in z.
-    now, healthy : ndarray, shape (8,)
+    coefficients : ndarray
+        Of all relations.
+    change : ndarray
+        Of all their own parameters.
+    now, healthy : ndarray, shape (2 n,)
         Synchronous vectors.
     """
 
@@ -62,12 +101,17 @@ class SynchronousState:
     healthy: FloatArray
 
 
-def rotation_of(window: WindowStatistics) -> Rotation | None:
-    """Synchronous vectors of a window with their covariance; None without a phase reference or a channel."""
-    if window.synchronous is None or any(name not in window.states for name in _CHANNELS):
+def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Rotation | None:
+    """Synchronous vectors of a window with their covariance; None without a phase reference or a coordinate."""
+    orders = [lowest(name, window.states) for name in coordinates]
+    if window.synchronous is None or not coordinates or not np.isfinite(window.speed_rad_s):
         return None
-    columns = [window.states.index(name) for name in _CHANNELS]
-    q = window.synchronous[columns]
+    known = [order for order in orders if order is not None]
+    if len(known) < len(orders) or window.speed_rad_s == 0:
+        return None
+    columns = [window.states.index(state_of(name, order)) for name, order in zip(coordinates, known, strict=True)]
+    to_displacement = (1j * window.speed_rad_s) ** -np.array(known, dtype=np.float64)
+    q = window.synchronous[columns] * to_displacement
     step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
     distance = np.abs(np.round((window.frequencies_hz - window.speed_rad_s / (2 * np.pi)) / step_hz))
     # the regression has emptied the bin of the line itself
@@ -75,49 +119,84 @@ def rotation_of(window: WindowStatistics) -> Rotation | None:
     if not np.any(near):
         return None
     density = window.spectrum[near][:, columns][:, :, columns].mean(axis=0) * (2 / window.duration_s)
+    density = density * np.outer(to_displacement, to_displacement.conj())
     # q = a - jb with the phase of cos θ: the density of q is that of the transform
     covariance = np.block([[density.real, -density.imag], [density.imag, density.real]])
-    return Rotation(np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s)
+    return Rotation(coordinates, np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s)
 
 
-def relative_force(state: SynchronousState, speed_now: float, speed_healthy: float) -> FloatArray:
-    """Unbalance force over the healthy one, less one: real parts in y and z, then imaginary parts; shape (4,)."""
-    now = _force(state.coefficients, state.change, state.now, speed_now)
-    healthy = _force(state.coefficients, np.zeros(4), state.healthy, speed_healthy)
-    ratio = now / healthy * (speed_healthy / speed_now) ** 2 - 1
+def rotations_by_speed(found: Sequence[Rotation]) -> tuple[Rotation, ...]:
+    """One rotation for each distinct speed, slowest first: the mean of those within 3 % of the slowest among them."""
+    left = sorted(found, key=lambda one: one.speed_rad_s)
+    groups: list[list[Rotation]] = []
+    for one in left:
+        if groups and one.speed_rad_s / groups[-1][0].speed_rad_s - 1 <= SPEED_TOLERANCE:
+            groups[-1].append(one)
+        else:
+            groups.append([one])
+    return tuple(
+        Rotation(
+            coordinates=near[0].coordinates,
+            vectors=np.mean([one.vectors for one in near], axis=0),
+            covariance=np.sum([one.covariance for one in near], axis=0) / len(near) ** 2,
+            speed_rad_s=float(np.mean([one.speed_rad_s for one in near])),
+        )
+        for near in groups
+    )
+
+
+def relative_force(rows: Sequence[ForceRow], state: SynchronousState, now: Rotation, healthy: Rotation) -> FloatArray:
+    """Unbalance force over the healthy one, less one: real parts row by row, then imaginary parts."""
+    speeds = now.speed_rad_s, healthy.speed_rad_s
+    forces = _forces(rows, state.coefficients, state.change, now.coordinates, state.now, speeds[0])
+    before = _forces(
+        rows, state.coefficients, np.zeros_like(state.change), healthy.coordinates, state.healthy, speeds[1]
+    )
+    ratio = forces / before * (speeds[1] / speeds[0]) ** 2 - 1
     return np.concatenate([ratio.real, ratio.imag])
 
 
-def _force(coefficients: FloatArray, change: FloatArray, vectors: FloatArray, W: float) -> ComplexArray:
-    q = vectors[:4] + 1j * vectors[4:]
-    forces = np.empty(2, dtype=np.complex128)
-    for plane in range(2):
-        one, two = q[2 * plane], q[2 * plane + 1]
-        rate, disc, own, shaft = coefficients[N_COEFFICIENTS * plane : N_COEFFICIENTS * (plane + 1)]
-        stiffness, damping = change[2 * plane : 2 * plane + 2]
-        forces[plane] = (
-            (1 + stiffness) * one
-            - rate * (1 + damping) * 1j * W * one
-            + W**2 * (disc * two + own * one)
-            - shaft * (two - one)
+def _forces(
+    rows: Sequence[ForceRow],
+    coefficients: FloatArray,
+    change: FloatArray,
+    coordinates: tuple[str, ...],
+    vectors: FloatArray,
+    speed_rad_s: float,
+) -> ComplexArray:
+    n = len(coordinates)
+    q = dict(zip(coordinates, vectors[:n] + 1j * vectors[n:], strict=True))
+    forces = np.empty(len(rows), dtype=np.complex128)
+    for number, one in enumerate(rows):
+        combination = np.concatenate([[1.0], -coefficients[one.coefficients]])
+        scale = np.ones(combination.size)
+        for own, value in zip(one.row.own, change[one.own], strict=True):
+            scale[list(own.terms)] *= 1 + value
+        forces[number] = sum(
+            weight
+            * (speed_rad_s if term.times_speed else 1.0)
+            * sum(motion.factor * (1j * speed_rad_s) ** motion.order * q[motion.coordinate] for motion in term.motions)
+            for weight, term in zip(combination * scale, one.row.terms, strict=True)
         )
     return forces
 
 
-def slopes(state: SynchronousState, speed_now: float, speed_healthy: float) -> tuple[FloatArray, ...]:
+def slopes(
+    rows: Sequence[ForceRow], state: SynchronousState, now: Rotation, healthy: Rotation
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Derivatives of `relative_force` to coefficients, change, now and healthy, by central differences."""
     parts = [state.coefficients, state.change, state.now, state.healthy]
     derivatives = []
     for number, part in enumerate(parts):
         columns = []
         floor = 1e-3 if number == 1 else 0.0
-        step_of = 1e-4 * np.maximum(np.abs(part), max(floor, 1e-3 * float(np.max(np.abs(part)))))
-        for position, step in enumerate(step_of):
+        largest = 1e-3 * float(np.max(np.abs(part), initial=0.0))
+        for position, step in enumerate(1e-4 * np.maximum(np.abs(part), max(floor, largest))):
             ends = []
             for sign in (1, -1):
                 moved = [other.copy() for other in parts]
                 moved[number][position] += sign * step
-                ends.append(relative_force(SynchronousState(*moved), speed_now, speed_healthy))
+                ends.append(relative_force(rows, SynchronousState(*moved), now, healthy))
             columns.append((ends[0] - ends[1]) / (2 * step))
         derivatives.append(np.stack(columns, axis=1))
-    return tuple(derivatives)
+    return derivatives[0], derivatives[1], derivatives[2], derivatives[3]

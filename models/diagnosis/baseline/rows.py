@@ -1,0 +1,187 @@
+"""The rows of motion that a machine without parameters is read by, as a table.
+
+Everything else in this room is driven by it: a row that is added here is learned, read, stored and reported without a
+change elsewhere. The sum of the rows of bearing and disc holds no shaft force and no tilt. Divided by the bearing's
+stiffness to ground,
+
+    y1 + (c/k) ẏ1 + (m2/k) ÿ2 + (m1/k) ÿ1 + s (y2 - y1) = f / k,
+
+where s is zero on the six-degree-of-freedom machine and takes up a shaft that is held elsewhere too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from models.diagnosis.baseline.kinematics import Motion, not_measured
+from models.physics.parameters import PARAMETERS
+
+__all__ = ["ROWS", "Own", "Row", "Term", "evaluable_rows", "parameters_of"]
+
+_NO_PHASE = "no phase reference"
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One term of a row: motions that share a coefficient.
+
+    Attributes
+    ----------
+    motions : tuple of Motion
+        Their weighted sum.
+    spread : float or None
+        Standard deviation expected beforehand of the coefficient; None where nothing is expected.
+    in_units_of : int or None
+        Term whose coefficient `spread` is a multiple of.
+    without : float or None
+        Expected spread of a term that is left out wherever the relation holds without it.
+    times_speed : bool
+        Whether the coefficient is proportional to the speed (gyroscopic terms).
+    """
+
+    motions: tuple[Motion, ...]
+    spread: float | None = None
+    in_units_of: int | None = None
+    without: float | None = None
+    times_speed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Own:
+    """A parameter that a row reads.
+
+    Attributes
+    ----------
+    parameter : str
+        One of ``models.physics.parameters.PARAMETERS``.
+    terms : tuple of int
+        Terms whose coefficients are proportional to it.
+    resists : bool
+        Whether these terms have the sign of the first one, as a stiffness and a damping do; a fit of the other sign
+        has not determined them.
+    """
+
+    parameter: str
+    terms: tuple[int, ...] = ()
+    resists: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One row of motion.
+
+    Attributes
+    ----------
+    name : str
+        Unique in the table.
+    number : str
+        The paper's equations.
+    title : str
+        What it is about.
+    terms : tuple of Term
+        The first is the target: its coefficient is one.
+    own : tuple of Own
+        What it reads. A change of the first is relative to the scale of the row.
+    rests_on : str
+        Name of the row whose coefficients it uses, for a row that is evaluated on the rotation-synchronous vectors;
+        empty for one that is learned on the stochastic part.
+    """
+
+    name: str
+    number: str
+    title: str
+    terms: tuple[Term, ...]
+    own: tuple[Own, ...]
+    rests_on: str = ""
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether it is evaluated on the rotation-synchronous vectors."""
+        return bool(self.rests_on)
+
+    @property
+    def n_coefficients(self) -> int:
+        """Coefficients to learn."""
+        return len(self.terms) - 1
+
+    @property
+    def needs_speed(self) -> bool:
+        """Whether it cannot be evaluated without a phase reference."""
+        return self.synchronous or any(term.times_speed for term in self.terms)
+
+    @property
+    def motions(self) -> tuple[Motion, ...]:
+        """All motions of all terms."""
+        return tuple(motion for term in self.terms for motion in term.motions)
+
+
+def _bearing_and_disc(plane: str) -> tuple[Term, ...]:
+    one, two = f"{plane}1", f"{plane}2"
+    return (
+        Term((Motion(one, 0),)),
+        Term((Motion(one, 1),)),
+        Term((Motion(two, 2),)),
+        Term((Motion(one, 2),), spread=1.0, in_units_of=2),
+        Term((Motion(two, 0), Motion(one, 0, -1.0)), spread=0.5, without=0.02),
+    )
+
+
+def _bearing(name: str, number: str, plane: str, direction: str) -> Row:
+    return Row(
+        name=name,
+        number=number,
+        title=f"bearing and disc, {direction}",
+        terms=_bearing_and_disc(plane),
+        own=(Own(f"k_b{plane}", (0,)), Own(f"c_b{plane}", (1,))),
+    )
+
+
+def _unbalance(name: str, rests_on: str, number: str, plane: str, direction: str) -> Row:
+    return Row(
+        name=name,
+        number=number,
+        title=f"unbalance force through bearing and disc, {direction}",
+        terms=_bearing_and_disc(plane),
+        own=(Own("e"),),
+        rests_on=rests_on,
+    )
+
+
+ROWS: tuple[Row, ...] = (
+    _bearing("y", "28 + 29", "y", "horizontal"),
+    _bearing("z", "31 + 29 in z", "z", "vertical"),
+    _unbalance("y 1x", "y", "28 + 29 at the speed", "y", "horizontal"),
+    _unbalance("z 1x", "z", "31 + 29 in z at the speed", "z", "vertical"),
+)
+"""The rows that can be learned from a recording alone."""
+
+
+def parameters_of(rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
+    """Parameters that rows read, in the order of ``models.physics.parameters.PARAMETERS``."""
+    read = {own.parameter for row in rows for own in row.own}
+    return tuple(name for name in PARAMETERS if name in read)
+
+
+def evaluable_rows(
+    states: Sequence[str], has_phase_reference: bool, rows: Sequence[Row] = ROWS
+) -> list[tuple[Row, str]]:
+    """Say of every row whether it can be evaluated with these sensors.
+
+    Parameters
+    ----------
+    states : sequence of str
+        Measured state variables and accelerations.
+    has_phase_reference : bool
+    rows : sequence of Row
+
+    Returns
+    -------
+    list of (Row, str)
+        Each row with the reason why it cannot be evaluated; empty if it can.
+    """
+    found = []
+    for row in rows:
+        reasons = [not_measured(row.motions, tuple(states))]
+        if row.needs_speed and not has_phase_reference:
+            reasons.append(_NO_PHASE)
+        found.append((row, "; ".join(reason for reason in reasons if reason)))
+    return found
