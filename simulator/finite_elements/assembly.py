@@ -1,0 +1,139 @@
+"""From a rotor to its equations of motion, its modes, and its response to harmonic forces.
+
+Coordinates are (v, v') of all nodes in the horizontal plane y, then in the vertical plane z. A positive speed turns
+from y to z.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.signals.block import FloatArray
+from simulator.finite_elements.elements import beam_inertia, beam_mass, beam_stiffness, shear_ratio
+from simulator.finite_elements.rotor import BeamRotor
+
+__all__ = [
+    "Equations",
+    "Mode",
+    "assemble",
+    "harmonic_response",
+    "modes",
+    "place",
+    "probed",
+    "unbalance_force",
+    "unbalance_response",
+]
+
+ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Equations:
+    """M ξ̈ + C ξ̇ + K ξ = f.
+
+    Attributes
+    ----------
+    M, C, K : ndarray, shape (n, n)
+        C holds damping and the gyroscopic part.
+    """
+
+    M: FloatArray
+    C: FloatArray
+    K: FloatArray
+
+    @property
+    def A(self) -> FloatArray:
+        """State matrix of (ξ, ξ̇), shape (2n, 2n)."""
+        n = len(self.M)
+        lower = -np.linalg.solve(self.M, np.hstack([self.K, self.C]))
+        return np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), lower])
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """A mode's frequency and damping ratio."""
+
+    frequency_hz: float
+    damping: float
+
+
+def place(rotor: BeamRotor, node: int, plane: str) -> int:
+    """Coordinate of a node's translation in plane ``y`` or ``z``."""
+    return 2 * node + (2 * (rotor.elements + 1) if plane == "z" else 0)
+
+
+def probed(rotor: BeamRotor) -> tuple[int, int, int, int]:
+    """Coordinates of y1, y2, z1, z2: translations of the first bearing and the first disc."""
+    one, two = rotor.bearings[0].node, rotor.discs[0].node
+    return place(rotor, one, "y"), place(rotor, two, "y"), place(rotor, one, "z"), place(rotor, two, "z")
+
+
+def assemble(rotor: BeamRotor, speed_rad_s: float) -> Equations:
+    """Equations of motion at a speed, cubic stiffness left out."""
+    length_m, EI = rotor.length_m / rotor.elements, rotor.bending_stiffness
+    shear_stiffness_N = _shear_coefficient(rotor.poisson) * rotor.E_Pa / (2 * (1 + rotor.poisson)) * rotor.area_m2
+    phi = shear_ratio(EI, shear_stiffness_N, length_m) if rotor.shear else 0.0
+    inertia = rotor.density_kg_m3 * EI / rotor.E_Pa if rotor.shear else 0.0
+    element_N = beam_inertia(length_m, inertia, phi)
+    element_M = beam_mass(length_m, rotor.density_kg_m3 * rotor.area_m2, phi) + element_N
+    element_K = beam_stiffness(length_m, EI, phi)
+    n = 2 * (rotor.elements + 1)
+    M1, K1, G1 = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    for element in range(rotor.elements):
+        at = slice(2 * element, 2 * element + 4)
+        M1[at, at] += element_M
+        K1[at, at] += element_K
+        G1[at, at] += 2 * element_N
+    for disc in rotor.discs:
+        v = 2 * disc.node
+        M1[v, v] += disc.mass_kg
+        M1[v + 1, v + 1] += disc.mass_kg * disc.radius_m**2 / 4
+        G1[v + 1, v + 1] += disc.mass_kg * disc.radius_m**2 / 2
+    for bearing in rotor.bearings:
+        M1[2 * bearing.node, 2 * bearing.node] += bearing.housing_kg
+    both, turn = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])
+    M = np.asarray(np.kron(both, M1), dtype=np.float64)
+    K = np.asarray(np.kron(both, K1), dtype=np.float64)
+    C = np.asarray(np.kron(both, rotor.shaft_damping_s * K1) + np.kron(turn, speed_rad_s * G1), dtype=np.float64)
+    for bearing in rotor.bearings:
+        y, z = place(rotor, bearing.node, "y"), place(rotor, bearing.node, "z")
+        K[np.ix_([y, z], [y, z])] += [[bearing.k_y, bearing.k_yz], [bearing.k_zy, bearing.k_z]]
+        C[y, y] += bearing.c_y
+        C[z, z] += bearing.c_z
+    return Equations(M, C, K)
+
+
+def _shear_coefficient(poisson: float) -> float:
+    """Cowper's κ of a solid round section."""
+    return 6 * (1 + poisson) / (7 + 6 * poisson)
+
+
+def modes(equations: Equations) -> tuple[Mode, ...]:
+    """Oscillating modes, slowest first."""
+    roots = np.linalg.eigvals(equations.A)
+    found = [Mode(float(abs(s) / (2 * np.pi)), float(-s.real / abs(s))) for s in roots if s.imag > 0]
+    return tuple(sorted(found, key=lambda mode: mode.frequency_hz))
+
+
+def harmonic_response(equations: Equations, frequency_rad_s: float, force: ComplexArray) -> ComplexArray:
+    """Complex amplitudes of all coordinates under the force f e^{jωt}, shape (n,)."""
+    w = frequency_rad_s
+    return np.asarray(
+        np.linalg.solve(equations.K - w**2 * equations.M + 1j * w * equations.C, force), dtype=np.complex128
+    )
+
+
+def unbalance_force(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
+    """Rotating force of all discs, q of f = Re{q e^{jθ}}, shape (n,)."""
+    force = np.zeros(4 * (rotor.elements + 1), dtype=np.complex128)
+    for disc in rotor.discs:
+        q = disc.unbalance_kg_m * speed_rad_s**2 * np.exp(1j * disc.phase_rad)
+        force[place(rotor, disc.node, "y")] += q
+        force[place(rotor, disc.node, "z")] += -1j * q
+    return force
+
+
+def unbalance_response(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
+    """Synchronous vectors of all coordinates, q of ξ = Re{q e^{jθ}}, shape (n,); of the linear rotor."""
+    return harmonic_response(assemble(rotor, speed_rad_s), speed_rad_s, unbalance_force(rotor, speed_rad_s))

@@ -1,0 +1,113 @@
+"""Coloured forces at any coordinates of a rotor, and what they do in the long run.
+
+The colour is that of `models.physics.excitation`: white noise through a Butterworth low-pass, with or without a hump.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.physics.discretise import advance, discretise
+from models.physics.excitation import ColouringFilter, Source, colouring_filter
+from models.physics.lyapunov import stationary_covariance
+from models.signals.block import FloatArray
+from simulator.finite_elements.assembly import Equations
+
+__all__ = ["Force", "covariance_under", "force_samples", "forced"]
+
+
+@dataclass(frozen=True, slots=True)
+class Force:
+    """One independent source; it may act at several places, shared with signs and weights.
+
+    Attributes
+    ----------
+    cutoff_hz : float
+    rms_N : float
+    share : tuple of (int, float)
+        Coordinates (`simulator.finite_elements.assembly.place`) and the part of the force there.
+    order : int
+        Of the Butterworth low-pass, 1 to 4.
+    hump_share, hump_hz, hump_damping : float
+        As `models.physics.excitation.Source`.
+    """
+
+    cutoff_hz: float
+    rms_N: float
+    share: tuple[tuple[int, float], ...]
+    order: int = 2
+    hump_share: float = 0.0
+    hump_hz: float = 80.0
+    hump_damping: float = 0.4
+
+    @property
+    def colour(self) -> ColouringFilter:
+        """White noise to a force of unit variance."""
+        return colouring_filter(
+            Source(
+                cutoff_hz=self.cutoff_hz,
+                direction=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0),  # where it acts is ours to say
+                force_rms_N=1.0,
+                order=self.order,
+                hump_share=self.hump_share,
+                hump_hz=self.hump_hz,
+                hump_damping=self.hump_damping,
+            )
+        )
+
+
+def forced(forces: tuple[Force, ...]) -> tuple[int, ...]:
+    """Coordinates at which any force acts, ascending."""
+    return tuple(sorted({at for force in forces for at, _ in force.share}))
+
+
+def distribution(forces: tuple[Force, ...]) -> FloatArray:
+    """Force at each of the `forced` coordinates per unit of each source, shape (n_sources, n_coordinates), N."""
+    places = forced(forces)
+    spread = np.zeros((len(forces), len(places)))
+    for number, force in enumerate(forces):
+        for at, part in force.share:
+            spread[number, places.index(at)] += force.rms_N * part
+    return spread
+
+
+def force_samples(forces: tuple[Force, ...], count: int, rate_hz: float, rng: np.random.Generator) -> FloatArray:
+    """Force at the `forced` coordinates, sampled exactly and stationary from the first sample; shape (count, n), N."""
+    if not forces:
+        return np.zeros((count, 0))
+    drives = np.empty((count, len(forces)))
+    for number, force in enumerate(forces):
+        colour = force.colour
+        system = discretise(colour.R, colour.S, 1 / rate_hz)
+        stationary = stationary_covariance(colour.R, colour.S)
+        values, vectors = np.linalg.eigh((stationary + stationary.T) / 2)
+        start = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+        noise = rng.standard_normal((count, len(values)))
+        drives[:, number] = advance(system, start, noise) @ colour.output
+    return drives @ distribution(forces)
+
+
+def covariance_under(equations: Equations, forces: tuple[Force, ...]) -> FloatArray:
+    """Stationary covariance of (ξ, ξ̇) under coloured forces, from the Ljapunov equation; shape (2n, 2n), SI.
+
+    Raises
+    ------
+    models.errors.EstimationError
+        If the rotor is unstable.
+    """
+    n = len(equations.M)
+    colours = [force.colour for force in forces]
+    places, spread = forced(forces), distribution(forces)
+    inverse = np.linalg.inv(equations.M)[:, list(places)]
+    size = 2 * n + sum(colour.output.size for colour in colours)
+    A = np.zeros((size, size))
+    B = np.zeros((size, sum(colour.S.shape[1] for colour in colours)))
+    A[: 2 * n, : 2 * n] = equations.A
+    row, column = 2 * n, 0
+    for colour, part in zip(colours, spread, strict=True):
+        states, drives = colour.S.shape
+        A[n : 2 * n, row : row + states] = np.outer(inverse @ part, colour.output)
+        A[row : row + states, row : row + states] = colour.R
+        B[row : row + states, column : column + drives] = colour.S
+        row, column = row + states, column + drives
+    return stationary_covariance(A, B)[: 2 * n, : 2 * n]

@@ -1,0 +1,255 @@
+"""A finite-element rotor as its sensors see it: samples, windows of the monitor, a recording, a machine file."""
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import lfilter
+
+from models.diagnosis.moments import Plan
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.physics.matrices import STATE_INDEX
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.channels import Channel, ChannelDescriptor
+from models.signals.keys import MachineKeys
+from models.signals.recording import RecordedMessage, RecordingWriter
+from simulator.finite_elements.forces import Force
+from simulator.finite_elements.motion import PROBES, move
+from simulator.finite_elements.rotor import BeamRotor, changed_rotor
+from simulator.messages import JSON_ENCODING, block_message
+
+__all__ = [
+    "MOTION",
+    "RATE_HZ",
+    "SITE",
+    "RunCondition",
+    "WindowSizes",
+    "descriptor",
+    "machine_file",
+    "plan",
+    "record_run",
+    "sampled",
+    "windows_of",
+]
+
+RATE_HZ = 2000.0
+SITE = "beams"
+MOTION = PROBES[:8]
+"""Displacement and velocity of bearing and disc in both planes: what is measured unless said otherwise."""
+
+_START_NS = 1_767_225_600_000_000_000
+_UNITS = {"displacement": ("um", 1e-6), "velocity": ("mm/s", 1e-3), "acceleration": ("m/s2", 1.0)}
+_STATE_ORDER = tuple(sorted(PROBES[:8], key=STATE_INDEX.__getitem__))
+_LAG_STEP_S, _LAG_TO_S = 0.001, 0.125
+
+
+@dataclass(frozen=True, slots=True)
+class RunCondition:
+    """How a rotor runs and how it is measured.
+
+    Attributes
+    ----------
+    forces : tuple of Force
+    speed_rad_s : float
+    changes : mapping of str to float
+        Relative changes of `simulator.finite_elements.rotor.CHANGEABLE`.
+    noise_relative : float
+        Sensor noise over each channel's own rms.
+    noise_corner_hz : float or None
+        Of first-order coloured noise; None is white.
+    """
+
+    forces: tuple[Force, ...]
+    speed_rad_s: float
+    changes: Mapping[str, float] = field(default_factory=dict)
+    noise_relative: float = 0.02
+    noise_corner_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class WindowSizes:
+    """Window, hop and segment, s, and the band of the spectra, Hz."""
+
+    length_s: float = 60.0
+    hop_s: float = 5.0
+    segment_s: float = 5.0
+    band_hz: tuple[float, float] = (3.0, 150.0)
+
+
+def sampled(
+    rotor: BeamRotor,
+    condition: RunCondition,
+    duration_s: float,
+    seed: int | list[int],
+    probes: tuple[str, ...] = MOTION,
+    *,
+    phase_reference: bool = True,
+) -> FloatArray:
+    """Samples in SI, the shaft angle last if there is a phase reference; shape (n_samples, n_probes [+ 1]).
+
+    Raises
+    ------
+    models.errors.EstimationError
+        If the rotor is unstable.
+    """
+    motion_rng, noise_rng = np.random.default_rng(seed).spawn(2)
+    changed = changed_rotor(rotor, condition.changes)
+    motion = move(changed, condition.speed_rad_s, condition.forces, duration_s, RATE_HZ, motion_rng)
+    seen = motion.values[:, [PROBES.index(name) for name in probes]]
+    noise = _noise(seen.shape, condition.noise_corner_hz, noise_rng)
+    seen = seen + condition.noise_relative * seen.std(axis=0) * noise
+    if not phase_reference:
+        return np.asarray(seen, dtype=np.float64)
+    return np.column_stack([seen, np.mod(motion.angle_rad, 2 * np.pi)])
+
+
+def _noise(shape: tuple[int, int], corner_hz: float | None, rng: np.random.Generator) -> FloatArray:
+    white = rng.standard_normal(shape)
+    if corner_hz is None:
+        return white
+    memory = float(np.exp(-2 * np.pi * corner_hz / RATE_HZ))
+    innovation = float(np.sqrt(1 - memory**2))
+    carried = white[:1] * (1 - innovation)  # the first sample has the full variance
+    return np.asarray(lfilter([innovation], [1.0, -memory], white, axis=0, zi=carried)[0], dtype=np.float64)
+
+
+def descriptor(
+    rotor: BeamRotor, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
+) -> ChannelDescriptor:
+    """Channels of the stream, in usual units."""
+    channels = [_channel(name) for name in probes]
+    if phase_reference:
+        channels.append(
+            Channel.model_validate(
+                {
+                    "name": "theta",
+                    "quantity": "shaft_angle",
+                    "location": "shaft",
+                    "direction": "rotation",
+                    "unit": "rad",
+                }
+            )
+        )
+    return ChannelDescriptor(site=SITE, machine=rotor.name, rate_hz=RATE_HZ, dtype="float32", channels=tuple(channels))
+
+
+def _channel(probe: str) -> Channel:
+    place, _, rate = probe.partition("_")
+    quantity = {"": "displacement", "dot": "velocity", "ddot": "acceleration"}[rate]
+    return Channel.model_validate(
+        {
+            "name": probe,
+            "quantity": quantity,
+            "location": "bearing" if place[1] == "1" else "disc",
+            "direction": place[0],
+            "unit": _UNITS[quantity][0],
+        }
+    )
+
+
+def plan(sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True) -> Plan:
+    """Sizes of the sliding window for SI samples as `sampled` gives them."""
+    lags = np.arange(0, round(_LAG_TO_S * RATE_HZ) + 1, round(_LAG_STEP_S * RATE_HZ))
+    segment = round(sizes.segment_s * RATE_HZ)
+    first, last = (round(edge * sizes.segment_s) for edge in sizes.band_hz)
+    order = [name for name in (*_STATE_ORDER, *PROBES[8:]) if name in probes]
+    return Plan(
+        rate_hz=RATE_HZ,
+        states=tuple(order),
+        columns=np.array([probes.index(name) for name in order], dtype=np.intp),
+        scales=np.ones(len(order)),
+        angle_column=len(probes) if phase_reference else None,
+        hop=round(sizes.hop_s * RATE_HZ),
+        preamble=max(int(lags[-1]), segment // 2),
+        segment=segment,
+        lags=lags,
+        bins=np.arange(first, last + 1),
+        hops=round(sizes.length_s / sizes.hop_s),
+        max_span_ns=round(1.5 * sizes.length_s * 1e9),
+    )
+
+
+def windows_of(samples: FloatArray, sizes: Plan) -> list[WindowStatistics]:
+    """Windows of a run that do not overlap."""
+    sliding, found = SlidingWindow(sizes), []
+    for number, _ in enumerate(sliding.feed(sizes.to_si(samples), _START_NS), start=1):
+        statistics = sliding.statistics() if number % sizes.hops == 0 else None
+        if statistics is not None:
+            found.append(statistics)
+    return found
+
+
+def machine_file(
+    rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
+) -> str:
+    """Machine file (TOML) with channels and sampling alone: nothing about the rotor."""
+    described = descriptor(rotor, probes, phase_reference=phase_reference)
+    lines = [
+        f'site = "{described.site}"',
+        f'name = "{described.machine}"',
+        f'description = "{rotor.description}; its parameters are not given"',
+        f"rate_hz = {described.rate_hz}",
+        "",
+        "[window]",
+        f"length_s = {sizes.length_s}",
+        f"hop_s = {sizes.hop_s}",
+        f"max_span_s = {1.5 * sizes.length_s}",
+        f"segment_s = {sizes.segment_s}",
+        f"band_hz = [{sizes.band_hz[0]}, {sizes.band_hz[1]}]",
+    ]
+    for channel in described.channels:
+        fields = ("name", "quantity", "location", "direction", "unit")
+        lines += ["", "[[sensors]]", *(f'{name} = "{getattr(channel, name)}"' for name in fields)]
+    return "\n".join(lines) + "\n"
+
+
+def record_run(
+    path: Path,
+    rotor: BeamRotor,
+    condition: RunCondition,
+    duration_s: float,
+    seed: int | list[int],
+    probes: tuple[str, ...] = MOTION,
+    *,
+    phase_reference: bool = True,
+    block_s: float = 0.1,
+    start_ns: int = _START_NS,
+    overwrite: bool = False,
+) -> int:
+    """Record a run as a live machine would have sent it; returns the number of blocks.
+
+    Raises
+    ------
+    models.errors.RecordingError
+        If the file cannot be written.
+    models.errors.EstimationError
+        If the rotor is unstable.
+    """
+    described = descriptor(rotor, probes, phase_reference=phase_reference)
+    keys = MachineKeys(described.site, described.machine)
+    samples = sampled(rotor, condition, duration_s, seed, probes, phase_reference=phase_reference)
+    run = int.from_bytes(hashlib.sha256(repr((seed, start_ns)).encode()).digest()[:2], "big")
+    count = 0
+    with RecordingWriter(path, overwrite=overwrite) as writer:
+        payload = described.model_dump_json().encode()
+        writer.write(RecordedMessage(keys.descriptor, payload, b"", JSON_ENCODING, start_ns, start_ns))
+        for block in _blocks(samples, described, block_s, start_ns, run):
+            data, attachment, encoding = block_message(block, described.schema_hash, "raw")
+            writer.write(RecordedMessage(keys.stream, data, attachment, encoding, block.end_ns, block.end_ns))
+            count += 1
+    return count
+
+
+def _blocks(
+    samples: FloatArray, described: ChannelDescriptor, block_s: float, start_ns: int, run: int
+) -> Iterator[SampleBlock]:
+    factors = np.array([channel.to_si for channel in described.channels])
+    scaled = np.asarray(samples / factors, dtype=np.float32)
+    if described.states[-1] == "theta":
+        scaled[:, -1] = np.where(scaled[:, -1] >= 2 * np.pi, 0.0, scaled[:, -1])
+    length = round(block_s * described.rate_hz)
+    for sequence, first in enumerate(range(0, len(scaled), length)):
+        start = start_ns + round(first * 1e9 / described.rate_hz)
+        yield SampleBlock(start, sequence, run, described.rate_hz, scaled[first : first + length])

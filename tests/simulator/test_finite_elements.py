@@ -1,0 +1,275 @@
+"""Finite-element rotors against closed forms, the Ljapunov equation and the frequency response."""
+
+import math
+import tomllib
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.errors import EstimationError
+from models.physics.excitation import Source, source_spectrum
+from models.signals.channels import ChannelDescriptor
+from models.signals.recording import read_recording
+from models.signals.wire import decode_block
+from simulator.finite_elements.assembly import assemble, harmonic_response, modes, place, probed, unbalance_response
+from simulator.finite_elements.forces import Force, covariance_under
+from simulator.finite_elements.machines import ROTORS, rotor_named
+from simulator.finite_elements.motion import PROBES, move
+from simulator.finite_elements.observed import (
+    MOTION,
+    RATE_HZ,
+    RunCondition,
+    WindowSizes,
+    descriptor,
+    machine_file,
+    plan,
+    record_run,
+    sampled,
+    windows_of,
+)
+from simulator.finite_elements.rotor import BeamRotor, Bearing, Disc, changed_rotor
+from simulator.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+
+BEAM = BeamRotor(
+    name="beam",
+    description="",
+    length_m=1.0,
+    diameter_m=0.02,
+    elements=12,
+    bearings=(Bearing(0, 1e12, 1e12, 0, 0), Bearing(12, 1e12, 1e12, 0, 0)),
+    discs=(),
+    speed_rad_s=0.0,
+    shaft_damping_s=0.0,
+)
+
+
+def forces(rotor: BeamRotor) -> tuple[Force, ...]:
+    y1, y2, z1, z2 = probed(rotor)
+    return (
+        Force(60.0, 5.0, ((y1, 0.6), (y2, 0.5), (z1, 0.4), (z2, -0.5))),
+        Force(90.0, 2.0, ((y2, 1.0),), order=1, hump_share=0.4, hump_hz=70.0),
+    )
+
+
+@pytest.mark.parametrize("shear", [False, True])
+def test_a_simply_supported_beam_has_the_frequencies_of_the_closed_form(shear: bool) -> None:
+    ends = (Bearing(0, 1e13, 1e13, 0, 0), Bearing(24, 1e13, 1e13, 0, 0))
+    rotor = replace(BEAM, shear=shear, diameter_m=0.12 if shear else 0.02, elements=24, bearings=ends)
+    found = [mode.frequency_hz for mode in modes(assemble(rotor, 0.0))][::2]
+    EI, rho, E = rotor.bending_stiffness, rotor.density_kg_m3, rotor.E_Pa
+    for n in (1, 2, 3):
+        wave = n * math.pi / rotor.length_m
+        if shear:  # Timoshenko's beam on pins: a quadratic in ω²
+            kG = 6 * 1.3 / (7 + 6 * 0.3) * E / 2.6
+            I = EI / E  # noqa: E741
+            a = rho**2 * I / kG
+            b = rho * rotor.area_m2 + rho * I * (1 + E / kG) * wave**2
+            squared = (b - math.sqrt(b**2 - 4 * a * EI * wave**4)) / (2 * a)
+        else:
+            squared = EI * wave**4 / (rho * rotor.area_m2)
+        assert found[n - 1] == pytest.approx(math.sqrt(squared) / (2 * math.pi), rel=2e-3)
+
+
+def test_an_overhang_bends_as_statics_says() -> None:
+    rotor = replace(BEAM, shear=False, bearings=(Bearing(0, 1e13, 1e13, 0, 0), Bearing(8, 1e13, 1e13, 0, 0)))
+    tip = place(rotor, 12, "z")
+    load = np.zeros(52)
+    load[tip] = 100.0
+    deflection = np.linalg.solve(assemble(rotor, 0.0).K, load)[tip]
+    span, overhang = 8 / 12, 4 / 12
+    assert deflection == pytest.approx(100 * overhang**2 * (span + overhang) / (3 * rotor.bending_stiffness), rel=1e-4)
+
+
+def test_a_spinning_disc_splits_its_tilting_modes_as_the_rigid_rotor_says() -> None:
+    k, L, disc, speed = 1e5, 0.4, Disc(2, 5.0, 0.1), 300.0
+    rotor = BeamRotor(
+        name="rigid",
+        description="",
+        length_m=L,
+        diameter_m=0.1,
+        elements=4,
+        bearings=(Bearing(0, k, k, 0, 0), Bearing(4, k, k, 0, 0)),
+        discs=(disc,),
+        speed_rad_s=speed,
+        shaft_damping_s=0.0,
+        E_Pa=1e15,
+        density_kg_m3=1e-3,
+    )
+    I_d, I_p, turning = 5 * 0.01 / 4, 5 * 0.01 / 2, k * L**2 / 2
+    roots = np.roots([I_d, -I_p * speed, -turning])
+    expected = sorted(np.abs(roots) / (2 * np.pi))
+    found = [mode.frequency_hz for mode in modes(assemble(rotor, speed)) if mode.frequency_hz < 200]
+    bounce = math.sqrt(2 * k / 5) / (2 * math.pi)
+    assert sorted([bounce, bounce, *expected]) == pytest.approx(found, rel=1e-4)
+
+
+def test_an_unbalance_drives_the_forward_whirl_which_is_the_faster_one() -> None:
+    between = rotor_named("between")
+    bearings = tuple(replace(one, k_z=one.k_y, c_y=1.0, c_z=1.0) for one in between.bearings)
+    equations = assemble(replace(between, bearings=bearings, shaft_damping_s=0.0), 1500.0)
+    slow, fast = modes(equations)[2:4]
+    assert fast.frequency_hz > 1.05 * slow.frequency_hz
+    force = np.zeros(len(equations.M), dtype=complex)
+    at = [place(between, 2, "y"), place(between, 2, "z")]
+    moved = {}
+    for turn in (1, -1):
+        force[at] = 1, -1j * turn
+        for mode in (slow, fast):
+            response = harmonic_response(equations, 2 * math.pi * mode.frequency_hz, force)
+            moved[turn, mode] = abs(response[at[0]])
+    assert moved[1, fast] > 5 * moved[-1, fast]
+    assert moved[-1, slow] > 5 * moved[1, slow]
+
+
+@pytest.mark.parametrize("rotor", ROTORS, ids=lambda rotor: str(rotor.name))
+def test_named_machines_are_of_realistic_size(rotor: BeamRotor) -> None:
+    low = [mode for mode in modes(assemble(rotor, rotor.speed_rad_s)) if mode.frequency_hz < 200]
+    assert 4 <= len(low) <= 10
+    assert all(mode.frequency_hz > 15 and 0.015 < mode.damping < 0.16 for mode in low), low
+
+
+def test_the_ljapunov_covariance_is_the_integral_of_the_spectrum() -> None:
+    rotor = rotor_named("overhung")
+    equations, sources = assemble(rotor, rotor.speed_rad_s), forces(rotor)
+    covariance = covariance_under(equations, sources)
+    frequency = np.arange(0.05, 900.0, 0.1)
+    total = np.zeros(4)
+    for force in sources:
+        colour = Source(
+            cutoff_hz=force.cutoff_hz, direction=(0,) * 6, force_rms_N=force.rms_N, order=force.order,
+            hump_share=force.hump_share, hump_hz=force.hump_hz,
+        )  # fmt: skip
+        pull = np.zeros(len(equations.M), dtype=complex)
+        for at, part in force.share:
+            pull[at] += part
+        gain = np.array([np.abs(harmonic_response(equations, 2 * np.pi * f, pull)) ** 2 for f in frequency])
+        total += 2 * 0.1 * source_spectrum(frequency, colour) @ gain[:, list(probed(rotor))]
+    assert np.diag(covariance)[list(probed(rotor))] == pytest.approx(total, rel=3e-3)
+
+
+@pytest.mark.parametrize("name", ["overhung", "both-sides"])
+def test_simulated_variances_are_those_of_the_ljapunov_equation(name: str) -> None:
+    rotor = rotor_named(name)
+    still = replace(rotor, discs=tuple(replace(disc, unbalance_kg_m=0.0) for disc in rotor.discs))
+    sources = forces(rotor)
+    n, rows = 4 * (rotor.elements + 1), list(probed(rotor))
+    theory = np.diag(covariance_under(assemble(rotor, rotor.speed_rad_s), sources))[rows + [n + row for row in rows]]
+    runs = [move(still, rotor.speed_rad_s, sources, 60, RATE_HZ, np.random.default_rng([11, k])) for k in range(5)]
+    ratio = np.array([run.values[:, :8].var(axis=0) / theory for run in runs])
+    error = ratio.std(axis=0, ddof=1) / math.sqrt(len(runs))
+    assert np.all(np.abs(ratio.mean(axis=0) - 1) < np.maximum(6 * error, 0.02)), ratio.mean(axis=0)
+    assert np.all(error < 0.06)
+    step = runs[0].values
+    # velocity is the integral of a continuous acceleration
+    gained = np.diff(step[:, 4:8], axis=0)
+    mean = (step[1:, 8:] + step[:-1, 8:]) / (2 * RATE_HZ)
+    assert np.all(np.std(gained - mean, axis=0) < 0.04 * np.std(gained, axis=0))
+
+
+def test_unbalance_alone_gives_the_frequency_response() -> None:
+    rotor = rotor_named("asymmetric")
+    motion = move(rotor, rotor.speed_rad_s, (), 2, RATE_HZ, np.random.default_rng(1))
+    q = unbalance_response(rotor, rotor.speed_rad_s)[list(probed(rotor))]
+    W = rotor.speed_rad_s
+    expected = np.real(np.exp(1j * motion.angle_rad)[:, None] * np.concatenate([q, 1j * W * q, -(W**2) * q]))
+    assert motion.values == pytest.approx(expected)
+
+
+def test_the_stepped_rotor_is_the_linear_one_where_the_cubic_stiffness_vanishes() -> None:
+    linear = rotor_named("overhung")
+    stepped = replace(linear, bearings=(replace(linear.bearings[0], cubic_N_per_m3=1e-9), *linear.bearings[1:]))
+    one, other = (
+        move(rotor, 150.0, forces(linear), 1.0, RATE_HZ, np.random.default_rng(4), oversampling=1).values
+        for rotor in (linear, stepped)
+    )
+    assert np.all(np.std(one - other, axis=0) < 2e-3 * np.std(one, axis=0))  # what is left of the start has decayed
+
+
+def test_cubic_stiffness_whirls_as_harmonic_balance_says_and_converges_with_the_square_of_the_step() -> None:
+    rotor = rotor_named("stiffening")
+    bearing = replace(rotor.bearings[0], k_z=rotor.bearings[0].k_y, c_z=rotor.bearings[0].c_y)
+    heavy = tuple(replace(disc, unbalance_kg_m=4 * disc.unbalance_kg_m) for disc in rotor.discs)
+    rotor = replace(rotor, bearings=(bearing, rotor.bearings[1]), discs=heavy)
+    speed, y1 = 2 * math.pi * 17.0, probed(rotor)[0]
+    radius = 0.0
+    for _ in range(200):
+        k = bearing.k_y + 0.75 * bearing.cubic_N_per_m3 * radius**2
+        stiff = replace(rotor, bearings=(replace(bearing, k_y=k, k_z=k), rotor.bearings[1]))
+        response = unbalance_response(stiff, speed)
+        radius = 0.5 * (radius + abs(response[y1]))
+    found = []
+    for oversampling in (1, 2, 4):
+        motion = move(rotor, speed, (), 2.0, RATE_HZ, np.random.default_rng(5), oversampling=oversampling)
+        design = np.column_stack([np.cos(motion.angle_rad), np.sin(motion.angle_rad)])
+        a, b = np.linalg.lstsq(design, motion.values[:, 0], rcond=None)[0]
+        found.append(a - 1j * b)
+    assert 0.03 < bearing.cubic_N_per_m3 * radius**2 / bearing.k_y < 0.5
+    assert found[2] == pytest.approx(response[y1], rel=0.01)
+    assert abs(found[1] - found[2]) < abs(found[0] - found[2]) / 2.5
+
+
+def test_an_unstable_rotor_is_refused() -> None:
+    rotor = rotor_named("fluid-film")
+    whirling = replace(rotor, bearings=(replace(rotor.bearings[0], k_yz=4e5, k_zy=-4e5), rotor.bearings[1]))
+    with pytest.raises(EstimationError, match="fluid-film: unstable at"):
+        move(whirling, rotor.speed_rad_s, (), 1.0, RATE_HZ, np.random.default_rng(0))
+
+
+def test_changes_reach_what_they_name() -> None:
+    rotor = rotor_named("stiffening")
+    other = changed_rotor(rotor, {"k_bz": -0.1, "c_by": -0.3, "e": 0.2})
+    one, two = rotor.bearings[0], other.bearings[0]
+    assert (two.k_y, two.c_z, two.cubic_N_per_m3) == (one.k_y, one.c_z, one.cubic_N_per_m3)
+    assert (two.k_z, two.c_y, two.cubic_ratio_z) == pytest.approx((0.9 * one.k_z, 0.7 * one.c_y, 0.9))
+    assert other.discs[1].unbalance_kg_m == pytest.approx(1.2 * rotor.discs[1].unbalance_kg_m)
+    with pytest.raises(ValueError, match="stiffening: change EI"):
+        changed_rotor(rotor, {"EI": 0.1})
+
+
+def test_windows_hold_what_the_plan_says_and_see_the_unbalance() -> None:
+    rotor = rotor_named("between")
+    condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(3))
+    sizes = plan(WindowSizes(length_s=20.0))
+    assert sizes.states == ("y1", "y2", "z1", "z2", "y1_dot", "y2_dot", "z1_dot", "z2_dot")
+    found = windows_of(sampled(rotor, condition, 43.0, 8), sizes)
+    assert [window.duration_s for window in found] == [20.0, 20.0]
+    assert found[1].start_ns == found[0].end_ns
+    expected = unbalance_response(rotor, condition.speed_rad_s)[list(probed(rotor))]
+    assert found[0].synchronous is not None
+    assert np.all(np.abs(found[0].synchronous[:4] / expected - 1) < 0.3)
+    assert found[0].speed_rad_s == pytest.approx(condition.speed_rad_s, rel=1e-6)
+    disc = [found[0].states.index("y2"), found[0].states.index("z2")]
+    level = np.sqrt(np.mean([np.diag(window.correlation[0])[disc].sum() for window in found]))
+    assert level / np.sqrt(np.sum(np.abs(expected[[1, 3]]) ** 2) / 2) == pytest.approx(1.5, rel=0.25)
+
+
+def test_a_recording_is_what_a_live_machine_sends(tmp_path: Path) -> None:
+    rotor = rotor_named("overhung")
+    condition = RunCondition(forces(rotor), rotor.speed_rad_s)
+    probes = ("y1", "z1", "y2_ddot")
+    path = tmp_path / "run.mcap"
+    assert record_run(path, rotor, condition, 1.05, 3, probes) == 11
+    messages = list(read_recording(path))
+    described = ChannelDescriptor.model_validate_json(messages[0].payload)
+    assert described == descriptor(rotor, probes)
+    blocks = [decode_block(one.payload, one.attachment, one.encoding) for one in messages[1:]]
+    assert {schema for _, schema in blocks} == {described.schema_hash}
+    assert [block.sequence for block, _ in blocks] == list(range(11))
+    assert all(after[0].start_ns == before[0].end_ns for before, after in pairwise(blocks))
+    stored = np.concatenate([block.samples for block, _ in blocks]).astype(float)
+    expected = sampled(rotor, condition, 1.05, 3, probes)
+    assert stored * [1e-6, 1e-6, 1.0, 1.0] == pytest.approx(expected, rel=1e-6, abs=1e-12)
+    assert [one.log_time_ns for one in messages[1:]] == [block.end_ns for block, _ in blocks]
+
+
+def test_the_machine_file_tells_channels_and_sampling_and_nothing_of_the_rotor() -> None:
+    rotor = rotor_named("both-sides")
+    content = tomllib.loads(machine_file(rotor, WindowSizes(), (*MOTION, "y1_ddot")))
+    assert set(content) == {"site", "name", "description", "rate_hz", "window", "sensors"}
+    assert [sensor["name"] for sensor in content["sensors"]] == [*MOTION, "y1_ddot", "theta"]
+    assert set(PROBES) >= {sensor["name"] for sensor in content["sensors"]} - {"theta"}
+    bare = tomllib.loads(machine_file(rotor, WindowSizes(), ("y1", "z1"), phase_reference=False))
+    assert [sensor["location"] for sensor in bare["sensors"]] == ["bearing", "bearing"]
