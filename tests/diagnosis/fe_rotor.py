@@ -17,6 +17,8 @@ from models.signals.block import FloatArray
 
 RATE_HZ = 2000.0
 STATES = ("y1", "y2", "z1", "z2", "y1_dot", "y2_dot", "z1_dot", "z2_dot")
+ACCELERATIONS = ("y1_ddot", "y2_ddot", "z1_ddot", "z2_ddot")
+COLUMNS = (*STATES, *ACCELERATIONS)
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,7 @@ def simulate(
     noise: float = 0.01,
     noise_memory_s: float = 0.0,
 ) -> FloatArray:
-    """Samples of `STATES` and the shaft angle, shape (n_samples, 9); noise is relative to each channel's rms."""
+    """Samples of `COLUMNS` and the shaft angle, shape (n_samples, 13); noise is relative to each channel's rms."""
     M, C, K = matrices(rotor)
     n, rows = M.shape[0], _rows(rotor)
     rng = np.random.default_rng(seed)
@@ -139,8 +141,11 @@ def simulate(
     coloured = lfilter([1.0], [1, -2 * pole, pole**2], white, axis=0)
     coloured *= excitation.level_N / coloured.std()
     force = coloured @ np.array(excitation.sources)
-    output = np.concatenate([V[rows], V[[n + row for row in rows]]])
-    x = np.zeros((count + warm, 8))
+    rates = [n + row for row in rows]
+    output = np.concatenate([V[rows], V[rates], (A @ V)[rates]])
+    x = np.zeros((count + warm, len(COLUMNS)))
+    # a force that is held over samples jumps at each of them: the acceleration there is the mean of both sides
+    x[:, len(STATES) :] = (force + np.vstack([force[:1], force[:-1]])) / 2 @ B[rates].T
     for root, drive, shape in zip(values, b, output.T, strict=True):
         if root.imag >= 0:
             state = lfilter([0, 1.0], [1, -root], force @ drive)
@@ -151,7 +156,7 @@ def simulate(
     pull[[rows[1], rows[3]]] = rotor.unbalance_kg_m * W**2 * np.array([1, -1j])
     whirl = np.linalg.solve(K - W**2 * M + 1j * W * C, pull)[rows]
     theta = 0.3 + W * np.arange(count) / RATE_HZ
-    x += np.real(np.exp(1j * theta)[:, None] * np.concatenate([whirl, 1j * W * whirl]))
+    x += np.real(np.exp(1j * theta)[:, None] * np.concatenate([whirl, 1j * W * whirl, -(W**2) * whirl]))
     error = rng.standard_normal(x.shape)
     if noise_memory_s:
         decay = np.exp(-1 / (noise_memory_s * RATE_HZ))
@@ -160,16 +165,16 @@ def simulate(
     return np.column_stack([x, np.mod(theta, 2 * np.pi)])
 
 
-def plan(hops: int = 12, hop_s: float = 5.0) -> Plan:
-    """A plan as a machine file would give it."""
+def plan(hops: int = 12, hop_s: float = 5.0, states: tuple[str, ...] = STATES) -> Plan:
+    """A plan as a machine file would give it, of the given columns."""
     lags: npt.NDArray[np.intp] = np.arange(0, round(0.125 * RATE_HZ) + 1, round(0.001 * RATE_HZ))
     segment = round(hop_s * RATE_HZ)
     return Plan(
         rate_hz=RATE_HZ,
-        states=STATES,
-        columns=np.arange(8),
-        scales=np.ones(8),
-        angle_column=8,
+        states=states,
+        columns=np.array([COLUMNS.index(name) for name in states]),
+        scales=np.ones(len(states)),
+        angle_column=len(COLUMNS),
         hop=segment,
         preamble=max(int(lags[-1]), segment // 2),
         segment=segment,

@@ -6,49 +6,66 @@ on the distance of two kernels alone.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import comb
 
 import numpy as np
 
 from models.signals.block import FloatArray
 
-__all__ = ["LONGEST_LAG_STEP_S", "Kernels", "gain", "kernels", "passband_hz"]
+__all__ = ["LONGEST_LAG_STEP_S", "Kernels", "Shape", "gain", "kernels", "passband_hz", "shape_for"]
 
 LONGEST_LAG_STEP_S = 0.00126
 """Spacing of the lags beyond which a kernel has too few points."""
 
 _SPACING_S = 0.004
 _FALLEN_TO = 0.1
+_FALLEN_AT = 3.0  # width times the band's end for cos⁸: a tenth is left there, and a seventieth a third further up
+_LEAD = 0.375
 
 
 @dataclass(frozen=True, slots=True)
-class _Shape:
-    """cosᵖ over a width; as a sum of cosines of multiples of the width's frequency."""
+class Shape:
+    """cosᵖ over a width: a sum of cosines of multiples of the width's frequency.
+
+    Attributes
+    ----------
+    power : int
+    width_s : float
+    lead_s : float
+        From the shortest lag to the first kernel's centre; what lies before it weighs less than a thousandth.
+    """
 
     power: int
     width_s: float
+    lead_s: float
 
     @property
     def cosines(self) -> FloatArray:
         """Weights of cos(2π m u), m = 0 … p/2."""
         half = self.power // 2
-        row = np.array([_binomial(self.power, half + m) for m in range(half + 1)]) / 2**self.power
+        row = np.array([comb(self.power, half + m) for m in range(half + 1)]) / 2**self.power
         row[1:] *= 2
         return np.asarray(row, dtype=np.float64)
 
 
-_SHAPES = {2: _Shape(4, 0.010), 4: _Shape(8, 0.014)}
-"""By the most derivatives that the kernel bears on lags of about a millisecond."""
+def shape_for(deepest: int, band_to_hz: float) -> Shape:
+    """Shape of the kernels that bear some derivatives.
 
+    One derivative is borne by a narrow kernel. Every further one lifts the sensors' noise by another power of the
+    frequency: kernels are then so wide that they pass nothing beyond the band of the spectra, or the spectra would not
+    know what the moments scatter by.
 
-def _binomial(n: int, k: int) -> float:
-    value = 1.0
-    for i in range(1, k + 1):
-        value *= (n - k + i) / i
-    return value
-
-
-def _shape(deepest: int) -> _Shape:
-    return _SHAPES[min(depth for depth in _SHAPES if deepest <= depth)]
+    Parameters
+    ----------
+    deepest : int
+        Most derivatives on a kernel (`Formation.deepest`), at most 4.
+    band_to_hz : float
+        Highest frequency of the window's spectra.
+    """
+    if deepest <= 1:
+        return Shape(4, 0.010, 0.005)
+    width_s = _FALLEN_AT / band_to_hz
+    return Shape(8, width_s, _LEAD * width_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +88,7 @@ class Kernels:
         return float(self.centres_s[1] - self.centres_s[0])
 
 
-def kernels(lags_s: FloatArray, lag_from_s: float, deepest: int) -> Kernels:
+def kernels(lags_s: FloatArray, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
     """Kernels beyond a shortest lag.
 
     Parameters
@@ -80,19 +97,20 @@ def kernels(lags_s: FloatArray, lag_from_s: float, deepest: int) -> Kernels:
         Equally spaced.
     lag_from_s : float
         Where the first kernel begins.
+    shape : Shape
     deepest : int
         Most derivatives that are asked for, at most 4.
     """
-    return _kernels(lags_s.tobytes(), lag_from_s, deepest)
+    return _kernels(lags_s.tobytes(), lag_from_s, shape, deepest)
 
 
 @lru_cache(maxsize=256)
-def _kernels(lags: bytes, lag_from_s: float, deepest: int) -> Kernels:
-    lags_s, shape = np.frombuffer(lags), _shape(deepest)
+def _kernels(lags: bytes, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
+    lags_s = np.frombuffer(lags)
     step_s = float(lags_s[1] - lags_s[0])
     spacing_s = max(1, round(_SPACING_S / step_s)) * step_s
     width_s = shape.width_s
-    centres = np.arange(lag_from_s + width_s / 2, lags_s[-1] - width_s / 2 + 1e-9, spacing_s)
+    centres = np.arange(lag_from_s + shape.lead_s, lags_s[-1] - width_s / 2 + 1e-9, spacing_s)
     u = (lags_s[None, :] - centres[:, None]) / width_s
     inside = np.abs(u) < 0.5
     values = []
@@ -105,9 +123,8 @@ def _kernels(lags: bytes, lag_from_s: float, deepest: int) -> Kernels:
     return Kernels(tuple(values), centres)
 
 
-def gain(frequencies_hz: FloatArray, deepest: int) -> FloatArray:
+def gain(frequencies_hz: FloatArray, shape: Shape) -> FloatArray:
     """Fourier transform of a kernel, shape (n_bins,): real, as the kernel is even."""
-    shape = _shape(deepest)
     x = np.asarray(frequencies_hz, dtype=np.float64) * shape.width_s
     total = np.zeros_like(x)
     for m, weight in enumerate(shape.cosines):
@@ -115,14 +132,16 @@ def gain(frequencies_hz: FloatArray, deepest: int) -> FloatArray:
     return total
 
 
-def passband_hz(deepest: int) -> float:
+def passband_hz(deepest: int, band_to_hz: float) -> float:
     """Frequency, Hz, up to which the kernels let through at least a tenth: the end of the differentiator's valid band.
 
     Parameters
     ----------
     deepest : int
         Most derivatives on a kernel (`Formation.deepest`).
+    band_to_hz : float
+        Highest frequency of the window's spectra.
     """
-    f = np.linspace(0.0, 1000.0, 4001)
-    through = gain(f, deepest)
-    return float(f[np.argmax(through < _FALLEN_TO * through[0])])
+    f = np.linspace(0.0, 2000.0, 8001)
+    through = gain(f, shape_for(deepest, band_to_hz))
+    return float(min(band_to_hz, f[np.argmax(through < _FALLEN_TO * through[0])]))

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.baseline.kernels import Kernels, gain, kernels
+from models.diagnosis.baseline.kernels import Kernels, Shape, gain, kernels, shape_for
 from models.diagnosis.baseline.kinematics import Formation, formation_of
 from models.diagnosis.baseline.rows import Row
 from models.diagnosis.moments import ComplexArray
@@ -126,12 +126,17 @@ class RowWindow:
     pairs: npt.NDArray[np.intp]
     factors: FloatArray
 
+    @property
+    def shape(self) -> Shape:
+        """Of the kernels."""
+        return shape_for(self.formation.deepest, float(self.window.frequencies_hz[-1]))
+
     def beyond(self, lag_from_s: float) -> LagMoments:
         """Moments beyond a shortest lag."""
         window, formation = self.window, self.formation
         index = {name: position for position, name in enumerate(window.states)}
         references = [index[name] for name in self.references]
-        over = kernels(window.lags_s, lag_from_s, formation.deepest)
+        over = kernels(window.lags_s, lag_from_s, self.shape, formation.deepest)
 
         def moments(correlation: FloatArray) -> FloatArray:
             seen: dict[tuple[str, int], FloatArray] = {}
@@ -182,8 +187,9 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     columns = [index[name] for name in references]
     pairs = np.array(np.triu_indices(n_terms))
     own = spectra[:, pairs[0], pairs[1]].real
-    between = _reference_spectra(window, columns, formation.deepest)
-    nearest = kernels(window.lags_s, SHORTEST_LAG_FROM_S, formation.deepest)
+    shape = shape_for(formation.deepest, float(f[-1]))
+    between = _reference_spectra(window, columns, shape)
+    nearest = kernels(window.lags_s, SHORTEST_LAG_FROM_S, shape, formation.deepest)
     cosine, sine = _waves(f.tobytes(), nearest.spacing_s, nearest.centres_s.size)
     flat = between.reshape(f.size, -1)
     # one product for each reference pair: what the distance does to it, weighted by the pairs of terms
@@ -193,13 +199,13 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     return RowWindow(window, formation, references, terms, spectra, blocks, pairs, factors)
 
 
-def _reference_spectra(window: WindowStatistics, columns: list[int], deepest: int) -> ComplexArray:
+def _reference_spectra(window: WindowStatistics, columns: list[int], shape: Shape) -> ComplexArray:
     """Cross-spectra of the references seen through the kernels, by frequency, per resolution of the window."""
     f = window.frequencies_hz
     step_hz = f[1] - f[0]
     bins_hz = np.full(f.size, step_hz)
     bins_hz[0] += f[0] - step_hz / 2  # below the band the spectra are taken as level
-    weight = 2 * bins_hz / window.duration_s * gain(f, deepest) ** 2
+    weight = 2 * bins_hz / window.duration_s * gain(f, shape) ** 2
     return np.asarray(window.spectrum[:, columns][:, :, columns].conj() * weight[:, None, None], dtype=np.complex128)
 
 
@@ -234,7 +240,7 @@ def shared_covariance(a: LagMoments, of_a: FloatArray, b: LagMoments, of_b: Floa
     bins_hz = np.full(f.size, step_hz)
     bins_hz[0] += f[0] - step_hz / 2
     weight = 2 * bins_hz / window.duration_s
-    weight = weight * gain(f, a.of.formation.deepest) * gain(f, b.of.formation.deepest) * density
+    weight = weight * gain(f, a.of.shape) * gain(f, b.of.shape) * density
     between = window.spectrum[:, rows][:, :, columns].conj() * weight[:, None, None]
     first, second = (np.exp(2j * np.pi * f[:, None] * one.kernels.centres_s) for one in (a, b))
     found = np.empty((len(rows), first.shape[1], len(columns), second.shape[1]))

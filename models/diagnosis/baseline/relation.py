@@ -37,7 +37,7 @@ class Relation:
     references : tuple of str
         Measured states they were correlated with.
     coefficients : ndarray, shape (n,)
-        Of every term but the first in term₀ = Σ b term; for the bearing's row minus c/k, m2/k, m1/k and s.
+        Of every term but the first in term₀ = Σ b term; for the bearing's row -c/k, -m2/k, -m1/k and -s.
     covariance : ndarray, shape (n, n)
         Theirs, widened where the relation did not fit.
     misfit : float
