@@ -17,6 +17,7 @@ import numpy as np
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for
 from models.diagnosis.networks.amortised import NetworkDiagnostician
+from models.commissioning.installed import Installed
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
@@ -67,7 +68,7 @@ def main() -> None:
             np.fft.rfft(piece[number * half : number * half + plan.segment], axis=0)
 
     def whole() -> None:
-        monitor = MachineMonitor(machine, bundle)
+        monitor = MachineMonitor(Installed(machine, bundle))
         for block in stream:
             monitor.step(block)
 

@@ -9,7 +9,7 @@
     ├── RecordingError        a recording cannot be read or written
     └── EstimationError       a window cannot be evaluated (never raised for "nothing found")
 
-Expected trouble in a live stream (a gap, a duplicate, a NaN) is a value, not an exception: see ``service.ingest``.
+Expected trouble in a live stream (a gap, a duplicate, a NaN) is a value, not an exception: see ``models.ingest``.
 """
 
 __all__ = ["BundleError", "EstimationError", "MachineFileError", "RecordingError", "RotorwatchError", "WireError"]

@@ -1,5 +1,9 @@
 """The machine file: everything the programs know about one machine, in one checked TOML file.
 
+`MachineFile` is what every machine has: identity, channels, window, alarms. `Machine` is one whose parameters are known
+as well, so that it can be simulated and compared with theory; nobody knows those of most real machines, which are
+commissioned instead (`models.commissioning`).
+
 Every field carries its unit in its name; unknown keys are refused. ``docs/machine-file.md`` explains each field.
 """
 
@@ -13,7 +17,7 @@ from typing import Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from models.errors import MachineFileError
-from models.physics.parameters import PARAMETERS, RotorParameters
+from models.physics.parameters import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
 
@@ -22,8 +26,10 @@ __all__ = [
     "ConditionRange",
     "IngestSettings",
     "Machine",
+    "MachineFile",
     "WindowSettings",
     "load_machine",
+    "load_machine_file",
     "read_toml",
     "validation_text",
 ]
@@ -174,17 +180,17 @@ class AlarmSettings(BaseModel):
         return self.parameters.get(name, self.limits)
 
 
-class Machine(BaseModel):
-    """One machine: identity, physics, sensors, operation, window, ingest and alarms."""
+class MachineFile(BaseModel):
+    """One machine: identity, sensors, window, ingest and alarms, and as much as is known of its physics."""
 
     model_config = _STRICT
 
     site: str
     name: str
     description: str = ""
-    rotor: RotorParameters
-    operation: Operation
-    condition: ConditionRange
+    rotor: KnownRotor | None = None
+    operation: Operation | None = None
+    condition: ConditionRange | None = None
     rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
     dtype: str = Field(default="float32", pattern="^float(32|64)$")
     sensors: tuple[Channel, ...] = Field(min_length=1)
@@ -246,8 +252,16 @@ class Machine(BaseModel):
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
+class Machine(MachineFile):
+    """A machine whose parameters are known: rotor, operation and the conditions it is trained for."""
+
+    rotor: RotorParameters
+    operation: Operation
+    condition: ConditionRange
+
+
 def load_machine(name_or_path: str | Path) -> Machine:
-    """Load a machine file by path, or a shipped one by its name.
+    """Load the file of a machine whose parameters are known, by path, or a shipped one by its name.
 
     Parameters
     ----------
@@ -259,16 +273,44 @@ def load_machine(name_or_path: str | Path) -> Machine:
     MachineFileError
         Naming the file, the field, the value found and what was expected.
     """
-    path = Path(name_or_path)
-    if path.suffix != ".toml" and (_SHIPPED / f"{name_or_path}.toml").is_file():
-        path = _SHIPPED / f"{name_or_path}.toml"
-    elif not path.is_file():
-        shipped = ", ".join(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
-        raise MachineFileError(f"{path}: no such machine file; shipped machines: {shipped}")
+    path = _path(name_or_path)
     try:
         return Machine.model_validate(read_toml(path))
     except ValidationError as error:
         raise MachineFileError(validation_text(path, error)) from error
+
+
+def load_machine_file(name_or_path: str | Path) -> MachineFile:
+    """Load a machine file, whatever is known of the machine; a `Machine` if all its parameters are.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        As for `load_machine`.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
+    """
+    path = _path(name_or_path)
+    try:
+        found = MachineFile.model_validate(read_toml(path))
+    except ValidationError as error:
+        raise MachineFileError(validation_text(path, error)) from error
+    if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
+        return found
+    return Machine.model_validate(found.model_dump())
+
+
+def _path(name_or_path: str | Path) -> Path:
+    path = Path(name_or_path)
+    if path.suffix != ".toml" and (_SHIPPED / f"{name_or_path}.toml").is_file():
+        return _SHIPPED / f"{name_or_path}.toml"
+    if not path.is_file():
+        shipped = ", ".join(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
+        raise MachineFileError(f"{path}: no such machine file; shipped machines: {shipped}")
+    return path
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -23,13 +23,34 @@ from types import MappingProxyType
 from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
 
-__all__ = ["ALARM_TEXT", "MODEL", "Alarm", "AlarmBook", "AlarmEvent", "AlarmState", "Severity"]
+__all__ = ["ALARM_TEXT", "MODEL", "SENSOR", "SHAPE", "Alarm", "AlarmBook", "AlarmEvent", "AlarmState", "Severity"]
 
 MODEL = "model"
 """What the alarm is about that says: outside the model."""
 
-ALARM_TEXT: Mapping[str, str] = MappingProxyType({**PARAMETER_TEXT, MODEL: "outside the model"})
+SENSOR = "sensor"
+"""What the alarm is about that says: a sensor is at fault."""
+
+SHAPE = "shape"
+"""What the alarm is about that says: where no equation can be evaluated, a channel's vibration is not as it was."""
+
+ALARM_TEXT: Mapping[str, str] = MappingProxyType(
+    {**PARAMETER_TEXT, MODEL: "outside the model", SENSOR: "data health", SHAPE: "vibration changed"}
+)
 """What each alarm is about, in words."""
+
+
+_SENTENCES: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        MODEL: (
+            "something has changed that no parameter describes, or a sensor is at fault",
+            "the model describes the machine again",
+        ),
+        SENSOR: ("a sensor is at fault", "the sensors agree with each other again"),
+        SHAPE: ("a channel's vibration is no longer as on the healthy machine", "the vibration is as it was"),
+    }
+)
+"""Of what is no parameter: what is said when it is raised, without a note, and when it clears."""
 
 
 class AlarmState(StrEnum):
@@ -67,7 +88,9 @@ class Alarm:
     occurrence : int
         Counts the times it became active.
     change, standard_error : float
-        Latest relative change and its standard error; nan for the model.
+        Latest relative change and its standard error; nan for what is no parameter.
+    note : str
+        What is known of it, in a sentence; empty for a parameter.
     low_confidence : bool
         The data were outside the model too: that this parameter is the one that changed is to be taken with reserve.
     """
@@ -81,6 +104,7 @@ class Alarm:
     change: float = 0.0
     standard_error: float = float("inf")
     low_confidence: bool = False
+    note: str = ""
 
     @property
     def raised(self) -> bool:
@@ -101,13 +125,11 @@ class AlarmEvent:
     def text(self) -> str:
         """The event in a sentence."""
         alarm = self.alarm
-        if alarm.parameter == MODEL:
+        if alarm.parameter in _SENTENCES:
+            raised, cleared = _SENTENCES[alarm.parameter]
             if self.kind == "cleared":
-                return "cleared: the model describes the machine again"
-            return (
-                f"{alarm.severity.upper()}: outside the model: something has changed that no parameter describes, or a "
-                "sensor is at fault"
-            )
+                return f"cleared: {cleared}"
+            return f"{alarm.severity.upper()}: {ALARM_TEXT[alarm.parameter]}: {alarm.note or raised}"
         what = f"{PARAMETER_TEXT[alarm.parameter]} ({alarm.parameter})"
         size = f"{alarm.change:+.1%} ± {1.96 * alarm.standard_error:.1%}"
         reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
@@ -200,20 +222,24 @@ class AlarmBook:
             danger=size > limits.danger_above,
         )
 
-    def update_model(self, outside: bool, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """Judge the model itself at the end of a hop.
+    def update_state(self, about: str, present: bool, time_ns: int, note: str = "") -> tuple[AlarmEvent, ...]:
+        """Judge what is no parameter at the end of a hop.
 
         Parameters
         ----------
-        outside : bool
-            Whether the data are further from the model than sampling explains.
+        about : str
+            `MODEL`, `SENSOR` or `SHAPE`.
+        present : bool
+            Whether the data are further from the model than sampling explains, a sensor is at fault, or a channel's
+            vibration has changed.
         time_ns : int
             Data time of the end of the hop.
+        note : str
+            What is known of it, in a sentence.
         """
-        alarm = replace(
-            self._alarms.get(MODEL, Alarm(MODEL, since_ns=time_ns)), change=math.nan, standard_error=math.nan
-        )
-        return self._judge(alarm, time_ns, beyond=outside, small=not outside, danger=False)
+        known = self._alarms.get(about, Alarm(about, since_ns=time_ns))
+        alarm = replace(known, change=math.nan, standard_error=math.nan, note=note if present else known.note)
+        return self._judge(alarm, time_ns, beyond=present, small=not present, danger=False)
 
     def _judge(self, alarm: Alarm, time_ns: int, *, beyond: bool, small: bool, danger: bool) -> tuple[AlarmEvent, ...]:
         """Move an alarm on."""

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from models.errors import MachineFileError
-from models.machine import Machine, load_machine, read_toml, validation_text
+from models.machine import MachineFile, load_machine_file, read_toml, validation_text
 from models.signals.link import LinkSettings
 
 __all__ = [
@@ -54,11 +54,11 @@ class MachineEntry(BaseModel):
     bundle: str | None = Field(
         default=None,
         min_length=1,
-        description="trained networks: shipped bundle by name, or folder relative to the settings file; without them "
-        "the equations are reported as not evaluable",
+        description="trained networks or what was commissioned: shipped bundle by name, or folder relative to the "
+        "settings file; a machine whose parameters are not known needs one, others are monitored without networks",
     )
 
-    def load(self) -> Machine:
+    def load(self) -> MachineFile:
         """Load the machine file.
 
         Raises
@@ -66,7 +66,7 @@ class MachineEntry(BaseModel):
         MachineFileError
             Naming the file, the field and the value found.
         """
-        return load_machine(self.file)
+        return load_machine_file(self.file)
 
 
 class QueueSettings(BaseModel):

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 from models.diagnosis.readings import EquationReading, ParameterReading
 from models.diagnosis.verdict.detectable import DetectableChange, length_to_find
 from models.diagnosis.verdict.sequential import SequentialVerdict
-from models.machine import Machine
+from models.machine import MachineFile
 from models.physics.parameters import PARAMETER_TEXT
 from service.alarms import ALARM_TEXT, Alarm, AlarmEvent, AlarmState
 from service.monitor import DataQuality, HealthState, MachineHealth, WindowReport
@@ -60,7 +60,7 @@ class Identity:
     machine_hash: str
 
 
-def machine_hash(machine: Machine) -> str:
+def machine_hash(machine: MachineFile) -> str:
     """Twelve hexadecimal digits that change with anything in the machine file but comments and layout."""
     text = json.dumps(machine.model_dump(mode="json"), sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
@@ -177,7 +177,7 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     )
 
 
-def machine_description(identity: Identity, machine: Machine, state: HealthState) -> MachineDescription:
+def machine_description(identity: Identity, machine: MachineFile, state: HealthState) -> MachineDescription:
     """Convert a machine file."""
     keys = machine.keys
     names = [name for name, value in vars(type(keys)).items() if isinstance(value, property) and name != "root"]
@@ -186,7 +186,7 @@ def machine_description(identity: Identity, machine: Machine, state: HealthState
         machine=identity.machine,
         description=machine.description,
         state=state,
-        speed_rpm=machine.operation.speed_rpm,
+        speed_rpm=None if machine.operation is None else machine.operation.speed_rpm,
         rate_hz=machine.rate_hz,
         channels=machine.sensors,
         window_length_s=machine.window.length_s,
@@ -198,7 +198,7 @@ def machine_description(identity: Identity, machine: Machine, state: HealthState
 
 
 def detectable_changes(
-    identity: Identity, machine: Machine, record: MachineHealth, change: float | None
+    identity: Identity, machine: MachineFile, record: MachineHealth, change: float | None
 ) -> DetectableChanges:
     """Say what the latest window would have shown, and how much data a wished change takes."""
     latest = record.latest

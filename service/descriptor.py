@@ -2,20 +2,20 @@
 
 from pydantic import ValidationError
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.channels import ChannelDescriptor
 
 __all__ = ["descriptor_mismatch"]
 
 
-def descriptor_mismatch(announced: bytes, machine: Machine) -> tuple[str, ...]:
+def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ...]:
     """Differences between an announced descriptor and the machine file, one sentence per field.
 
     Parameters
     ----------
     announced : bytes
         JSON from the ``descriptor`` key.
-    machine : Machine
+    machine : MachineFile
         What is expected.
 
     Returns

@@ -13,20 +13,22 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from models.commissioning.installed import Installed
+from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.moments import plan_for
-from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.detectable import DetectableChange, detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest, SequentialVerdict
 from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError, WireError
-from models.machine import Machine
+from models.ingest import Gate, Reason, Verdict
 from models.signals.block import SampleBlock
 from models.signals.wire import decode_block
-from service.alarms import Alarm, AlarmBook, AlarmEvent, Severity
-from service.ingest import Gate, Reason, Verdict
-from service.residuals import Opinion, WindowEvaluator
+from service.alarms import MODEL, SENSOR, SHAPE, Alarm, AlarmBook, AlarmEvent, Severity
+from service.residuals import Evaluation, Opinion, evaluator_for
 
 __all__ = ["DataQuality", "HealthState", "MachineHealth", "MachineMonitor", "MonitorReport", "WindowReport"]
 
@@ -39,6 +41,8 @@ class HealthState(StrEnum):
     ALERT = "alert"
     DANGER = "danger"
     OUTSIDE_MODEL = "outside-model"
+    DATA_HEALTH = "data-health"
+    UNCHANGED = "unchanged"
     NO_DATA = "no-data"
     NOT_EVALUABLE = "not-evaluable"
 
@@ -80,13 +84,14 @@ class WindowReport:
     start_ns, end_ns : int
         Oldest and newest data in the window.
     state : HealthState
-        After this window: warming, healthy, alert, danger, outside-model or not-evaluable.
+        After this window: warming, healthy, alert, danger, outside-model, data-health, unchanged (no
+        equation can be evaluated, but every channel is as it was) or not-evaluable.
     filled : float
         Fraction of a full window.
     speed_rad_s : float or None
         Mean speed in the window.
     parameters : tuple of ParameterReading
-        The likelihood's readings of the whole window.
+        Readings of the whole window by the diagnostician that decides: the likelihood, or the baseline.
     equations : tuple of EquationReading
         The networks' opinion, equation by equation.
     opinions : tuple of Opinion
@@ -101,6 +106,10 @@ class WindowReport:
         What would have been noticed in this window, parameter by parameter.
     reason : str
         Why the window was not evaluated; empty if it was.
+    sensors : tuple of SensorFinding
+        Faults of sensors in the window; with any of them nothing is said of the machine.
+    shapes : tuple of ChannelShape
+        Where no equation can be evaluated: whether each channel's vibration is as it was.
     """
 
     start_ns: int
@@ -116,6 +125,8 @@ class WindowReport:
     verdict: SequentialVerdict | None = None
     detectable: tuple[DetectableChange, ...] = ()
     reason: str = ""
+    sensors: tuple[SensorFinding, ...] = ()
+    shapes: tuple[ChannelShape, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,19 +164,19 @@ class MachineMonitor:
 
     Parameters
     ----------
-    machine : Machine
-        The machine file.
-    bundle : Bundle or None
-        Trained networks; without them the equations are reported as not evaluable.
+    installed : Installed
+        The machine file, and what was trained and commissioned for the machine.
     """
 
-    def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
-        self.machine = machine
-        self._plan = plan_for(machine, lagged=bundle is not None)  # only the networks look at lags
+    def __init__(self, installed: Installed) -> None:
+        self.machine = machine = installed.machine
+        self._evaluator = evaluator_for(installed)
+        self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
+        self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
-        self._evaluator = WindowEvaluator(machine, bundle)
-        self._test = SequentialTest(SequentialSettings.for_machine(machine))
+        settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
+        self._test = SequentialTest(settings, by=self._evaluator.by)
         self._alarms = AlarmBook(machine.alarms)
         self._quality = DataQuality()
         self._refused: Counter[str] = Counter()
@@ -243,6 +254,19 @@ class MachineMonitor:
             report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
             self._latest = report
             return report, ()
+        findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
+        events = self._alarms.update_state(SENSOR, bool(findings), end_ns, "; ".join(each.text for each in findings))
+        if findings:
+            report = WindowReport(
+                statistics.start_ns,
+                end_ns,
+                self._state(HealthState.DATA_HEALTH),
+                filled,
+                sensors=findings,
+                reason="; ".join(each.text for each in findings),
+            )
+            self._latest = report
+            return report, events
         short = {hops: self._window.statistics(hops) for hops in self._test.wanted()}
         present = {hops: latest for hops, latest in short.items() if latest is not None}
         try:
@@ -252,17 +276,20 @@ class MachineMonitor:
                 statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
             )
             self._latest = report
-            return report, ()
+            return report, events
         looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
         whole = self._test.settings.window_hops
         looks[whole] = _stretch(evaluation.deciding, statistics)
         verdict = self._test.update(looks)
-        events = self._alarm(verdict, end_ns)
+        changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
+        events += self._alarm(verdict, evaluation.deciding.suspect, end_ns)
+        if evaluation.shapes:
+            events += self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed))
         outside = verdict.isolation.outside
         report = WindowReport(
             start_ns=statistics.start_ns,
             end_ns=end_ns,
-            state=self._state(HealthState.OUTSIDE_MODEL if outside else HealthState.HEALTHY),
+            state=self._state(_calm_state(evaluation, outside=outside)),
             filled=filled,
             speed_rad_s=evaluation.speed_rad_s,
             parameters=evaluation.deciding.parameters,
@@ -271,12 +298,16 @@ class MachineMonitor:
             misfit_z=evaluation.deciding.misfit_z,
             suspect=evaluation.deciding.suspect if outside else "",
             verdict=verdict,
-            detectable=detectable_changes(looks[whole], self._test.thresholds(whole), self.machine.window.length_s),
+            detectable=detectable_changes(
+                looks[whole].complete(), self._test.thresholds(whole), self.machine.window.length_s
+            ),
+            reason="" if evaluation.deciding.evaluable else _why_nothing(evaluation.deciding),
+            shapes=evaluation.shapes,
         )
         self._latest = report
         return report, events
 
-    def _alarm(self, verdict: SequentialVerdict, end_ns: int) -> tuple[AlarmEvent, ...]:
+    def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> tuple[AlarmEvent, ...]:
         """Bring what was found to the alarms; without clean data they stay where they are."""
         named = {finding.name for finding in verdict.findings}
         events: list[AlarmEvent] = []
@@ -293,7 +324,8 @@ class MachineMonitor:
                     )
                 )
         if verdict.current:
-            events.extend(self._alarms.update_model(verdict.isolation.outside, end_ns))
+            note = f"best explained by: {suspect}" if suspect else ""
+            events.extend(self._alarms.update_state(MODEL, verdict.isolation.outside, end_ns, note))
         return tuple(events)
 
     def _state(self, otherwise: HealthState) -> HealthState:
@@ -305,6 +337,20 @@ class MachineMonitor:
                 return HealthState.ALERT
             case None:
                 return otherwise
+
+
+def _calm_state(evaluation: Evaluation, *, outside: bool) -> HealthState:
+    """What a machine without raised alarms is: healthy only if something was read that could have said otherwise."""
+    if evaluation.deciding.evaluable:
+        return HealthState.OUTSIDE_MODEL if outside else HealthState.HEALTHY
+    if evaluation.shapes and not any(shape.changed for shape in evaluation.shapes):
+        return HealthState.UNCHANGED
+    return HealthState.NOT_EVALUABLE
+
+
+def _why_nothing(diagnosis: Diagnosis) -> str:
+    """Why no parameter could be read, every reason once."""
+    return "; ".join(dict.fromkeys(reading.reason for reading in diagnosis.parameters if reading.reason))
 
 
 def _stretch(diagnosis: Diagnosis, window: WindowStatistics) -> Stretch:

@@ -1,24 +1,37 @@
-"""Evaluation of one window: several diagnosticians side by side, and whether they agree."""
+"""Evaluation of one window: several diagnosticians side by side, and whether they agree.
+
+A machine whose parameters are known, given or identified, is compared with theory (`KnownMachineEvaluator`). One of
+which only healthy recordings are known is compared with its baseline (`BaselineEvaluator`), and where its sensors allow
+no equation, each channel with its own healthy form.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 
+from models.commissioning.commissioned import Commissioned, IdentifiedRecord
+from models.commissioning.installed import Installed
+from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, EquationReading, ParameterReading
 from models.diagnosis.verdict.agreement import Agreement, agreements
-from models.diagnosis.verdict.determined import determined
+from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
-from models.errors import EstimationError
-from models.machine import Machine
+from models.errors import BundleError, EstimationError
+from models.machine import Machine, MachineFile
+from models.physics.parameters import PARAMETERS
 
-__all__ = ["Evaluation", "Opinion", "WindowEvaluator"]
+__all__ = ["Evaluation", "Opinion", "WindowEvaluator", "evaluator_for"]
 
+_SHAPE = "shape"
+_TOO_FEW = "too few sensors for any equation of this machine; see what is said of each channel"
+_EMPTY = np.zeros((0, 0))
 _STEADY = 0.05
 """Range of speed within a window, relative: what the changing 1x leaves behind then stays next to the excluded line."""
 
@@ -61,6 +74,8 @@ class Evaluation:
         What the others say.
     speed_rad_s : float or None
         Mean speed.
+    shapes : tuple of ChannelShape
+        Where no equation can be evaluated: whether each channel's vibration is as it was.
     """
 
     deciding: Diagnosis
@@ -68,27 +83,23 @@ class Evaluation:
     equations: tuple[EquationReading, ...]
     opinions: tuple[Opinion, ...]
     speed_rad_s: float | None
+    shapes: tuple[ChannelShape, ...] = ()
 
 
-class WindowEvaluator:
-    """Evaluates the windows of one machine.
+class WindowEvaluator(Protocol):
+    """Evaluates the windows of one machine."""
 
-    Parameters
-    ----------
-    machine : Machine
-    bundle : Bundle or None
-        Without it the equations are reported as not evaluable.
-    """
+    @property
+    def by(self) -> str:
+        """Name of the diagnostician that decides."""
 
-    def __init__(self, machine: Machine, bundle: Bundle | None) -> None:
-        self._machine = machine
-        self._place = f"{machine.site}/{machine.name}"
-        self._likelihood = LengthFits(machine)
-        others: list[Diagnostician] = []
-        if bundle is not None and bundle.amortised is not None:
-            others.append(NetworkDiagnostician(machine, bundle.amortised))
-        others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
-        self._others = tuple(others)
+    @property
+    def takes_short(self) -> bool:
+        """Whether stretches shorter than the window can be evaluated."""
+
+    @property
+    def needs_lags(self) -> bool:
+        """Whether correlations are needed at all lags, or at lag zero alone."""
 
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window.
@@ -105,6 +116,61 @@ class WindowEvaluator:
         EstimationError
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
+
+
+def evaluator_for(installed: Installed) -> WindowEvaluator:
+    """The evaluator that what is known of the machine allows."""
+    known, commissioned = installed.known, installed.commissioned
+    if known is not None:
+        identified = None if commissioned is None else commissioned.identified
+        return KnownMachineEvaluator(known, installed.bundle, identified)
+    if commissioned is None:
+        raise BundleError(f"{installed.machine.site}/{installed.machine.name}: neither known nor commissioned")
+    return BaselineEvaluator(installed.machine, commissioned)
+
+
+class KnownMachineEvaluator:
+    """Compares the windows of one machine with theory.
+
+    Parameters
+    ----------
+    machine : Machine
+        With all its parameters.
+    bundle : Bundle or None
+        Without it the equations are reported as not evaluable.
+    identified : IdentifiedRecord, optional
+        Uncertainty of parameters that were identified; part of every reading.
+    """
+
+    def __init__(self, machine: Machine, bundle: Bundle | None, identified: IdentifiedRecord | None = None) -> None:
+        self._machine = machine
+        self._place = f"{machine.site}/{machine.name}"
+        self._likelihood = LengthFits(machine)
+        self._shared = None if identified is None else identified.matrix()
+        self._has_networks = bundle is not None
+        others: list[Diagnostician] = []
+        if bundle is not None and bundle.amortised is not None:
+            others.append(NetworkDiagnostician(machine, bundle.amortised))
+        others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
+        self._others = tuple(others)
+
+    @property
+    def by(self) -> str:
+        """The likelihood."""
+        return "likelihood"
+
+    @property
+    def takes_short(self) -> bool:
+        """Short stretches can be evaluated."""
+        return True
+
+    @property
+    def needs_lags(self) -> bool:
+        """Only the networks look at lags."""
+        return self._has_networks
+
+    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+        """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
         deciding = self._decide(window, self._likelihood.window)
         evaluated = {}
@@ -149,7 +215,57 @@ class WindowEvaluator:
             diagnosis = diagnose(window)
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{self._place}: {error} in this window") from error
-        return determined(diagnosis, window, self._machine.window.length_s)
+        stated = determined(diagnosis, window, self._machine.window.length_s)
+        return stated if self._shared is None else with_shared_error(stated, self._shared)
+
+
+class BaselineEvaluator:
+    """Compares the windows of one machine with what was learned on it when it was healthy.
+
+    Parameters
+    ----------
+    machine : MachineFile
+    commissioned : Commissioned
+        With a baseline, or at least the healthy shape of every channel.
+    """
+
+    def __init__(self, machine: MachineFile, commissioned: Commissioned) -> None:
+        self._place = f"{machine.site}/{machine.name}"
+        self._conditions = commissioned.conditions
+        self._shape = commissioned.shape
+        self._length_s = machine.window.length_s
+        self._baseline = None if commissioned.baseline is None else commissioned.baseline.diagnostician()
+
+    @property
+    def by(self) -> str:
+        """The baseline, or nothing but the shapes of channels."""
+        return _SHAPE if self._baseline is None else self._baseline.by
+
+    @property
+    def takes_short(self) -> bool:
+        """Relations need whole windows."""
+        return False
+
+    @property
+    def needs_lags(self) -> bool:
+        """Relations hold between correlation functions."""
+        return True
+
+    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+        """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""
+        _ = short
+        outside = self._conditions.outside(window)
+        if outside:
+            raise EstimationError(f"{self._place}: not evaluable here: {outside}")
+        speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
+        if self._baseline is not None:
+            deciding = determined(self._baseline.diagnose(window), window, self._length_s)
+        else:
+            deciding = Diagnosis(
+                _SHAPE, tuple(ParameterReading(name, _SHAPE, reason=_TOO_FEW) for name in PARAMETERS), covariance=_EMPTY
+            )
+        shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window)
+        return Evaluation(deciding, {}, (), (), speed, shapes)
 
 
 def _opinion(deciding: Diagnosis, other: Diagnosis) -> Opinion:

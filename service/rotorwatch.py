@@ -342,19 +342,18 @@ def _overridden(
 
 def _checked(file: Path) -> str:
     """Check one file and say what it describes."""
-    from models.diagnosis.networks.bundle import load_bundle  # noqa: PLC0415  # keeps --help quick
-    from models.machine import load_machine, read_toml  # noqa: PLC0415
+    from models.commissioning.installed import install  # noqa: PLC0415  # keeps --help quick
+    from models.machine import load_machine_file, read_toml  # noqa: PLC0415
     from service.config import load_settings  # noqa: PLC0415
 
     if {"site", "rotor", "sensors"} & set(read_toml(file)):
-        machine = load_machine(file)
+        machine = load_machine_file(file)
         return f"machine {machine.site}/{machine.name}, {len(machine.sensors)} channels at {machine.rate_hz:g} Hz"
     settings = load_settings(file)
     names = []
     for entry in settings.machines:
         machine = entry.load()
-        if entry.bundle is not None:
-            load_bundle(entry.bundle, machine)
+        install(machine, entry.bundle)
         names.append(f"{machine.site}/{machine.name}")
     return f"settings for {', '.join(names)}"
 

@@ -26,9 +26,9 @@ from types import FrameType
 
 import uvicorn
 
-from models.diagnosis.networks.bundle import load_bundle
+from models.commissioning.installed import install
 from models.errors import RotorwatchError
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.keys import MachineKeys
 from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
@@ -72,9 +72,8 @@ class Runtime:
         self.settings = settings
         self._workers: list[MachineWorker] = []
         for entry in settings.machines:
-            machine = entry.load()
-            bundle = None if entry.bundle is None else load_bundle(entry.bundle, machine)
-            self._workers.append(MachineWorker(machine, bundle, settings.queue, settings.history))
+            installed = install(entry.load(), entry.bundle)
+            self._workers.append(MachineWorker(installed, settings.queue, settings.history))
         directory = settings.recording.directory
         self.catalogue = None if directory is None else Catalogue(Path(directory))
         self.replays = ReplayDesk(settings, self.catalogue)
@@ -147,7 +146,7 @@ class Runtime:
             self._undo = undo.pop_all()
         _log.info("running", http=server.url, machines=len(self._workers))
 
-    def _record(self, machine: Machine, link: Link, undo: ExitStack) -> None:
+    def _record(self, machine: MachineFile, link: Link, undo: ExitStack) -> None:
         """Record the machine, if that is wanted; trouble with the disk is the recorder's own affair."""
         if self.settings.recording.directory is None:
             return
@@ -161,12 +160,12 @@ class Runtime:
         undo.callback(MachineTap(link, machine.keys, recorder.put).close)
         self._recorders[machine.site, machine.name] = recorder
 
-    def _recording_state(self, machine: Machine) -> str:
+    def _recording_state(self, machine: MachineFile) -> str:
         recorder = self._recorders.get((machine.site, machine.name))
         return "off" if recorder is None else recorder.status().text
 
     def _connect(self, worker: MachineWorker, link: Link, undo: ExitStack) -> MachineLink:
-        machine: Machine = worker.machine
+        machine: MachineFile = worker.machine
         keys: MachineKeys = machine.keys
         callbacks = MachineCallbacks(
             on_block=worker.inbox.put,

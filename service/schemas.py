@@ -386,7 +386,9 @@ class MachineDescription(BaseModel):
     machine: _Name
     description: str = Field(description="from the machine file", examples=["Rotor kit with an overhung disc"])
     state: _State
-    speed_rpm: float = Field(description="nominal speed", examples=[1320.0])
+    speed_rpm: float | None = Field(
+        description="nominal speed, null where the machine file gives none", examples=[1320.0]
+    )
     rate_hz: float = Field(description="samples per second and channel", examples=[2000.0])
     channels: tuple[Channel, ...] = Field(
         description="columns of the stream",

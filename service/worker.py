@@ -5,8 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-from models.diagnosis.networks.bundle import Bundle
-from models.machine import Machine
+from models.commissioning.installed import Installed
 from service import conversion
 from service.config import HistorySettings, QueueSettings
 from service.conversion import Identity
@@ -49,8 +48,8 @@ class MachineWorker:
 
     Parameters
     ----------
-    machine : Machine
-    bundle : Bundle or None
+    installed : Installed
+        The machine file, and what was trained and commissioned for it.
     queue : QueueSettings
     history : HistorySettings
     clock : callable
@@ -59,19 +58,18 @@ class MachineWorker:
 
     def __init__(
         self,
-        machine: Machine,
-        bundle: Bundle | None,
+        installed: Installed,
         queue: QueueSettings,
         history: HistorySettings,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.machine = machine
+        self.machine = machine = installed.machine
         self.inbox = Inbox(queue.blocks, queue.when_full)
         self.history = History(history.reports, history.alarm_events)
         self.identity = Identity(
             site=machine.site,
             machine=machine.name,
-            bundle=None if bundle is None else bundle.identity,
+            bundle=installed.identity,
             machine_hash=conversion.machine_hash(machine),
         )
         self.errors = 0
@@ -79,7 +77,7 @@ class MachineWorker:
         self._clock = clock
         self._log = logger(machine=f"{machine.site}/{machine.name}")
         self._limiter = Limiter(clock)
-        self._monitor = MachineMonitor(machine, bundle)
+        self._monitor = MachineMonitor(installed)
         self._snapshot: MachineHealth = self._monitor.health()
         self._begin_s = clock()
         self._latest_data_s: float | None = None

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_arrow, encode_block
 from simulator.truth import TruthRecord
@@ -50,6 +50,6 @@ def block_message(block: SampleBlock, schema_hash: str, encoding: BlockEncoding)
     return encode_block(block, schema_hash) if encoding == "raw" else encode_arrow(block, schema_hash)
 
 
-def descriptor_payload(machine: Machine) -> bytes:
+def descriptor_payload(machine: MachineFile) -> bytes:
     """Encode the channel descriptor as JSON."""
     return machine.descriptor.model_dump_json().encode()

@@ -21,7 +21,7 @@ import zenoh
 import zenoh.ext
 
 from models.errors import MachineFileError, RotorwatchError
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from simulator.messages import (
@@ -77,7 +77,7 @@ class PublishSettings:
 
 
 def publish(
-    machine: Machine,
+    machine: MachineFile,
     stream: BlockStream,
     settings: PublishSettings,
     *,
@@ -90,7 +90,7 @@ def publish(
 
     Parameters
     ----------
-    machine : Machine
+    machine : MachineFile
     stream : iterator of (SampleBlock, tuple of TruthRecord)
         From `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for.
     settings : PublishSettings
@@ -159,7 +159,7 @@ def _reason(error: zenoh.ZError) -> str:
 
 
 @contextmanager
-def _declared(session: zenoh.Session, machine: Machine, pace: float | None) -> Iterator[_Outlets]:
+def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) -> Iterator[_Outlets]:
     keys, descriptor = machine.keys, descriptor_payload(machine)
     # A real machine never waits for its monitor: a block that finds the queue full is dropped, and the subscriber
     # fetches it from the cache. Without pace there is nothing to fall behind of, and a cache of any size would
@@ -211,7 +211,7 @@ def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, timeout_s: f
 
 def _send(
     outlets: _Outlets,
-    machine: Machine,
+    machine: MachineFile,
     stream: BlockStream,
     settings: PublishSettings,
     stop: Event,

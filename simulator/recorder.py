@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter
 from simulator.messages import (
     JSON_ENCODING,
@@ -20,7 +20,7 @@ __all__ = ["record"]
 
 
 def record(
-    machine: Machine,
+    machine: MachineFile,
     stream: BlockStream,
     path: Path,
     *,
@@ -36,7 +36,7 @@ def record(
 
     Parameters
     ----------
-    machine : Machine
+    machine : MachineFile
     stream : iterator of (SampleBlock, tuple of TruthRecord)
         From `simulator.stream.blocks`.
     path : Path

@@ -6,17 +6,39 @@ from types import MappingProxyType
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["FAULT_FIELDS", "PARAMETERS", "PARAMETER_TEXT", "RotorParameters", "changed"]
+__all__ = ["FAULT_FIELDS", "PARAMETERS", "PARAMETER_TEXT", "KnownRotor", "RotorParameters", "changed"]
 
 
-class RotorParameters(BaseModel):
+class KnownRotor(BaseModel):
+    """What is known of a rotor's parameters; see `RotorParameters` for the meaning of each."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    m1_kg: float | None = Field(default=None, gt=0, le=1e5)
+    m2_kg: float | None = Field(default=None, gt=0, le=1e5)
+    I2_kg_m2: float | None = Field(default=None, gt=0, le=1e5)
+    I2p_kg_m2: float | None = Field(default=None, ge=0, le=1e5)
+    shaft_length_m: float | None = Field(default=None, gt=0, le=50)
+    shaft_diameter_m: float | None = Field(default=None, gt=0, le=5)
+    shaft_E_Pa: float | None = Field(default=None, gt=0, le=1e12)
+    k_by_N_per_m: float | None = Field(default=None, gt=0, le=1e12)
+    k_bz_N_per_m: float | None = Field(default=None, gt=0, le=1e12)
+    c_by_N_s_per_m: float | None = Field(default=None, gt=0, le=1e9)
+    c_bz_N_s_per_m: float | None = Field(default=None, gt=0, le=1e9)
+    e_m: float | None = Field(default=None, ge=0, le=0.1)
+
+    @property
+    def unknown(self) -> tuple[str, ...]:
+        """Fields that are not given."""
+        return tuple(name for name in type(self).model_fields if getattr(self, name) is None)
+
+
+class RotorParameters(KnownRotor):
     """Bearing mass on springs and dampers, flexible shaft, overhung disc (paper §2.1, Fig. 2).
 
     The shaft between bearing and disc is a cantilever that keeps its slope at the bearing. The paper's own values
     (Table 1) are lost; nothing here depends on a particular number.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     m1_kg: float = Field(gt=0, le=1e5, description="bearing mass")
     m2_kg: float = Field(gt=0, le=1e5, description="disc mass")

@@ -42,12 +42,12 @@ def import_(
     """
     with exit_codes():
         one_blas_thread()
-        from models.machine import load_machine  # noqa: PLC0415  # keeps --help quick
+        from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
         from service.interchange.importing import import_file  # noqa: PLC0415
         from service.interchange.mapping import load_mapping  # noqa: PLC0415
         from service.interchange.summary import summary_lines  # noqa: PLC0415
 
-        described = load_machine(machine)
+        described = load_machine_file(machine)
         done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)
         for line in summary_lines(done):
             typer.echo(line)

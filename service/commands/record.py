@@ -14,7 +14,7 @@ from models.errors import MachineFileError, RecordingError
 from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
-    from models.machine import Machine
+    from models.machine import MachineFile
     from models.signals.salvage import Salvage
     from service.config import RecordingSettings
     from service.recording.recorder import MachineRecorder
@@ -162,11 +162,11 @@ class _Statuses:
 
 def _settings(
     config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
-) -> "tuple[list[Machine], RecordingSettings]":
+) -> "tuple[list[MachineFile], RecordingSettings]":
     """Machines and settings: the command line over the settings file."""
     from pydantic import ValidationError  # noqa: PLC0415  # keeps --help quick
 
-    from models.machine import load_machine, validation_text  # noqa: PLC0415
+    from models.machine import load_machine_file, validation_text  # noqa: PLC0415
     from service.config import RecordingSettings, load_settings  # noqa: PLC0415
 
     settings = None if config is None else load_settings(config)
@@ -182,7 +182,7 @@ def _settings(
     if recording.directory is None:
         raise MachineFileError("nowhere to record to: give --out DIR, or directory in [recording] of the settings")
     files = machines or [entry.file for entry in settings.machines] if settings is not None else machines or []
-    loaded = [load_machine(file) for file in files]
+    loaded = [load_machine_file(file) for file in files]
     roots = [one.keys.root for one in loaded]
     for root in roots:
         if roots.count(root) > 1:

@@ -63,8 +63,8 @@ def replay(
         typer.Option(
             "--machine",
             metavar="FILE[@BUNDLE]",
-            help="Offline: evaluate with this machine file, and after @ its trained networks. If left out, the shipped "
-            "machine with the recorded site and name, with its networks.",
+            help="Offline: evaluate with this machine file, and after @ its bundle (trained or commissioned). If left "
+            "out, the shipped machine with the recorded site and name, with its networks.",
         ),
     ] = None,
     out: Annotated[
@@ -193,10 +193,10 @@ def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") 
     as_json = request.progress == "json"
     if as_json and request.out is None:
         raise MachineFileError("--progress json writes to standard output: name a file for the results with --out")
-    machine, bundle = choose_machine(request.keys, request.machine)
+    installed = choose_machine(request.keys, request.machine)
     with _lines(request.out, request.overwrite) as write:
         run = OfflineReplay(
-            source, request.keys, machine, bundle, write, from_ns=request.from_ns, to_ns=request.to_ns
+            source, request.keys, installed, write, from_ns=request.from_ns, to_ns=request.to_ns
         )  # fmt: skip
         for text in run.descriptor_differences:
             typer.echo(f"the recorded channel descriptor differs from the machine file: {text}", err=True)

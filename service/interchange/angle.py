@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Quantity
 from models.signals.keyphasor import EdgeDetector, PulseTrain, pulse_train, shaft_angle
@@ -67,7 +67,7 @@ class AngleColumn:
 
     Attributes
     ----------
-    machine : Machine
+    machine : MachineFile
     pulses : PulseTrain or None
     reverse : bool
         Whether the shaft turns from z to y.
@@ -75,7 +75,7 @@ class AngleColumn:
         Rows left out.
     """
 
-    machine: Machine
+    machine: MachineFile
     pulses: PulseTrain | None
     reverse: bool
     unknown: int = 0

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Quantity
 from models.signals.recording import RecordedMessage
@@ -49,12 +49,12 @@ class BlockMaker:
 
     Parameters
     ----------
-    machine : Machine
+    machine : MachineFile
     origin_ns : int
         Time of the first row of the file.
     """
 
-    def __init__(self, machine: Machine, origin_ns: int) -> None:
+    def __init__(self, machine: MachineFile, origin_ns: int) -> None:
         self._machine, self._origin_ns = machine, origin_ns
         ingest, rate_hz = machine.ingest, machine.rate_hz
         self._least = max(1, int(np.ceil(ingest.block_from_s * rate_hz - 1e-9)))

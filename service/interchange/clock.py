@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.units import time_unit_ns
 from service.interchange.mapping import TimeBase
@@ -68,7 +68,7 @@ class Clock:
         return np.asarray(entries.astype(np.float64) * unit_ns - zero)
 
 
-def clock_for(source: Source, columns: list[Reference], base: TimeBase, machine: Machine) -> Clock:
+def clock_for(source: Source, columns: list[Reference], base: TimeBase, machine: MachineFile) -> Clock:
     """Find out how fast the rows come, and check it against the machine.
 
     Raises
@@ -181,7 +181,7 @@ def check_order(path: Path, column: Reference | None, times: FloatArray, first_r
         raise SourceError(f"{path}: row {first_row + at + 1}, column {column}: {what}, expected ascending times{hint}")
 
 
-def _ratio(path: Path, rate_hz: float, tolerance: float, base: TimeBase, machine: Machine) -> Fraction:
+def _ratio(path: Path, rate_hz: float, tolerance: float, base: TimeBase, machine: MachineFile) -> Fraction:
     if abs(rate_hz / machine.rate_hz - 1) <= tolerance:
         return Fraction(1)
     if not base.resample:

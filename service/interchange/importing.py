@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.keyphasor import PulseTrain
 from models.signals.recording import RecordingWriter
 from service.interchange.angle import AngleColumn, read_pulses
@@ -34,7 +34,7 @@ class Imported:
     ----------
     source : Path
     recording : Path
-    machine : Machine
+    machine : MachineFile
     mapping : Mapping
     clock : Clock
     read : Read
@@ -50,7 +50,7 @@ class Imported:
 
     source: Path
     recording: Path
-    machine: Machine
+    machine: MachineFile
     mapping: Mapping
     clock: Clock
     read: Read
@@ -61,7 +61,7 @@ class Imported:
 
 
 def import_file(
-    path: Path, mapping: Mapping, machine: Machine, recording: Path, *, overwrite: bool = False
+    path: Path, mapping: Mapping, machine: MachineFile, recording: Path, *, overwrite: bool = False
 ) -> Imported:
     """Import a file.
 
@@ -71,7 +71,7 @@ def import_file(
         CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4.
     mapping : Mapping
         Which column is which channel.
-    machine : Machine
+    machine : MachineFile
         Whose stream it becomes.
     recording : Path
         What is written; nothing is left of it if the import fails.
@@ -125,7 +125,7 @@ def _sampled(column: str, index: int | None, columns: list[Reference]) -> list[R
     return [] if reference in columns else [reference]
 
 
-def _nothing(path: Path, machine: Machine, read: Read, cut_rows: int) -> str:
+def _nothing(path: Path, machine: MachineFile, read: Read, cut_rows: int) -> str:
     ends = f", {cut_rows} of them at the ends where filters settle" if cut_rows else ""
     return (
         f"{path}: {read.rows} rows, {len(read.gaps)} gaps: no stretch is long enough{ends}; expected at least "

@@ -10,7 +10,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from models.errors import MachineFileError
-from models.machine import Machine, read_toml, validation_text
+from models.machine import MachineFile, read_toml, validation_text
 from models.signals.channels import Channel, Quantity
 from models.signals.units import time_unit_ns, unit_factor
 
@@ -173,7 +173,7 @@ class Mapping(BaseModel):
         """Channels to integrate."""
         return {} if self.acceleration is None else self.acceleration.channels
 
-    def check_against(self, machine: Machine) -> None:
+    def check_against(self, machine: MachineFile) -> None:
         """Check that every channel of the machine is mapped, once, and in a unit of its quantity.
 
         Raises
@@ -216,7 +216,7 @@ class Mapping(BaseModel):
                 raise ValueError(f"{field}.unit: {error}") from error
 
 
-def load_mapping(path: Path, machine: Machine) -> Mapping:
+def load_mapping(path: Path, machine: MachineFile) -> Mapping:
     """Load a mapping for a machine.
 
     Raises

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Quantity
 from models.signals.units import same_unit, unit_factor
@@ -91,7 +91,7 @@ class Read:
     left_out: int = 0
 
 
-def signals_of(source: Source, mapping: Mapping, machine: Machine) -> list[Signal]:
+def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[Signal]:
     """Columns of the machine's channels, in the order of the machine file; the keyphasor's channel is not among them.
 
     Raises

@@ -99,9 +99,11 @@ def _pulse_lines(done: Imported) -> list[str]:
     ]
     if done.unknown_angle:
         lines.append(f"rows left out because the shaft angle is not known: {done.unknown_angle}")
-    nominal_rpm = done.machine.operation.speed_rpm
-    if abs(speed_rpm / nominal_rpm - 1) > done.machine.operation.speed_tolerance:
-        lines.append(f"note: the machine file says speed_rpm = {nominal_rpm:g}; at this speed nothing is evaluated")
+    operation = done.machine.operation
+    if operation is not None and abs(speed_rpm / operation.speed_rpm - 1) > operation.speed_tolerance:
+        lines.append(
+            f"note: the machine file says speed_rpm = {operation.speed_rpm:g}; at this speed nothing is evaluated"
+        )
     return lines
 
 

@@ -12,12 +12,12 @@ from models.diagnosis.networks.relation import EquationNetwork, read_equation, w
 from models.diagnosis.readings import EquationReading
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import RotorwatchError, WireError
-from models.machine import Machine
+from models.ingest import Gate
+from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.keys import MachineKeys
 from models.signals.wire import decode_block
 from service.descriptor import descriptor_mismatch
-from service.ingest import Gate
 from service.replay.source import RecordingSource
 
 __all__ = ["Correlations", "Curve", "Panel", "correlations_of", "latest_window"]
@@ -92,7 +92,7 @@ class Correlations:
 
 
 def latest_window(
-    source: RecordingSource, keys: MachineKeys, machine: Machine, from_ns: int, to_ns: int
+    source: RecordingSource, keys: MachineKeys, machine: MachineFile, from_ns: int, to_ns: int
 ) -> WindowStatistics:
     """The latest full window of what was recorded, as a monitor that hears it from `from_ns` on has it.
 
@@ -166,7 +166,7 @@ def _panel(
 
 
 def _blocks(
-    source: RecordingSource, keys: MachineKeys, machine: Machine, from_ns: int, to_ns: int
+    source: RecordingSource, keys: MachineKeys, machine: MachineFile, from_ns: int, to_ns: int
 ) -> Iterator[tuple[SampleBlock, str]]:
     """Blocks as the gate wants them; undecodable ones are left out.
 

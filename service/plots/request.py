@@ -104,8 +104,9 @@ def draw_plot(request: PlotRequest) -> None:
     keys = source.machine(request.key)
     name = f"{keys.site}/{keys.machine}"
     if request.kind == "correlation":
-        machine, bundle = choose_machine(keys, request.machine)
-        if bundle is None:
+        installed = choose_machine(keys, request.machine)
+        machine, bundle = installed.known, installed.bundle
+        if machine is None or bundle is None:
             raise MachineFileError(
                 "correlations are compared with what trained networks predict, and none were named: "
                 "--machine FILE@BUNDLE"

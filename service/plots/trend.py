@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from models.diagnosis.networks.bundle import Bundle
+from models.commissioning.installed import Installed
 from models.errors import MachineFileError, RotorwatchError
-from models.machine import AlarmSettings, Machine
+from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import FloatArray
 from models.signals.keys import PREFIX, MachineKeys
@@ -126,8 +126,7 @@ def read_trend(source: RecordingSource, keys: MachineKeys, machine: str | None, 
             f"{place}: no reports of {keys.site}/{keys.machine} in this stretch of time, and no sample blocks to "
             "compute them from"
         )
-    chosen, bundle = choose_machine(keys, machine)
-    return _computed(source, keys, chosen, bundle, from_ns, to_ns)
+    return _computed(source, keys, choose_machine(keys, machine), from_ns, to_ns)
 
 
 def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> tuple[AlarmEventData, ...]:
@@ -200,16 +199,15 @@ def _slim(report: Report) -> Report:
 def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
     """Limits of the shipped machine, if it was this one that reported."""
     try:
-        machine, _ = choose_machine(keys, None)
+        machine = choose_machine(keys, None).machine
     except MachineFileError:
         return None
     return machine.alarms if machine_hash(machine) == report.machine_hash else None
 
 
-def _computed(
-    source: RecordingSource, keys: MachineKeys, machine: Machine, bundle: Bundle | None, from_ns: int, to_ns: int
-) -> Trend:
+def _computed(source: RecordingSource, keys: MachineKeys, installed: Installed, from_ns: int, to_ns: int) -> Trend:
     """Reports of an offline replay, the same to the last bit as those of ``rotorwatch replay``."""
+    machine = installed.machine
     reports: list[Report] = []
     alarms: list[AlarmEventData] = []
 
@@ -220,7 +218,7 @@ def _computed(
         else:
             alarms.append(AlarmCloudEvent.model_validate(message["message"]).data)
 
-    run = OfflineReplay(source, keys, machine, bundle, take, from_ns=from_ns, to_ns=to_ns)
+    run = OfflineReplay(source, keys, installed, take, from_ns=from_ns, to_ns=to_ns)
     summary = run.run()
     if summary.blocks == 0:
         raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")

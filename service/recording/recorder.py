@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from models.errors import RecordingError
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter, writing
 from service.config import RecordingSettings
 from service.logs import Limiter, logger
@@ -92,7 +92,7 @@ class MachineRecorder:
 
     Parameters
     ----------
-    machine : Machine
+    machine : MachineFile
         Whose messages they are.
     settings : RecordingSettings
         With a directory.
@@ -109,7 +109,7 @@ class MachineRecorder:
 
     def __init__(
         self,
-        machine: Machine,
+        machine: MachineFile,
         settings: RecordingSettings,
         clock: Callable[[], float] = time.monotonic,
         now_ns: Callable[[], int] = time.time_ns,

@@ -3,16 +3,16 @@
 from importlib.resources import files
 from pathlib import Path
 
-from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.commissioning.installed import Installed, install
 from models.errors import MachineFileError
-from models.machine import Machine, load_machine
+from models.machine import load_machine_file
 from models.signals.keys import MachineKeys
 
 __all__ = ["choose_machine", "is_shipped_bundle", "is_shipped_machine"]
 
 
-def choose_machine(keys: MachineKeys, wanted: str | None) -> tuple[Machine, Bundle | None]:
-    """Load the machine file and networks for a recorded machine.
+def choose_machine(keys: MachineKeys, wanted: str | None) -> Installed:
+    """Load the machine file, and what was trained or commissioned, for a recorded machine.
 
     Parameters
     ----------
@@ -27,16 +27,15 @@ def choose_machine(keys: MachineKeys, wanted: str | None) -> tuple[Machine, Bund
     MachineFileError
         If the file cannot be used, or none was named and no shipped machine fits.
     BundleError
-        If the networks cannot be used.
+        If the bundle cannot be used, or the machine needs one that was commissioned.
     """
     if wanted is not None:
         file, _, name = wanted.partition("@")
-        machine = load_machine(file)
-        return machine, load_bundle(name, machine) if name else None
+        return install(load_machine_file(file), name or None)
     for path in _shipped_files():
-        machine = load_machine(path)
+        machine = load_machine_file(path)
         if (machine.site, machine.name) == (keys.site, keys.machine):
-            return machine, load_bundle(path.stem, machine) if is_shipped_bundle(path.stem) else None
+            return install(machine, path.stem if is_shipped_bundle(path.stem) else None)
     shipped = ", ".join(path.stem for path in _shipped_files())
     raise MachineFileError(
         f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({shipped}) has this site "

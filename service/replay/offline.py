@@ -8,9 +8,8 @@ import json
 import time
 from collections.abc import Callable
 
-from models.diagnosis.networks.bundle import Bundle
+from models.commissioning.installed import Installed
 from models.errors import WireError
-from models.machine import Machine
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from models.signals.wire import decode_block
@@ -47,9 +46,8 @@ class OfflineReplay:
     source : RecordingSource
     keys : MachineKeys
         The recorded machine whose stream is replayed.
-    machine : Machine
-        The machine file to evaluate it with.
-    bundle : Bundle or None
+    installed : Installed
+        The machine file to evaluate it with, and what was trained and commissioned for it.
     write : callable
         Takes each result line, without its line end.
     from_ns, to_ns : int, optional
@@ -60,8 +58,7 @@ class OfflineReplay:
         self,
         source: RecordingSource,
         keys: MachineKeys,
-        machine: Machine,
-        bundle: Bundle | None,
+        installed: Installed,
         write: Callable[[str], None],
         *,
         from_ns: int | None = None,
@@ -69,15 +66,15 @@ class OfflineReplay:
     ) -> None:
         self._source = source
         self._keys = keys
-        self._machine = machine
+        self._machine = machine = installed.machine
         self._write = write
         self._from_ns = source.start_ns if from_ns is None else from_ns
         self._to_ns = source.end_ns + 1 if to_ns is None else to_ns
-        self._monitor = MachineMonitor(machine, bundle)
+        self._monitor = MachineMonitor(installed)
         self.identity = Identity(
             site=machine.site,
             machine=machine.name,
-            bundle=None if bundle is None else bundle.identity,
+            bundle=installed.identity,
             machine_hash=conversion.machine_hash(machine),
         )
         self._digest = hashlib.sha256()

@@ -55,6 +55,22 @@ def fixed_length_s(name: str, change: float) -> float:
     return length_s
 
 
+def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
+    """A commissioning that was one of its standard errors off: 64 windows must not make a finding of it."""
+    shared = np.zeros((6, 6))
+    shared[0, 0] = 0.02**2
+    offset = true(k_by=0.02)
+    named = {}
+    for common in (None, shared):
+        hops, test = gaussian(SEED + 40), SequentialTest(SETTINGS)
+        for _ in range(12 * 64 + 12):
+            looks = {n: replace(look, common=common) for n, look in hops.looks(offset).items()}
+            if looks:
+                verdict = test.update(looks)
+        named[common is None] = [finding.name for finding in verdict.findings]
+    assert named == {True: ["k_by"], False: []}
+
+
 @pytest.mark.slow
 def test_false_alarms_come_at_the_declared_rate() -> None:
     """27.8 hours of a healthy machine at 2000 declared false alarms per month: 77 are expected."""

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from models.ingest import Gate
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
-from service.ingest import Gate
 from service.interchange.importing import Imported, import_file
 from service.interchange.mapping import load_mapping
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import zenoh
 
-from models.machine import Machine, load_machine
+from models.machine import MachineFile, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
@@ -134,7 +134,7 @@ def scenario_blocks(duration_s: float, *faults: Event, start_ns: int = START_NS,
     return [block for block, _ in blocks(scenario, machine, start_ns=start_ns, run=run)]
 
 
-def send(connect: str, stream: list[SampleBlock], machine: Machine = LAB) -> None:
+def send(connect: str, stream: list[SampleBlock], machine: MachineFile = LAB) -> None:
     """Publish blocks as the simulator does, as fast as the service takes them."""
     plan = PublishSettings(
         link=LinkSettings(connect=(connect,)), pace=None, wait_for_subscriber_s=20.0, linger_s=0.0, drain_s=20.0
@@ -148,7 +148,7 @@ class Feed:
     """Good blocks of the shipped machine, one after the other, put on the key without the simulator."""
 
     session: zenoh.Session
-    machine: Machine = LAB
+    machine: MachineFile = LAB
     run: int = 1
     sequence: int = 0
     start_ns: int = START_NS

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.machine import AlarmSettings
-from service.alarms import AlarmBook, AlarmEvent, AlarmState, Severity
+from service.alarms import MODEL, AlarmBook, AlarmEvent, AlarmState, Severity
 
 CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6}
 MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}
@@ -57,13 +57,13 @@ def test_a_change_must_have_been_found() -> None:
 
 def test_outside_the_model_is_an_alarm_of_its_own() -> None:
     book = AlarmBook(SETTINGS)
-    told = [event for n in range(4) for event in book.update_model(True, n * 5_000_000_000)]
+    told = [event for n in range(4) for event in book.update_state(MODEL, True, n * 5_000_000_000)]
     assert [(event.kind, event.alarm.parameter) for event in told] == [("raised", "model")]
     assert told[0].text.startswith("ALERT: outside the model: something has changed that no parameter describes")
     assert not book.update("e", 0.3, 0.01, 0, named=True, low_confidence=True)
     (event,) = book.update("e", 0.3, 0.01, 10**10, named=True, low_confidence=True)
     assert event.text.endswith("changed by +30.0% ± 2.0% (low confidence: outside the model)")
-    told = [event for n in range(4, 9) for event in book.update_model(False, n * 5_000_000_000)]
+    told = [event for n in range(4, 9) for event in book.update_state(MODEL, False, n * 5_000_000_000)]
     assert [event.text for event in told] == ["cleared: the model describes the machine again"]
 
 

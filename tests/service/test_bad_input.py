@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from models.ingest import Reason
 from models.signals.block import SampleBlock
 from models.signals.wire import BLOCK_ENCODING, encode_block
-from service.ingest import Reason
 from service.runtime import Runtime
 from service.worker import MachineWorker
 from tests.service.live import LAB, Feed, endpoint, open_session, service, until

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from models.ingest import Gate, Reason, Verdict
 from models.machine import load_machine
 from models.signals.block import SampleBlock
-from service.ingest import Gate, Reason, Verdict
 
 MACHINE = load_machine("lab")
 START_NS = 1_800_000_000_000_000_000

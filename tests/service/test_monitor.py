@@ -6,12 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.bundle import load_bundle
+from models.commissioning.installed import install
+from models.ingest import Reason
 from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from service.alarms import AlarmEvent
-from service.ingest import Reason
 from service.monitor import HealthState, MachineMonitor, WindowReport
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
@@ -28,7 +28,7 @@ def scenario(name: str, duration_s: float, seed: int = SEED) -> Scenario:
 
 def monitor() -> MachineMonitor:
     _, machine = load_scenario("healthy")
-    return MachineMonitor(machine, load_bundle("lab", machine))
+    return MachineMonitor(install(machine, "lab"))
 
 
 def feed(target: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[WindowReport], list[AlarmEvent]]:
@@ -114,7 +114,7 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     loaded, machine = load_scenario("healthy")
     fields = loaded.model_dump() | {"duration_s": 75.0, "seed": SEED, "events": [{"at_s": 0, "speed_rpm": 2000}]}
     stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
-    windows, events = feed(MachineMonitor(machine, None), stream_)
+    windows, events = feed(MachineMonitor(install(machine, None)), stream_)
     assert windows[-1].state is HealthState.NOT_EVALUABLE
     assert "speed is 2000 rpm, evaluated are 1320 rpm ± 20%" in windows[-1].reason
     assert windows[-1].parameters == ()
@@ -126,7 +126,7 @@ def test_an_unsteady_speed_is_not_evaluable() -> None:
     ramp = {"at_s": 20, "ramp_s": 30, "speed_rpm": 1452}
     fields = loaded.model_dump() | {"duration_s": 140.0, "seed": SEED, "events": [ramp]}
     stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
-    windows, events = feed(MachineMonitor(machine, None), stream_)
+    windows, events = feed(MachineMonitor(install(machine, None)), stream_)
     states = [window.state for window in windows]
     assert states[11] is HealthState.NOT_EVALUABLE
     assert "speed went from 1320 to 1452 rpm within the window" in windows[11].reason
@@ -170,7 +170,7 @@ def test_parameters_that_the_sensors_cannot_see_are_not_read() -> None:
     horizontal = [column for column, sensor in enumerate(machine.sensors) if sensor.direction != "z"]
     part = machine.model_copy(update={"sensors": tuple(machine.sensors[column] for column in horizontal)})
     blocks_ = [replace(block, samples=block.samples[:, horizontal]) for block in stream("healthy", 63.0)]
-    window = feed(MachineMonitor(part, None), blocks_)[0][-1]
+    window = feed(MachineMonitor(install(part, None)), blocks_)[0][-1]
     readings = {reading.name: reading for reading in window.parameters}
     assert readings["k_bz"].change is None
     assert readings["k_bz"].reason == "no displacement or velocity measured in z"
@@ -202,7 +202,7 @@ def test_a_report_says_what_would_have_been_noticed_and_who_agrees() -> None:
 
 def test_without_a_bundle_the_equations_say_so() -> None:
     _, machine = load_scenario("healthy")
-    window = feed(MachineMonitor(machine, None), stream("healthy", 63.0))[0][-1]
+    window = feed(MachineMonitor(install(machine, None)), stream("healthy", 63.0))[0][-1]
     assert {equation.reason for equation in window.equations} == {"no trained network"}
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.commissioning.installed import install
 from models.diagnosis.networks.bundle import load_bundle
 from models.errors import MachineFileError, RotorwatchError
 from models.machine import Machine
@@ -67,7 +68,7 @@ def lines(faulty: Path) -> list[dict[str, object]]:
     """What an offline replay of it says, with the networks."""
     found: list[dict[str, object]] = []
     source = RecordingSource([faulty])
-    OfflineReplay(source, LAB.keys, LAB, load_bundle("lab", LAB), lambda line: found.append(json.loads(line))).run()
+    OfflineReplay(source, LAB.keys, install(LAB, "lab"), lambda line: found.append(json.loads(line))).run()
     return found
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from models.diagnosis.networks.bundle import load_bundle
+from models.commissioning.installed import install
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import read_recording
@@ -38,7 +38,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def offline(*files: Path) -> tuple[OfflineSummary, list[str]]:
     lines: list[str] = []
     source = RecordingSource(files)
-    run = OfflineReplay(source, source.machine(), LAB, load_bundle("lab", LAB), lines.append)
+    run = OfflineReplay(source, source.machine(), install(LAB, "lab"), lines.append)
     return run.run(), lines
 
 
@@ -72,7 +72,7 @@ def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> I
 
 
 def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSummary) -> None:
-    monitor = MachineMonitor(LAB, load_bundle("lab", LAB))
+    monitor = MachineMonitor(install(LAB, "lab"))
     reports = [
         monitor.step_payload(message.payload, message.attachment, message.encoding)
         for message in read_recording(faulty, keys={LAB.keys.stream})

@@ -9,7 +9,7 @@ import httpx
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.bundle import load_bundle
+from models.commissioning.installed import install
 from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.link import LinkSettings
@@ -40,7 +40,7 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
     file = machine_file(tmp_path, SHORT_SILENCE)
     machine = load_machine(file)
     stream = scenario_blocks(85.0, parse_fault("c_bz=0.5@0"))
-    offline = MachineMonitor(machine, load_bundle("lab", machine))
+    offline = MachineMonitor(install(machine, "lab"))
     reports = [offline.step(block) for block in stream]
     windows = tuple(window for report in reports for window in report.windows)
     events = tuple(event for report in reports for event in report.events)

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 from models.errors import MachineFileError
 from models.machine import load_machine
 from models.physics.matrices import STATES
-from models.signals.channels import UNIT_TO_SI, Channel, ChannelDescriptor, Quantity, state_name
+from models.signals.channels import ACCELERATIONS, UNIT_TO_SI, Channel, ChannelDescriptor, Quantity, state_name
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings
 
@@ -38,7 +38,7 @@ def test_every_state_and_the_angle_can_be_measured() -> None:
                     measurable.add(state_name(Channel.model_validate(fields)))
                 except ValidationError as error:
                     refusals.append(str(error))
-    assert measurable == {*STATES, "theta"}
+    assert measurable == {*STATES, *ACCELERATIONS, "theta"}
     assert len(measurable) + len(refusals) == len(Quantity) * 9
     assert all(" at location '" in refusal for refusal in refusals)
 
@@ -49,6 +49,7 @@ def test_every_state_and_the_angle_can_be_measured() -> None:
         ("displacement", "um", 1e-6),
         ("displacement", "mil", 25.4e-6),  # a thousandth of an inch of 25.4 mm
         ("velocity", "mm/s", 1e-3),
+        ("acceleration", "g", 9.80665),  # standard gravity, ISO 80000-3
         ("velocity", "in/s", 0.0254),
     ],
 )

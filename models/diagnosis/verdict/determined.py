@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 
 from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.verdict.stretch import slope, to_scale
 from models.diagnosis.window import WindowStatistics
 from models.physics.parameters import PARAMETERS
+from models.signals.block import FloatArray
 
-__all__ = ["determined"]
+__all__ = ["determined", "with_shared_error"]
 
 _VAGUE = 0.2
 """A larger standard error of a full window is no longer one: the reading says nothing."""
@@ -33,7 +35,31 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
     stated = tuple(_stated(name, diagnosis.by, found.get(name), window.states, vague) for name in PARAMETERS)
     before = [reading.name for reading in diagnosis.evaluable]
     kept = [before.index(reading.name) for reading in stated if reading.change is not None]
-    return replace(diagnosis, parameters=stated, covariance=diagnosis.full_covariance[np.ix_(kept, kept)])
+    part = np.ix_(kept, kept)
+    shared = None if diagnosis.common is None else diagnosis.common[part]
+    return replace(diagnosis, parameters=stated, covariance=diagnosis.full_covariance[part], common=shared)
+
+
+def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis:
+    """Return the diagnosis with an error added that all windows share.
+
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+    covariance : ndarray, shape (6, 6)
+        Of the values that changes are relative to, in the scale of the errors, in the order of `PARAMETERS`.
+    """
+    readings = diagnosis.evaluable
+    at = [PARAMETERS.index(reading.name) for reading in readings]
+    slopes = np.array([slope(r.name, to_scale(r.name, r.change or 0.0)) for r in readings])
+    shared = covariance[np.ix_(at, at)] * np.outer(slopes, slopes)
+    total = diagnosis.full_covariance + shared
+    errors = dict(zip((reading.name for reading in readings), np.sqrt(np.diag(total)).tolist(), strict=True))
+    parameters = tuple(
+        replace(reading, standard_error=errors[reading.name]) if reading.name in errors else reading
+        for reading in diagnosis.parameters
+    )
+    return replace(diagnosis, parameters=parameters, covariance=total, common=shared)
 
 
 def _stated(

@@ -85,7 +85,7 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
     rate : float
         Probability that a healthy window is called changed; the test of the model has the same rate to itself.
     """
-    stretch = stretch_of(diagnosis, 0, 0)
+    stretch = stretch_of(diagnosis, 0, 0).complete()
     return isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
 
 

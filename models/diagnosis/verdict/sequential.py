@@ -24,7 +24,7 @@ from models.diagnosis.readings import ParameterReading
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
 from models.diagnosis.verdict.isolation import Isolation, isolate, restricted
 from models.diagnosis.verdict.stretch import Stretch, added, from_scale, slope
-from models.machine import Machine
+from models.machine import MachineFile
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
@@ -66,12 +66,23 @@ class SequentialSettings:
     systematic: float = 0.002
 
     @classmethod
-    def for_machine(cls, machine: Machine, per_month: float | None = None) -> "SequentialSettings":
-        """Settings with which a machine is monitored, at its declared rate or at another one."""
+    def for_machine(
+        cls, machine: MachineFile, per_month: float | None = None, *, short: bool = True
+    ) -> "SequentialSettings":
+        """Settings with which a machine is monitored, at its declared rate or at another one.
+
+        Parameters
+        ----------
+        machine : MachineFile
+        per_month : float, optional
+            Another rate.
+        short : bool
+            Whether stretches shorter than the window can be evaluated.
+        """
         return cls(
             hop_s=machine.window.hop_s,
             window_hops=machine.window.hops,
-            short_hops=tuple(hops for hops in _SHORT_HOPS if hops < machine.window.hops),
+            short_hops=tuple(hops for hops in _SHORT_HOPS if short and hops < machine.window.hops),
             false_alarms_per_month=machine.alarms.false_alarms_per_month if per_month is None else per_month,
         )
 
@@ -173,6 +184,9 @@ class SequentialState:
             found[f"information_{windows}"] = np.array([one.information for one in ring])
             misfits = [np.nan if one.misfit_z is None else one.misfit_z for one in ring]
             found[f"misfit_z_{windows}"] = np.array(misfits)
+            shared = [one.common for one in ring if one.common is not None]
+            if shared:
+                found[f"common_{windows}"] = np.array(shared)
         return found
 
     @classmethod
@@ -190,16 +204,18 @@ class SequentialState:
         for name in arrays:
             if name.startswith("times_"):
                 windows = int(name.removeprefix("times_"))
+                times = arrays[name].reshape(-1, 2).tolist()
                 columns = zip(
-                    arrays[name].reshape(-1, 2).tolist(),
+                    times,
                     arrays[f"vector_{windows}"],
                     arrays[f"information_{windows}"],
                     arrays[f"misfit_z_{windows}"].tolist(),
+                    arrays.get(f"common_{windows}", [None] * len(times)),
                     strict=True,
                 )
                 state.sums[windows] = [
-                    Stretch(start, end, vector, information, None if np.isnan(misfit) else misfit)
-                    for (start, end), vector, information, misfit in columns
+                    Stretch(start, end, vector, information, None if np.isnan(misfit) else misfit, common)
+                    for (start, end), vector, information, misfit, common in columns
                 ]
         return state
 
@@ -267,12 +283,11 @@ class SequentialTest:
             If the full window is not among them.
         """
         window_hops = self.settings.window_hops
-        window = looks[window_hops]
-        every = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}
-        every[window_hops] = window
-        for windows, total in self._accumulate(window).items():
-            every[windows * window_hops] = total if windows == 1 else total.blurred(self.settings.systematic)
-        self._watch_for_contradiction(every)
+        own = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}
+        for windows, total in self._accumulate(looks[window_hops]).items():
+            own[windows * window_hops] = total if windows == 1 else total.blurred(self.settings.systematic)
+        self._watch_for_contradiction(own)  # an error that all stretches share makes none contradict another
+        every = {hops: look.complete() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}

@@ -3,11 +3,14 @@
 Changes are held in the scale in which their errors are normal and do not depend on the change: the logarithm of the
 ratio to nominal for stiffness and damping, the relative change itself for the eccentricity, which enters linearly. They
 are held as information: matrix J (the inverse covariance) and vector J x. Independent stretches add both.
+
+An error that all stretches share, as that of a commissioning, does not shrink when they are added. It is carried beside
+the information and comes in when a stretch is looked at (`Stretch.complete`).
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +23,8 @@ __all__ = ["Stretch", "added", "from_scale", "slope", "stretch_of", "to_scale"]
 _LINEAR = frozenset({"e"})
 _MOST_LOSS = -0.95
 """A parameter that reads as lost altogether has no logarithm."""
+_LEAST_OWN = 1e-4
+"""Least share of the total variance that is a window's own: its covariance and the shared one are both estimates."""
 
 
 def to_scale(name: str, change: float) -> float:
@@ -51,6 +56,8 @@ class Stretch:
         J; zero row and column for a parameter that was not evaluable.
     misfit_z : float or None
         Over-identification, standard normal where the model holds.
+    common : ndarray, shape (6, 6), or None
+        Covariance shared with every other stretch, not contained in `information`.
     """
 
     start_ns: int
@@ -58,6 +65,7 @@ class Stretch:
     vector: FloatArray
     information: FloatArray
     misfit_z: float | None = None
+    common: FloatArray | None = None
 
     @property
     def known(self) -> tuple[int, ...]:
@@ -89,16 +97,21 @@ class Stretch:
         standard_error : float
             Of every parameter, in the scale of the errors.
         """
+        return self._widened(standard_error**2 * np.eye(len(self.known)), self.common)
+
+    def complete(self) -> "Stretch":
+        """Return the same with the shared error in its information: what may be said of this stretch alone."""
+        if self.common is None:
+            return self
         known = list(self.known)
+        return self._widened(self.common[np.ix_(known, known)], None)
+
+    def _widened(self, added_covariance: FloatArray, common: FloatArray | None) -> "Stretch":
         values, covariance = self.estimate()
-        return _stretch(
-            self.start_ns,
-            self.end_ns,
-            known,
-            values,
-            covariance + standard_error**2 * np.eye(len(known)),
-            self.misfit_z,
+        wider = _stretch(
+            self.start_ns, self.end_ns, list(self.known), values, covariance + added_covariance, self.misfit_z
         )
+        return replace(wider, common=common)
 
 
 def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
@@ -115,8 +128,22 @@ def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
     known = [PARAMETERS.index(reading.name) for reading in readings]
     values = np.array([to_scale(reading.name, reading.change or 0.0) for reading in readings], dtype=np.float64)
     slopes = np.array([slope(reading.name, value) for reading, value in zip(readings, values, strict=True)])
-    covariance = diagnosis.full_covariance / np.outer(slopes, slopes)
-    return _stretch(start_ns, end_ns, known, values, covariance, diagnosis.misfit_z)
+    scale = np.outer(slopes, slopes)
+    covariance = diagnosis.full_covariance / scale
+    if diagnosis.common is None:
+        return _stretch(start_ns, end_ns, known, values, covariance, diagnosis.misfit_z)
+    shared = diagnosis.common / scale
+    own = _stretch(start_ns, end_ns, known, values, _at_least(covariance - shared, covariance), diagnosis.misfit_z)
+    common = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+    common[np.ix_(known, known)] = shared
+    return replace(own, common=common)
+
+
+def _at_least(own: FloatArray, total: FloatArray) -> FloatArray:
+    """A window's own covariance, never less than a little of the total in any direction."""
+    scale = 1 / np.sqrt(np.diag(total))
+    values, vectors = np.linalg.eigh(own * np.outer(scale, scale))
+    return np.asarray((vectors * np.maximum(values, _LEAST_OWN)) @ vectors.T / np.outer(scale, scale), dtype=np.float64)
 
 
 def _stretch(
@@ -140,10 +167,12 @@ def _stretch(
 def added(stretches: Sequence[Stretch]) -> Stretch:
     """Sum of stretches that do not overlap: inverse-variance mean; misfits add as independent normal values."""
     misfits = [one.misfit_z for one in stretches if one.misfit_z is not None]
+    shared = [one.common for one in stretches if one.common is not None]
     return Stretch(
         min(one.start_ns for one in stretches),
         max(one.end_ns for one in stretches),
         np.sum([one.vector for one in stretches], axis=0),
         np.sum([one.information for one in stretches], axis=0),
         sum(misfits) / math.sqrt(len(misfits)) if misfits else None,
+        np.mean(shared, axis=0) if shared else None,
     )

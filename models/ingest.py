@@ -15,7 +15,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from models.machine import Machine
+from models.machine import MachineFile
 from models.signals.block import SampleBlock
 
 __all__ = ["Gate", "Reason", "Verdict"]
@@ -85,11 +85,11 @@ class Gate:
 
     Parameters
     ----------
-    machine : Machine
+    machine : MachineFile
         What the stream must look like.
     """
 
-    def __init__(self, machine: Machine) -> None:
+    def __init__(self, machine: MachineFile) -> None:
         self._name = f"{machine.site}/{machine.name}"
         self._settings = machine.ingest
         self._rate_hz = machine.rate_hz

@@ -1,0 +1,205 @@
+"""Whether healthy recordings are fit to commission a machine from, and what to record instead where they are not."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from models.commissioning.healthy import HealthyRecording
+from models.commissioning.lines import foreign_lines
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.sensors.finding import SensorFinding
+from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.window import WindowStatistics
+from models.machine import MachineFile
+from models.physics.parameters import PARAMETER_TEXT
+
+__all__ = ["Check", "check_agreement", "check_data", "check_halves", "check_lines", "check_sensors_of", "check_steady"]
+
+_FEWEST_HOPS = 8
+_FEW_WINDOWS = 6
+_MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
+_STEADY_SPEED = 0.05
+_STEADY_LEVEL = 2.0
+"""Ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute."""
+_RATE = 1e-3
+"""Probability that a healthy machine fails a comparison of its own windows."""
+_LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5
+"""Share of a foreign line in the power of a channel's random part."""
+
+
+class Check(BaseModel):
+    """One question about the recordings, and its answer."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(description="what was asked")
+    verdict: Literal["passed", "limited", "refused"]
+    text: str = Field(description="the answer in a sentence, with its figures")
+    advice: str = Field(default="", description="what to record or change instead; empty where nothing is needed")
+
+
+def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
+    """Whether there is enough data, and how much was lost."""
+    name = "enough data"
+    hops = sum(len(one.hops) for one in recordings)
+    used_s = sum(one.duration_s for one in recordings)
+    refused: Counter[str] = Counter()
+    for one in recordings:
+        refused.update(dict(one.refused))
+    gaps, missing_s = sum(one.gaps for one in recordings), sum(one.missing_s for one in recordings)
+    window = machine.window
+    lost = f"{gaps} gaps of {missing_s:.3g} s in all" if gaps else "no gaps"
+    if refused:
+        last = next(one.last_refusal for one in reversed(recordings) if one.last_refusal)
+        lost += f", {sum(refused.values())} blocks refused (the latest: {last})"
+    found = f"{used_s:.4g} s of usable data in {len(recordings)} recordings; {lost}"
+    wanted_s = _FEW_WINDOWS * window.length_s
+    advice = f"record at least {wanted_s:g} s without interruption, in one or several files"
+    if hops < _FEWEST_HOPS:
+        return Check(name=name, verdict="refused", text=f"too short: {found}", advice=advice)
+    share = missing_s / (used_s + missing_s)
+    if share > _TOO_MUCH_REFUSED:
+        advice = f"find out why {share:.0%} of the data are missing, and {advice}"
+        return Check(name=name, verdict="refused", text=f"too many gaps: {found}", advice=advice)
+    if used_s < wanted_s or share > _MUCH_REFUSED or refused:
+        return Check(name=name, verdict="limited", text=found, advice=advice)
+    return Check(name=name, verdict="passed", text=found)
+
+
+def check_sensors_of(findings: Mapping[str, Sequence[SensorFinding]]) -> Check:
+    """Whether a sensor was at fault while the recordings were made.
+
+    Parameters
+    ----------
+    findings : mapping of str to sequence of SensorFinding
+        By recording.
+    """
+    name = "sensors"
+    faults = [f"{recording}: {finding.text}" for recording, found in findings.items() for finding in found]
+    if not faults:
+        return Check(name=name, verdict="passed", text="no sensor stuck, clipped, swapped, delayed or in contradiction")
+    return Check(
+        name=name,
+        verdict="refused",
+        text="; ".join(dict.fromkeys(faults)),
+        advice="repair, re-range or rewire what is named, and record again: a fault must not become the healthy state",
+    )
+
+
+def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
+    """Whether speed and level held still within each recording."""
+    name = "stationary"
+    moved = []
+    for recording in recordings:
+        for window in windows[recording.name]:
+            slowest, fastest = window.speed_range
+            if np.isfinite(slowest) and fastest - slowest > _STEADY_SPEED * window.speed_rad_s:
+                rpm = 30 / np.pi
+                moved.append(
+                    f"{recording.name}: the speed goes from {slowest * rpm:.0f} to {fastest * rpm:.0f} rpm within "
+                    f"{window.duration_s:.3g} s"
+                )
+                break
+        powers = np.array([np.diag(w.correlation[0]) for w in windows[recording.name]])
+        half = len(powers) // 2
+        if half:
+            ratio = np.sqrt(powers[half:].mean(axis=0) / np.maximum(powers[:half].mean(axis=0), np.finfo(float).tiny))
+            worst = int(np.argmax(np.abs(np.log(np.maximum(ratio, np.finfo(float).tiny)))))
+            if not 1 / _STEADY_LEVEL <= ratio[worst] <= _STEADY_LEVEL:
+                state = windows[recording.name][0].states[worst]
+                moved.append(
+                    f"{recording.name}: the random vibration of {state} in the second half is {ratio[worst]:.2g} times "
+                    "that of the first"
+                )
+    if not moved:
+        return Check(name=name, verdict="passed", text="speed and level hold still within every recording")
+    return Check(
+        name=name,
+        verdict="refused",
+        text="; ".join(moved),
+        advice="record in steady operation; one file for each speed or load, each of at least two windows",
+    )
+
+
+def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
+    """Whether something else than noise and the rotation drives the machine."""
+    name = "second excitation"
+    found = [(one.name, line) for one in recordings for line in foreign_lines(one)]
+    loud = [(recording, line) for recording, line in found if line.share > _LOUD_LINE]
+    if not loud:
+        return Check(name=name, verdict="passed", text="no line but those of the rotation stands out")
+    text = "; ".join(
+        f"{recording}: a steady line at {line.frequency_hz:.2f} Hz makes {line.share:.0%} of the random vibration of "
+        f"{line.state}"
+        for recording, line in loud
+    )
+    advice = (
+        "a neighbouring machine, a gear or a supply line drives the rotor besides: the relations are for noise and "
+        "unbalance; record while the other machine stands, or let the line fall outside the band"
+    )
+    dominant = any(line.share > _DOMINANT_LINE for _, line in loud)
+    return Check(name=name, verdict="refused" if dominant else "limited", text=text, advice=advice)
+
+
+def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:
+    """Whether either half of the data, taken for healthy, finds the other half healthy.
+
+    Parameters
+    ----------
+    first_on_second : sequence of Diagnosis
+        Windows read against what was learned on the other half.
+    """
+    return _compared("halves agree", first_on_second, "between the halves of the healthy data")
+
+
+def check_agreement(diagnoses: Sequence[Diagnosis], what: str) -> Check:
+    """Whether healthy windows agree with what they are compared with.
+
+    Parameters
+    ----------
+    diagnoses : sequence of Diagnosis
+    what : str
+        In words: "the parameters in the machine file".
+    """
+    return _compared(f"agrees with {what}", diagnoses, f"between the healthy data and {what}")
+
+
+def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str) -> Check:
+    readable = [each for each in diagnoses if each.evaluable]
+    if not readable:
+        reasons = dict.fromkeys(reading.reason for each in diagnoses for reading in each.parameters if reading.reason)
+        text = f"nothing could be compared: {'; '.join(reasons) or 'there is only one window'}"
+        return Check(name=name, verdict="limited", text=text, advice="record at least two full windows")
+    rate = _RATE / len(readable)
+    isolations = [isolate_window(each, rate) for each in readable]
+    named: Counter[str] = Counter(changed for one in isolations for changed in one.changed)
+    outside = sum(one.outside for one in isolations)
+    if named:
+        worst = named.most_common(1)[0][0]
+        reading = max(
+            (r for each in readable for r in each.evaluable if r.name == worst), key=lambda r: abs(r.z or 0.0)
+        )
+        text = (
+            f"{PARAMETER_TEXT[worst]} differs {between}: {reading.change or 0.0:+.1%}, "
+            f"{abs(reading.z or 0.0):.1f} standard errors, in {named[worst]} of {len(readable)} windows"
+        )
+        return Check(
+            name=name,
+            verdict="refused",
+            text=text,
+            advice="the machine, its operation or a sensor was not the same throughout: record again in one condition, "
+            "one file for each speed or load",
+        )
+    if 2 * outside > len(readable):
+        return Check(
+            name=name,
+            verdict="limited",
+            text=f"{outside} of {len(readable)} windows lie further apart than chance explains, {between}",
+            advice="give fewer parameters in [rotor], so that more is learned from the recordings",
+        )
+    worst_z = max(abs(r.z or 0.0) for each in readable for r in each.evaluable)
+    text = f"no difference {between}: at most {worst_z:.1f} standard errors in {len(readable)} windows"
+    return Check(name=name, verdict="passed", text=text)

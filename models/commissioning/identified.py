@@ -1,0 +1,220 @@
+"""Partial knowledge: stiffness, damping and unbalance of a rotor with known masses and shaft, from healthy windows.
+
+The likelihood reads changes relative to a nominal rotor. Started from a guess and moved to what it reads, again and
+again, it identifies the rotor itself; what is left uncertain is shared by every later reading relative to it.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.baseline.learned import learn_baseline
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.verdict.stretch import added, stretch_of
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError, MachineFileError
+from models.machine import ConditionRange, Machine, MachineFile, Operation
+from models.physics.matrices import M_matrix, Q_matrix
+from models.physics.parameters import PARAMETERS, RotorParameters, changed
+from models.signals.block import FloatArray
+
+__all__ = ["Identified", "identify"]
+
+_ROUNDS = 8
+_SETTLED = 0.02
+"""Largest relative move of a parameter in the last round."""
+_START_DAMPING = 0.05
+_LEAST_TOLERANCE = 0.05
+_CUTOFF_HZ = (20.0, 300.0)
+_NO_STIFFNESS = 1e5
+"""N/m, in a plane without any sensor: nothing will be read of it."""
+_SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """A rotor identified on healthy windows.
+
+    Attributes
+    ----------
+    machine : Machine
+        The machine file with every parameter filled in.
+    names : tuple of str
+        Parameters that were identified.
+    covariance : ndarray, shape (6, 6)
+        Of the identified values, in the scale of the errors (`models.diagnosis.verdict.stretch`), in the order of
+        `PARAMETERS`; zero where nothing was identified.
+    diagnoses : tuple of Diagnosis
+        The healthy windows read against it, without its uncertainty.
+    """
+
+    machine: Machine
+    names: tuple[str, ...]
+    covariance: FloatArray
+    diagnoses: tuple[Diagnosis, ...]
+
+
+def identify(
+    machine: MachineFile, windows: Sequence[WindowStatistics], progress: Callable[[float], None] = lambda _: None
+) -> Identified:
+    """Identify stiffness, damping and unbalance.
+
+    Parameters
+    ----------
+    machine : MachineFile
+        With masses and shaft in its ``[rotor]``.
+    windows : sequence of WindowStatistics
+        Healthy ones that do not overlap.
+    progress : callable, optional
+        Told the fraction that is done.
+
+    Raises
+    ------
+    EstimationError
+        If no start leads to a rotor that explains the windows.
+    MachineFileError
+        If masses or shaft are missing.
+    """
+    whole = _first_guess(machine, windows)
+    for number in range(_ROUNDS):
+        diagnoses = _read(whole, windows)
+        together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
+        values, covariance = together.estimate()
+        moves = dict(zip(together.names, values.tolist(), strict=True))
+        whole = _moved(whole, moves, windows)
+        progress((number + 1) / _ROUNDS)
+        if max(abs(value) for value in moves.values()) < _SETTLED:
+            break
+    else:
+        raise EstimationError(
+            f"{machine.site}/{machine.name}: the rotor cannot be identified: after {_ROUNDS} rounds "
+            f"{max(moves, key=lambda name: abs(moves[name]))} still moves; masses or shaft of [rotor] may be wrong, or "
+            "the machine is not a bearing with an overhung disc"
+        )
+    total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
+    total[np.ix_(together.known, together.known)] = covariance
+    return Identified(whole, together.names, total, tuple(_read(whole, windows)))
+
+
+def _read(machine: Machine, windows: Sequence[WindowStatistics]) -> list[Diagnosis]:
+    found = []
+    for window in windows:
+        try:
+            # Each from a cold start: healthy windows may be of different conditions.
+            found.append(LikelihoodFit(machine).diagnose(window))
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(f"{machine.name}: {error} in a healthy window") from error
+    return found
+
+
+def _moved(machine: Machine, moves: dict[str, float], windows: Sequence[WindowStatistics]) -> Machine:
+    """The machine with its parameters where they were read; moves are in the scale of the errors."""
+    steps = {name: math.expm1(min(1.5, max(-1.5, value))) for name, value in moves.items() if name != "e"}
+    rotor = changed(machine.rotor, steps)
+    moved = machine.model_copy(update={"rotor": rotor})
+    return _with_unbalance(moved, windows) if "e" in moves else moved
+
+
+def _with_unbalance(machine: Machine, windows: Sequence[WindowStatistics]) -> Machine:
+    """Size and phase of the unbalance: e read along two phases at right angles."""
+    parts = []
+    for turn in (0.0, math.pi / 2):
+        operation = machine.operation.model_copy(update={"unbalance_phase_rad": turn})
+        turned = machine.model_copy(update={"operation": operation})
+        readings = [reading for each in _read(turned, windows) for reading in each.evaluable if reading.name == "e"]
+        weights = np.array([1 / (reading.standard_error or np.inf) ** 2 for reading in readings])
+        values = np.array([1 + (reading.change or 0.0) for reading in readings])
+        parts.append(float(weights @ values / weights.sum()))
+    size, phase = math.hypot(*parts), math.atan2(parts[1], parts[0])
+    return machine.model_copy(
+        update={
+            "rotor": machine.rotor.model_copy(update={"e_m": machine.rotor.e_m * size}),
+            "operation": machine.operation.model_copy(update={"unbalance_phase_rad": phase}),
+        }
+    )
+
+
+def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Machine:
+    """Every parameter from somewhere: the file, the sum of forces on bearing and disc, or the lowest peak."""
+    known = machine.rotor
+    if known is None or known.m2_kg is None or known.m1_kg is None:
+        raise MachineFileError(f"{machine.site}/{machine.name}: [rotor] gives no masses")
+    speeds = [window.speed_rad_s for window in windows if np.isfinite(window.speed_rad_s)]
+    if machine.operation is None and not speeds:
+        raise MachineFileError(
+            f"{machine.site}/{machine.name}: the recordings have no phase reference: give speed_rpm in [operation]"
+        )
+    speed = machine.operation.speed_rad_s if machine.operation is not None else float(np.median(speeds))
+    spread = max((abs(one / speed - 1) for one in speeds), default=0.0)
+    operation = machine.operation or Operation(
+        speed_rpm=speed * 30 / math.pi, speed_tolerance=max(_LEAST_TOLERANCE, 1.5 * spread)
+    )
+    guesses = {"e_m": _first_e(windows), **_from_forces(known.m2_kg, windows)}
+    given: dict[str, float] = known.model_dump(exclude_none=True)
+    if "k_by_N_per_m" not in guesses or "k_bz_N_per_m" not in guesses:
+        guesses |= _from_peak({**guesses, **given}, windows)
+    fields = {**guesses, **given}
+    for axis in "yz":
+        k = fields[f"k_b{axis}_N_per_m"]
+        fields.setdefault(f"c_b{axis}_N_s_per_m", 2 * _START_DAMPING * math.sqrt(k * (known.m1_kg + known.m2_kg)))
+    described = machine.model_dump() | {
+        "rotor": RotorParameters.model_validate(fields),
+        "operation": operation,
+        "condition": machine.condition or ConditionRange(cutoff_hz=_CUTOFF_HZ),
+    }
+    return Machine.model_validate(described)
+
+
+def _first_e(windows: Sequence[WindowStatistics]) -> float:
+    """Of the order of the synchronous motion; never nothing, because e is read as a ratio."""
+    sizes = [float(np.max(np.abs(window.synchronous))) for window in windows if window.synchronous is not None]
+    return float(np.clip(np.median(sizes), 1e-7, 1e-3)) if sizes else 1e-6
+
+
+def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str, float]:
+    """Stiffness and damping from the relation between bearing and disc: its terms are c/k and m2/k."""
+    try:
+        baseline = learn_baseline(windows)
+    except EstimationError:
+        return {}
+    found = {}
+    for axis, relation in zip("yz", baseline.relations, strict=True):
+        if relation is not None and relation.coefficients[1] > 0:
+            k = m2_kg / float(relation.coefficients[1])
+            found[f"k_b{axis}_N_per_m"] = k
+            found[f"c_b{axis}_N_s_per_m"] = -float(relation.coefficients[0]) * k
+    return found
+
+
+def _from_peak(fields: dict[str, float], windows: Sequence[WindowStatistics]) -> dict[str, float]:
+    """Stiffness for which the lowest mode lies at the strongest peak of its plane."""
+    found: dict[str, float] = {}
+    window = windows[0]
+    for axis in "yz":
+        columns = [n for n, name in enumerate(window.states) if name[0] == axis]
+        if not columns:
+            found[f"k_b{axis}_N_per_m"] = fields.get("k_by_N_per_m") or found.get("k_by_N_per_m") or _NO_STIFFNESS
+            continue
+        density = window.spectrum[:, columns[0], columns[0]].real
+        peak_rad_s = 2 * np.pi * float(window.frequencies_hz[int(np.argmax(density))])
+        mass = fields["m1_kg"] + fields["m2_kg"]
+        rigid = mass * peak_rad_s**2
+        filler = {name: fields.get(name, rigid) for name in ("k_by_N_per_m", "k_bz_N_per_m")}
+        best = min(
+            _SCALES,
+            key=lambda scale: abs(_lowest(fields | filler | {f"k_b{axis}_N_per_m": rigid * scale}, axis) - peak_rad_s),
+        )
+        found[f"k_b{axis}_N_per_m"] = rigid * best
+    return found
+
+
+def _lowest(fields: dict[str, float], axis: str) -> float:
+    """Lowest natural frequency in a plane, rad/s, at rest."""
+    damping = {f"c_b{each}_N_s_per_m": fields.get(f"c_b{each}_N_s_per_m", 1.0) for each in "yz"}
+    rotor = RotorParameters.model_validate({"e_m": 0.0, **fields, **damping})
+    at = slice(0, 3) if axis == "y" else slice(3, 6)
+    squares = np.linalg.eigvals(np.linalg.solve(M_matrix(rotor)[at, at], Q_matrix(rotor)[at, at]))
+    return float(np.sqrt(np.min(squares.real)))
