@@ -149,13 +149,21 @@ def _linear(modal: _Modal, rows: tuple[int, ...], force: FloatArray, rate_hz: fl
     output = modal.shapes[list(rows)][:, kept]
     rate = modal.shapes[[n + row for row in rows]][:, kept]
     shapes = np.concatenate([output, rate, rate * modal.roots[kept]]) * np.where(modal.roots[kept].imag == 0, 1, 2)
-    states = np.empty((len(kept), len(force)), dtype=np.complex128)
-    for number, mode in enumerate(kept):
-        driving = force @ modal.drive[mode, : force.shape[1]]
-        states[number] = lfilter([after[mode], before[mode]], [1, -decay[mode]], driving)
-    values = (shapes.real @ states.real - shapes.imag @ states.imag).T
-    values[:, 2 * len(rows) :] += force @ modal.direct[list(rows), : force.shape[1]].T
-    return np.ascontiguousarray(values)
+    drive = modal.drive[kept, : force.shape[1]]
+    direct = modal.direct[list(rows), : force.shape[1]]
+    carried = np.zeros((len(kept), 1), dtype=np.complex128)
+    values = np.empty((len(force), 3 * len(rows)))
+    for begin in range(0, len(force), _PIECE):
+        piece = force[begin : begin + _PIECE]
+        states = drive @ piece.T
+        for number, mode in enumerate(kept):
+            states[number], carried[number] = lfilter(
+                [after[mode], before[mode]], [1, -decay[mode]], states[number], zi=carried[number]
+            )
+        out = values[begin : begin + _PIECE]
+        out[:] = (shapes.real @ states.real - shapes.imag @ states.imag).T
+        out[:, 2 * len(rows) :] += piece @ direct.T
+    return values
 
 
 def _springs(rotor: BeamRotor) -> tuple[tuple[int, float], ...]:

@@ -1,0 +1,145 @@
+"""Shapes of correlation functions against their healthy spread: changed or not, at a declared rate, and no names."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.stats import binomtest, norm
+
+from models.diagnosis.fallback.shape import FEWEST_WINDOWS, HealthyShape, learn_shape
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.physics.parameters import PARAMETERS
+from simulator.finite_elements.machines import rotor_named
+from simulator.finite_elements.observed import WindowSizes, plan, sampled, windows_of
+from simulator.finite_elements.scenes import COMMISSIONED, ConditionRange, SourceLayout, drawn_condition
+
+PROBES = ("y1", "z1", "y2_ddot")
+LENGTH_S = 20.0
+
+
+@cache
+def recorded(seed: int, count: int, change: float = 0.0, condition: int = 1) -> tuple[WindowStatistics, ...]:
+    """One recording; `condition` 1 is that of commissioning, others have a cutoff of their own."""
+    rotor = rotor_named("overhung")
+    limits = COMMISSIONED if condition == 1 else replace(ConditionRange(), speed_relative=(1.0, 1.0))
+    changes = {"k_by": change} if change else {}
+    rng = np.random.default_rng([71, condition])
+    drawn = drawn_condition(rotor, SourceLayout.ONE_SOURCE, limits, changes, rng)
+    samples = sampled(rotor, drawn, count * LENGTH_S + 2.6, [seed, condition], PROBES)
+    return tuple(windows_of(samples, plan(WindowSizes(length_s=LENGTH_S), PROBES)))
+
+
+def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_windows() -> None:
+    rate = 0.05
+    for healthy in (4, 12):
+        z = []
+        any_changed = 0
+        for commissioning in range(4):
+            windows = recorded(100 + commissioning, 12 + 20)
+            shape = learn_shape(windows[12 - healthy : 12])
+            for window in windows[12:]:
+                judged = shape.judge(window, rate)
+                z.append([one.z for one in judged])
+                any_changed += any(one.changed for one in judged)
+        values = np.array(z, dtype=float)
+        assert binomtest(any_changed, len(z), rate, alternative="greater").pvalue > 0.005
+        for channel in values.T:
+            assert binomtest(int(np.sum(channel > norm.isf(rate))), len(z), rate, alternative="greater").pvalue > 0.005
+            assert 0.2 < np.mean(channel > 0) < 0.8  # neither blind nor crying wolf
+
+
+def test_a_lost_fifth_of_stiffness_is_seen_and_never_named() -> None:
+    shape = learn_shape(recorded(1, 6))
+    for window in recorded(2, 8, change=-0.2):
+        judged = shape.judge(window)
+        assert judged[0].changed
+        assert judged[0].z is not None
+        assert judged[0].z > judged[0].limit
+        for one in judged:
+            said = one.sentence.replace(one.channel, "")
+            assert not any(name in said.split() for name in (*PARAMETERS, "bearing", "disc", "stiffness", "damping"))
+    assert [one.channel for one in shape.judge(recorded(1, 6)[0])] == ["y1", "z1", "y2_ddot"]
+
+
+def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
+    one_colour = learn_shape(recorded(1, 6))
+    other_colours = [recorded(7, 1, condition=number)[0] for number in range(2, 26)]
+    assert sum(any(one.changed for one in one_colour.judge(window)) for window in other_colours) > 12
+    colours = learn_shape(other_colours[:12])
+    assert all(one.beyond_sampling > 2 for one in colours.channels)
+    assert all(one.beyond_sampling < 1.6 for one in one_colour.channels)
+    flagged = sum(any(one.changed for one in colours.judge(window, 0.05)) for window in other_colours[12:])
+    assert binomtest(flagged, 12, 0.05, alternative="greater").pvalue > 0.005
+
+
+def test_fewer_healthy_windows_and_shorter_ones_ask_for_a_larger_change() -> None:
+    healthy, (changed, *_) = recorded(1, 6), recorded(2, 8, change=-0.2)
+    shape = learn_shape(healthy)
+    known = shape.judge(changed)[0].z
+    fewer = replace_windows(shape, FEWEST_WINDOWS).judge(changed)[0].z
+    shorter = shape.judge(replace(changed, duration_s=7.0))[0].z
+    assert known is not None
+    assert fewer is not None
+    assert shorter is not None
+    assert fewer < known
+    assert shorter < known
+
+
+def replace_windows(shape: HealthyShape, count: int) -> HealthyShape:
+    return HealthyShape.model_validate(shape.model_dump() | {"windows": count})
+
+
+def test_the_level_does_not_count() -> None:
+    shape, (window, *_) = learn_shape(recorded(1, 6)), recorded(3, 2)
+    louder = replace(window, correlation=9.0 * window.correlation)
+    assert [one.z for one in shape.judge(louder)] == pytest.approx([one.z for one in shape.judge(window)])
+
+
+def test_what_cannot_be_compared_says_why_and_is_neither_changed_nor_healthy() -> None:
+    shape, (window, *_) = learn_shape(recorded(1, 6)), recorded(3, 2)
+    still = replace(window, correlation=0 * window.correlation)
+    cases = {
+        "it does not move": still,
+        "not measured": replace(window, states=("psi", "z1", "y2_ddot")),
+        "commissioned at": replace(window, speed_rad_s=1.5 * window.speed_rad_s),
+        "speed nan rpm": replace(window, speed_rad_s=float("nan")),
+        "its lags differ from the 126 lags up to 0.125 s": replace(window, lags_s=window.lags_s[:50]),
+    }
+    for reason, case in cases.items():
+        judged = shape.judge(case)[0]
+        assert (judged.state, judged.z, judged.changed) == ("not evaluable", None, False)
+        assert reason in judged.sentence
+    with pytest.raises(ValueError, match="rate is 0"):
+        shape.judge(window, 0)
+
+
+def test_too_little_to_learn_from_is_refused() -> None:
+    windows = recorded(1, 6)
+    with pytest.raises(EstimationError, match=r"^3 healthy windows: 4 .* six or more are advised"):
+        learn_shape(windows[:3])
+    with pytest.raises(EstimationError, match="healthy window 4: its lags differ"):
+        learn_shape([*windows[:4], replace(windows[4], lags_s=windows[4].lags_s[:50])])
+    with pytest.raises(EstimationError, match="no channel moves"):
+        learn_shape([replace(window, correlation=0 * window.correlation) for window in windows])
+    with pytest.raises(EstimationError, match="lag zero alone"):
+        learn_shape([replace(window, lags_s=window.lags_s[:1]) for window in windows])
+
+
+def test_json_gives_back_the_same_shape_to_the_last_bit_and_refuses_anything_else() -> None:
+    shape = learn_shape(recorded(1, 6))
+    text = shape.model_dump_json()
+    again = HealthyShape.model_validate_json(text)
+    assert again == shape
+    assert again.model_dump_json() == text
+    for damaged in (
+        text.replace('"windows":6', '"windows":3'),
+        text.replace('"windows":6', '"windows":"6"'),
+        text.replace('"window_s"', '"extra":1,"window_s"'),
+        text.replace('"lags_s":[0.0,', '"lags_s":['),
+    ):
+        assert damaged != text
+        with pytest.raises(ValidationError):
+            HealthyShape.model_validate_json(damaged)
