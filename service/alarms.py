@@ -163,8 +163,8 @@ class AlarmBook:
 
     @property
     def severity(self) -> Severity | None:
-        """Highest severity of the raised alarms."""
-        raised = [alarm.severity for alarm in self._alarms.values() if alarm.raised]
+        """Highest severity of the alarms that are raised on the machine; a sensor's fault is none of the machine."""
+        raised = [alarm.severity for alarm in self._alarms.values() if alarm.raised and alarm.parameter != SENSOR]
         if not raised:
             return None
         return Severity.DANGER if Severity.DANGER in raised else Severity.ALERT

@@ -7,7 +7,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
+from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.detectable import DetectableChange, length_to_find
 from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.machine import MachineFile
@@ -29,6 +31,8 @@ from service.schemas import (
     MachineDescription,
     Quality,
     Report,
+    SensorFault,
+    Shape,
     StreamStatus,
     Verdict,
 )
@@ -83,6 +87,8 @@ def report(identity: Identity, window: WindowReport) -> Report:
         opinions=tuple(_opinion(opinion) for opinion in window.opinions),
         equations=tuple(_equation(reading) for reading in window.equations),
         detectable=tuple(_detectable(found) for found in window.detectable),
+        sensors=_sensors(window.sensors),
+        shapes=_shapes(window.shapes),
         reason=window.reason,
         bundle=identity.bundle,
         machine_hash=identity.machine_hash,
@@ -119,6 +125,8 @@ def health(
         opinions=() if window is None else window.opinions,
         equations=() if window is None else window.equations,
         detectable=() if window is None else window.detectable,
+        sensors=() if window is None else window.sensors,
+        shapes=() if window is None else window.shapes,
         alarms=_alarms(record.alarms, include_normal=False),
         quality=_quality(record.quality, queue_dropped_blocks, link_missed_blocks),
         stream=stream,
@@ -329,6 +337,22 @@ def _equation(reading: EquationReading) -> EquationJson:
         msd_healthy=_finite(reading.msd_healthy),
         parameters=_parameters(reading.parameters),
         reason=reading.reason,
+    )
+
+
+def _sensors(findings: Iterable[SensorFinding]) -> tuple[SensorFault, ...]:
+    return tuple(
+        SensorFault(
+            states=found.states, kind=found.kind, text=found.text, value=_finite(found.value), z=_finite(found.z)
+        )
+        for found in findings
+    )
+
+
+def _shapes(shapes: Iterable[ChannelShape]) -> tuple[Shape, ...]:
+    return tuple(
+        Shape(state=one.channel, verdict=one.state, z=_finite(one.z), limit=one.limit, text=one.sentence)
+        for one in shapes
     )
 
 

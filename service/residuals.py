@@ -14,6 +14,7 @@ import numpy as np
 
 from models.commissioning.commissioned import Commissioned, IdentifiedRecord
 from models.commissioning.installed import Installed
+from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.networks.amortised import NetworkDiagnostician
@@ -265,7 +266,19 @@ class BaselineEvaluator:
                 _SHAPE, tuple(ParameterReading(name, _SHAPE, reason=_TOO_FEW) for name in PARAMETERS), covariance=_EMPTY
             )
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window)
-        return Evaluation(deciding, {}, (), (), speed, shapes)
+        return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
+
+
+def _row_readings(deciding: Diagnosis, window: WindowStatistics) -> tuple[EquationReading, ...]:
+    """The learned rows, each with the readings of its own parameters or why there are none."""
+    readings = {reading.name: reading for reading in deciding.parameters}
+    found = []
+    for row, lacking in evaluable_rows(window.states, window.synchronous is not None):
+        own = tuple(readings[each.parameter] for each in row.own)
+        reasons = dict.fromkeys(reading.reason for reading in own if reading.reason)
+        reason = lacking or ("" if any(reading.change is not None for reading in own) else "; ".join(reasons))
+        found.append(EquationReading(row.number, row.title, parameters=() if reason else own, reason=reason))
+    return tuple(found)
 
 
 def _opinion(deciding: Diagnosis, other: Diagnosis) -> Opinion:

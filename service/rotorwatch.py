@@ -23,11 +23,13 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
 
 __all__ = ["app"]
 
-_BAD_STATES = ("alert", "danger", "outside-model", "no-data")
+_BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
 _STYLES = {
     "danger": "bold red",
     "alert": "bold yellow",
     "outside-model": "yellow",
+    "data-health": "magenta",
+    "unchanged": "green",
     "no-data": "magenta",
     "healthy": "green",
 }

@@ -9,10 +9,22 @@ from typing import Annotated, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.diagnosis.verdict.agreement import Verdict as AgreementVerdict
 from models.signals.channels import Channel
 from service.alarms import AlarmState, Severity
 from service.monitor import HealthState
+from service.window_schemas import (
+    JSON,
+    Agreement,
+    Detectable,
+    Equation,
+    Finding,
+    Opinion,
+    Parameter,
+    Reason,
+    SensorFault,
+    Shape,
+    Verdict,
+)
 
 __all__ = [
     "Agreement",
@@ -34,159 +46,34 @@ __all__ = [
     "Quality",
     "Readiness",
     "Report",
+    "SensorFault",
+    "Shape",
     "StreamStatus",
     "Verdict",
     "example",
 ]
 
-_JSON = ConfigDict(extra="forbid", frozen=True)
 _NS = 1767225805000000000
 
-Interval = tuple[float, float]
 _Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
 _Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
 _Bundle = Annotated[
     str | None,
-    Field(description="identity of the trained networks in use; null without", examples=["lab-3f9c1e0b7a52"]),
+    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
 ]
 _MachineHash = Annotated[
     str,
     Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
 ]
-_Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]
 _AlarmParameter = Annotated[
-    str, Field(description="k_by, c_by, k_bz, c_bz, e, EI, or model (outside the model)", examples=["k_by"])
+    str,
+    Field(description="k_by, c_by, k_bz, c_bz, e, EI, model (outside the model), sensor or shape", examples=["k_by"]),
 ]
 _LowConfidence = Annotated[
     bool,
     Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
 ]
 _State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
-
-
-class Parameter(BaseModel):
-    """One physical parameter's relative change in one window."""
-
-    model_config = _JSON
-
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
-    by: str = Field(description="who says so: likelihood, network or relation", examples=["likelihood"])
-    relative_change: float | None = Field(
-        description="relative change from nominal; null if not evaluable", examples=[-0.247]
-    )
-    standard_error: float | None = Field(description="standard error of the relative change", examples=[0.0071])
-    interval_95: Interval | None = Field(
-        description="95 % interval of the relative change", examples=[(-0.261, -0.233)]
-    )
-    z: float | None = Field(description="relative change in standard errors", examples=[-34.8])
-    reason: _Reason
-
-
-class Equation(BaseModel):
-    """Residual of one compatibility equation in one window."""
-
-    model_config = _JSON
-
-    equation: str = Field(description="number of the compatibility equation: 28 to 31", examples=["28"])
-    title: str = Field(description="what the equation is about", examples=["bearing, horizontal"])
-    evaluable: bool = Field(description="whether the window allowed an evaluation", examples=[True])
-    msd: float | None = Field(
-        description="mean squared deviation between network and estimated correlation, over the target's mean square",
-        examples=[0.0613],
-    )
-    msd_healthy: float | None = Field(description="the same on healthy windows, mean", examples=[0.0018])
-    parameters: tuple[Parameter, ...] = Field(description="the residual projected on the equation's own parameters")
-    reason: _Reason
-
-
-class Agreement(BaseModel):
-    """Whether two diagnosticians say the same of one parameter."""
-
-    model_config = _JSON
-
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    between: tuple[str, str] = Field(description="who is compared", examples=[("likelihood", "relation")])
-    verdict: AgreementVerdict = Field(
-        description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
-    )
-    difference_z: float | None = Field(
-        description="second minus first change in combined standard errors", examples=[0.8]
-    )
-
-
-class Opinion(BaseModel):
-    """What a diagnostician other than the likelihood reads in the same window."""
-
-    model_config = _JSON
-
-    by: str = Field(description="who: network or relation", examples=["relation"])
-    parameters: tuple[Parameter, ...] = Field(description="what it reads")
-    agreement: tuple[Agreement, ...] = Field(description="how that compares with the likelihood")
-    reason: _Reason
-
-
-class Finding(BaseModel):
-    """One parameter that changed, and how that was found."""
-
-    model_config = _JSON
-
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
-    since_ns: int = Field(
-        description="start of the stretch of data that found it first: the date of the change, as far as it is known",
-        examples=[_NS - 20_000_000_000],
-    )
-    found_ns: int = Field(description="end of that stretch", examples=[_NS - 10_000_000_000])
-    stretch_s: float = Field(description="length of that stretch", examples=[10.0])
-
-
-class Verdict(BaseModel):
-    """What has changed, from stretches of data of all lengths that end with this hop; alarms are decided on it."""
-
-    model_config = _JSON
-
-    changed: tuple[Finding, ...] = Field(description="parameters that changed; empty: none")
-    text: str = Field(
-        description="the verdict in a sentence",
-        examples=[
-            "changed: bearing stiffness, horizontal (k_by) since 00:03:05, found 00:03:15 in 10 s of data; "
-            "confidence 99.6 %"
-        ],
-    )
-    detected: bool = Field(description="something changed, whether or not it is clear yet what", examples=[True])
-    confidence: float = Field(
-        description="probability of exactly this set of parameters among all sets", examples=[0.996]
-    )
-    low_confidence: bool = Field(
-        description="take what is said of parameters with reserve: outside the model, or several sets explain the data",
-        examples=[False],
-    )
-    outside_model: bool = Field(
-        description="something changed that no parameter describes, or a sensor is at fault", examples=[False]
-    )
-    outside_confidence: float | None = Field(
-        description="how sure that is, 0.5 for not at all; null without a test", examples=[0.5]
-    )
-    decided_s: float = Field(description="length of the stretch of data that decided", examples=[20.0])
-    settled: bool = Field(
-        description="no change within the window: `parameters` hold for one state of the machine", examples=[False]
-    )
-    current: tuple[Parameter, ...] = Field(
-        description="readings of the data since the last change, at most one window, changed parameters with the "
-        "others held at nominal; empty while there is too little"
-    )
-
-
-class Detectable(BaseModel):
-    """Smallest change of one parameter, alone, that would be found with 95 % probability."""
-
-    model_config = _JSON
-
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    loss: float = Field(description="relative change downwards; -1: not even a total loss", examples=[-0.025])
-    gain: float = Field(description="relative change upwards", examples=[0.026])
-    length_s: float = Field(description="data that takes", examples=[60.0])
 
 
 _MisfitZ = Annotated[
@@ -204,10 +91,22 @@ _Verdict = Annotated[Verdict | None, Field(description="what has changed; null i
 _Detectable = Annotated[tuple[Detectable, ...], Field(description="what would have been found in this window")]
 
 
+_Sensors = Annotated[
+    tuple[SensorFault, ...],
+    Field(
+        description="faults of sensors in the window; with any of them nothing is said of the machine", examples=[()]
+    ),
+]
+_Shapes = Annotated[
+    tuple[Shape, ...],
+    Field(description="where no equation can be evaluated: whether each channel is as it was", examples=[()]),
+]
+
+
 class Report(BaseModel):
     """One evaluation of the sliding window."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
@@ -219,19 +118,23 @@ class Report(BaseModel):
     misfit_z: _MisfitZ
     suspect: _Suspect
     verdict: _Verdict
-    parameters: tuple[Parameter, ...] = Field(description="the likelihood's readings of the whole window")
+    parameters: tuple[Parameter, ...] = Field(
+        description="readings of the whole window by the diagnostician that decides"
+    )
     opinions: _Opinions
     equations: tuple[Equation, ...] = Field(description="the networks' residuals, equation by equation")
     detectable: _Detectable
-    reason: _Reason
+    sensors: _Sensors
+    shapes: _Shapes
+    reason: Reason
     bundle: _Bundle
     machine_hash: _MachineHash
 
 
 class Alarm(BaseModel):
-    """Alarm of one parameter, or of the model."""
+    """Alarm of one parameter, of the model, of the sensors, or of the shape of vibration."""
 
-    model_config = _JSON
+    model_config = JSON
 
     parameter: _AlarmParameter
     text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
@@ -254,7 +157,7 @@ class Alarm(BaseModel):
 class AlarmStates(BaseModel):
     """The alarms of one machine that are not normal (or all of them, if asked for)."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
@@ -266,7 +169,7 @@ class AlarmStates(BaseModel):
 class Quality(BaseModel):
     """What came in since the monitor started."""
 
-    model_config = _JSON
+    model_config = JSON
 
     accepted_blocks: int = Field(description="blocks accepted", examples=[2051])
     refused_blocks: dict[str, int] = Field(description="blocks refused, by reason", examples=[{"not-finite": 3}])
@@ -284,7 +187,7 @@ class Quality(BaseModel):
 class StreamStatus(BaseModel):
     """What is known about whoever publishes the stream."""
 
-    model_config = _JSON
+    model_config = JSON
 
     publisher_alive: bool = Field(
         description="a publisher's liveliness token is there; publishers need not have one", examples=[True]
@@ -300,12 +203,13 @@ class StreamStatus(BaseModel):
 class Health(BaseModel):
     """Where a machine stands: state, latest window, alarms, quality of the data."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
     state: HealthState = Field(
-        description="warming, healthy, alert, danger, outside-model, no-data (silence; outranks everything, see "
+        description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
+        "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence; outranks everything, see "
         "`alarms`) or not-evaluable",
         examples=["alert"],
     )
@@ -321,6 +225,8 @@ class Health(BaseModel):
     opinions: _Opinions
     equations: tuple[Equation, ...] = Field(description="equations in the latest window")
     detectable: _Detectable
+    sensors: _Sensors
+    shapes: _Shapes
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
     quality: Quality = Field(description="what came in")
     stream: StreamStatus = Field(description="what is known about the publisher")
@@ -333,7 +239,7 @@ class Health(BaseModel):
 class AlarmEventData(BaseModel):
     """What happened to an alarm."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
@@ -358,7 +264,7 @@ class AlarmEventData(BaseModel):
 class AlarmCloudEvent(BaseModel):
     """An alarm event as a CloudEvent 1.0 in structured JSON form."""
 
-    model_config = _JSON
+    model_config = JSON
 
     specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
     id: str = Field(
@@ -380,7 +286,7 @@ class AlarmCloudEvent(BaseModel):
 class MachineDescription(BaseModel):
     """A monitored machine: what it is, what its stream looks like, where to find what is said about it."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
@@ -407,7 +313,7 @@ class MachineDescription(BaseModel):
 class DetectableParameter(BaseModel):
     """What it takes to find a change of one parameter."""
 
-    model_config = _JSON
+    model_config = JSON
 
     name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
     text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
@@ -421,7 +327,7 @@ class DetectableParameter(BaseModel):
 class DetectableChanges(BaseModel):
     """What would be found on this machine as it runs now, with 95 % probability."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
@@ -438,7 +344,7 @@ class DetectableChanges(BaseModel):
 class MachineReadiness(BaseModel):
     """Whether one machine's monitor works."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: _Site
     machine: _Name
@@ -455,7 +361,7 @@ class MachineReadiness(BaseModel):
 class Readiness(BaseModel):
     """Whether the service can do its work; machines without data are no reason against it."""
 
-    model_config = _JSON
+    model_config = JSON
 
     ready: bool = Field(description="session open and every worker alive", examples=[True])
     session_open: bool = Field(description="the Zenoh session is open", examples=[True])

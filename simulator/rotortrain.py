@@ -257,6 +257,70 @@ def delay(
         time_detection(machine, out, trials=trials, others=others, seed=seed, processes=processes, redraw=redraw)
 
 
+@app.command()
+def commission(
+    machine: Annotated[
+        str,
+        typer.Option("--machine", "-m", help="Machine file (TOML). What it leaves out of [rotor] is learned."),
+    ],
+    healthy: Annotated[
+        list[Path],
+        typer.Option(
+            "--healthy",
+            exists=True,
+            dir_okay=False,
+            help="Recording of the healthy machine; may be given several times.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle and the report.")],
+    first: Annotated[
+        float | None, typer.Option(min=1.0, metavar="SECONDS", help="Use only the first seconds of every recording.")
+    ] = None,
+    wish: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=0.9, help="Relative change that shall be found; the alarm limit if left out."),
+    ] = None,
+    why: Annotated[str, typer.Option(help="Why the machine is commissioned again; kept in the bundle.")] = "",
+    networks: Annotated[
+        bool, typer.Option(help="Train the networks, too, where the parameters are known (some ten minutes).")
+    ] = True,
+    windows: Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")] = 160,
+    draws: Annotated[
+        int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
+    ] = 150_000,
+    seed: SeedOption = _SEED,
+    processes: ProcessesOption = _CORES,
+) -> None:
+    """Make a calibrated monitor of a real machine from recordings of it while it was healthy.
+
+    With all parameters in the machine file (level full) the recordings are checked against theory and the networks
+    trained. With masses and shaft alone (partial) stiffness, damping and unbalance are identified. With nothing but
+    channels and sampling (none) the relations between bearing and disc are learned, and changes are told relative to
+    them. The report says what can be read, how sharply, and what to record where it is not enough. Recordings that are
+    too short, not steady or faulty are refused (exit code 3).
+
+    Example: rotortrain commission --machine pump.toml --healthy monday.mcap --healthy friday.mcap --out pump-bundle
+    """
+    with _running():
+        from simulator.commission.command import commission_machine  # noqa: PLC0415  # start-up stays free of numpy and torch
+
+        made = commission_machine(
+            machine,
+            healthy,
+            out,
+            first_s=first,
+            wished=wish,
+            why=why,
+            networks=networks,
+            n_windows=windows,
+            n_draws=draws,
+            seed=seed,
+            processes=processes,
+        )
+        if not made:
+            raise typer.Exit(3)
+
+
 @contextmanager
 def _running() -> Iterator[None]:
     """Run a command's work: linear algebra on one thread, the workers are processes; trouble is told in a sentence.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -94,7 +95,7 @@ def commission(
     wished: float | None = None,
     replaces: Commissioned | None = None,
     why: str = "",
-    progress: Callable[[str, float], None] = lambda *_: None,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Commissioning:
     """Commission a machine.
 
@@ -112,7 +113,7 @@ def commission(
     why : str
         Why it is commissioned again.
     progress : callable, optional
-        Told what is being done and the fraction of it that is.
+        Told what is being done, how much of it is done, and how much there is.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
@@ -184,7 +185,7 @@ def _not_learned(level: KnowledgeLevel, text: str) -> Check:
 
 
 def _read_known(
-    machine: Machine, pieces: Sequence[_Piece], progress: Callable[[str, float], None]
+    machine: Machine, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]
 ) -> tuple[_Read, ...]:
     found = []
     for number, piece in enumerate(pieces):
@@ -192,11 +193,11 @@ def _read_known(
         found.append(
             (piece.recording, piece.window.end_ns, determined(diagnosis, piece.window, machine.window.length_s))
         )
-        progress("comparing with theory", (number + 1) / len(pieces))
+        progress("comparing with theory", number + 1, len(pieces))
     return tuple(found)
 
 
-def _learn_full(machine: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, float], None]) -> _Learned:
+def _learn_full(machine: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]) -> _Learned:
     assert isinstance(machine, Machine)  # noqa: S101  # the level says so
     read = _read_known(machine, pieces, progress)
     check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
@@ -210,9 +211,11 @@ def _learn_full(machine: MachineFile, pieces: Sequence[_Piece], progress: Callab
     return _Learned((check,), read, read, machine)
 
 
-def _learn_partial(machine: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, float], None]) -> _Learned:
+def _learn_partial(
+    machine: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]
+) -> _Learned:
     windows = [piece.window for piece in pieces]
-    identified = identify(machine, windows, lambda done: progress("identifying the rotor", done))
+    identified = identify(machine, windows, partial(progress, "identifying the rotor"))
     read = tuple(
         (piece.recording, piece.window.end_ns, with_shared_error(stated, identified.covariance))
         for piece, diagnosis in zip(pieces, identified.diagnoses, strict=True)
@@ -228,7 +231,7 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[_Piece], progress: Cal
     return _Learned((check,), read, read, identified.machine, record)
 
 
-def _learn_none(_: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, float], None]) -> _Learned:
+def _learn_none(_: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]) -> _Learned:
     windows = [piece.window for piece in pieces]
     try:
         shape = learn_shape(windows)
@@ -240,15 +243,13 @@ def _learn_none(_: MachineFile, pieces: Sequence[_Piece], progress: Callable[[st
     ]
     if not evaluable:
         return _without_equations(shape, no_shape)
-    progress("learning the relations", 0.0)
     baseline = learn_baseline(windows, [piece.recording for piece in pieces])
     diagnostician = BaselineDiagnostician(baseline)
     read = []
     for number, piece in enumerate(pieces):
         read.append((piece.recording, piece.window.end_ns, diagnostician.diagnose(piece.window)))
-        progress("learning the relations", (number + 1) / (2 * len(pieces)))
+        progress("learning the relations", number + 1, len(pieces))
     compared = _halves(pieces)
-    progress("learning the relations", 1.0)
     return _Learned(
         (check_halves([each for _, _, each in compared]),),
         tuple(read),

@@ -122,7 +122,7 @@ def described(machine: MachineFile) -> dict[str, Any]:
     return json.loads(json.dumps(machine.model_dump(mode="json", include=_DESCRIBED)))  # type: ignore[no-any-return]
 
 
-def load_commissioned(directory: Path, machine: MachineFile) -> Commissioned:
+def load_commissioned(directory: Path, machine: MachineFile, *, same_description: bool = True) -> Commissioned:
     """Load what was commissioned and check that it belongs to a machine.
 
     Parameters
@@ -130,6 +130,8 @@ def load_commissioned(directory: Path, machine: MachineFile) -> Commissioned:
     directory : Path
         The bundle.
     machine : MachineFile
+    same_description : bool
+        Whether channels, window and physics must be as they were.
 
     Raises
     ------
@@ -149,7 +151,7 @@ def load_commissioned(directory: Path, machine: MachineFile) -> Commissioned:
         )
     now = described(machine)
     different = [name for name in sorted(now) if now[name] != found.described.get(name)]
-    if different:
+    if same_description and different:
         raise BundleError(
             f"{path}: {', '.join(different)} in the machine file of {machine.site}/{machine.name} differ from what was "
             "commissioned: commission the machine again"

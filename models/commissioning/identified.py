@@ -58,7 +58,7 @@ class Identified:
 
 
 def identify(
-    machine: MachineFile, windows: Sequence[WindowStatistics], progress: Callable[[float], None] = lambda _: None
+    machine: MachineFile, windows: Sequence[WindowStatistics], progress: Callable[[int, int], None] = lambda *_: None
 ) -> Identified:
     """Identify stiffness, damping and unbalance.
 
@@ -69,7 +69,7 @@ def identify(
     windows : sequence of WindowStatistics
         Healthy ones that do not overlap.
     progress : callable, optional
-        Told the fraction that is done.
+        Told how many rounds are done, and how many there may be.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def identify(
         values, covariance = together.estimate()
         moves = dict(zip(together.names, values.tolist(), strict=True))
         whole = _moved(whole, moves, windows)
-        progress((number + 1) / _ROUNDS)
+        progress(number + 1, _ROUNDS)
         if max(abs(value) for value in moves.values()) < _SETTLED:
             break
     else:

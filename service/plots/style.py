@@ -47,6 +47,8 @@ STATE_COLOURS = {
     "danger": "#D55E00",
     "outside-model": "#CC79A7",
     "not-evaluable": "#999999",
+    "unchanged": "#56B4E9",
+    "data-health": "#882255",
     "warming": "#dddddd",
     "no-data": "#000000",
 }

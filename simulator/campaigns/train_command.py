@@ -27,7 +27,7 @@ from simulator.campaigns.feature_draws import FeatureDraws, batches
 from simulator.campaigns.progress import bars
 from simulator.campaigns.spectral_draws import LOG_RATIO
 
-__all__ = ["train_bundle"]
+__all__ = ["train_bundle", "train_for"]
 
 _CONDITIONS_PER_BATCH = 480
 _CALIBRATION_SHARE = 3
@@ -36,12 +36,22 @@ _CALIBRATION_STREAM = 20
 
 
 def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
+    """Train the networks of a machine file or a shipped machine, see `train_for`.
+
+    Raises
+    ------
+    RotorwatchError
+        If the machine file or the bundle directory is not usable.
+    """
+    train_for(load_machine(name), out, n_windows, n_draws, seed, processes)
+
+
+def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
     """Train every equation's relation network and amortised network for the machine and write the bundle.
 
     Parameters
     ----------
-    name : str
-        Machine file or shipped machine.
+    machine : Machine
     out : Path
         Directory of the bundle.
     n_windows : int
@@ -53,9 +63,8 @@ def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, 
     Raises
     ------
     RotorwatchError
-        If the machine file or the bundle directory is not usable.
+        If the bundle directory is not usable.
     """
-    machine = load_machine(name)
     networks: list[EquationNetwork] = []
     with bars(remaining=True) as bar:
         for stream, equation in enumerate(EQUATIONS):

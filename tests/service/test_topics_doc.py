@@ -104,7 +104,17 @@ def test_example_on_a_topic_is_valid_and_complete(name: str) -> None:
 
 def test_every_state_is_explained() -> None:
     text = sections("topics.md")[KEYS.health]
-    for state in ("warming", "healthy", "alert", "danger", "outside-model", "no-data", "not-evaluable"):
+    for state in (
+        "warming",
+        "healthy",
+        "alert",
+        "danger",
+        "outside-model",
+        "no-data",
+        "not-evaluable",
+        "unchanged",
+        "data-health",
+    ):
         assert f"`{state}`" in text
 
 

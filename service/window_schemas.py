@@ -1,0 +1,188 @@
+"""JSON of what is said of a window: parameters, equations, opinions, verdict, sensors.
+
+Conventions as in `service.schemas`.
+"""
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from models.diagnosis.verdict.agreement import Verdict as AgreementVerdict
+
+__all__ = [
+    "JSON",
+    "Agreement",
+    "Detectable",
+    "Equation",
+    "Finding",
+    "Opinion",
+    "Parameter",
+    "Reason",
+    "SensorFault",
+    "Shape",
+    "Verdict",
+]
+
+JSON = ConfigDict(extra="forbid", frozen=True)
+"""Of every model."""
+
+_NS = 1767225805000000000
+
+Interval = tuple[float, float]
+Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]
+
+
+class Parameter(BaseModel):
+    """One physical parameter's relative change in one window."""
+
+    model_config = JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    by: str = Field(description="who says so: likelihood, network or relation", examples=["likelihood"])
+    relative_change: float | None = Field(
+        description="relative change from nominal; null if not evaluable", examples=[-0.247]
+    )
+    standard_error: float | None = Field(description="standard error of the relative change", examples=[0.0071])
+    interval_95: Interval | None = Field(
+        description="95 % interval of the relative change", examples=[(-0.261, -0.233)]
+    )
+    z: float | None = Field(description="relative change in standard errors", examples=[-34.8])
+    reason: Reason
+
+
+class Equation(BaseModel):
+    """Residual of one compatibility equation in one window."""
+
+    model_config = JSON
+
+    equation: str = Field(description="number of the compatibility equation: 28 to 31", examples=["28"])
+    title: str = Field(description="what the equation is about", examples=["bearing, horizontal"])
+    evaluable: bool = Field(description="whether the window allowed an evaluation", examples=[True])
+    msd: float | None = Field(
+        description="mean squared deviation between network and estimated correlation, over the target's mean square",
+        examples=[0.0613],
+    )
+    msd_healthy: float | None = Field(description="the same on healthy windows, mean", examples=[0.0018])
+    parameters: tuple[Parameter, ...] = Field(description="the residual projected on the equation's own parameters")
+    reason: Reason
+
+
+class Agreement(BaseModel):
+    """Whether two diagnosticians say the same of one parameter."""
+
+    model_config = JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    between: tuple[str, str] = Field(description="who is compared", examples=[("likelihood", "relation")])
+    verdict: AgreementVerdict = Field(
+        description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
+    )
+    difference_z: float | None = Field(
+        description="second minus first change in combined standard errors", examples=[0.8]
+    )
+
+
+class Opinion(BaseModel):
+    """What a diagnostician other than the likelihood reads in the same window."""
+
+    model_config = JSON
+
+    by: str = Field(description="who: network or relation", examples=["relation"])
+    parameters: tuple[Parameter, ...] = Field(description="what it reads")
+    agreement: tuple[Agreement, ...] = Field(description="how that compares with the likelihood")
+    reason: Reason
+
+
+class Finding(BaseModel):
+    """One parameter that changed, and how that was found."""
+
+    model_config = JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    since_ns: int = Field(
+        description="start of the stretch of data that found it first: the date of the change, as far as it is known",
+        examples=[_NS - 20_000_000_000],
+    )
+    found_ns: int = Field(description="end of that stretch", examples=[_NS - 10_000_000_000])
+    stretch_s: float = Field(description="length of that stretch", examples=[10.0])
+
+
+class Verdict(BaseModel):
+    """What has changed, from stretches of data of all lengths that end with this hop; alarms are decided on it."""
+
+    model_config = JSON
+
+    changed: tuple[Finding, ...] = Field(description="parameters that changed; empty: none")
+    text: str = Field(
+        description="the verdict in a sentence",
+        examples=[
+            "changed: bearing stiffness, horizontal (k_by) since 00:03:05, found 00:03:15 in 10 s of data; "
+            "confidence 99.6 %"
+        ],
+    )
+    detected: bool = Field(description="something changed, whether or not it is clear yet what", examples=[True])
+    confidence: float = Field(
+        description="probability of exactly this set of parameters among all sets", examples=[0.996]
+    )
+    low_confidence: bool = Field(
+        description="take what is said of parameters with reserve: outside the model, or several sets explain the data",
+        examples=[False],
+    )
+    outside_model: bool = Field(
+        description="something changed that no parameter describes, or a sensor is at fault", examples=[False]
+    )
+    outside_confidence: float | None = Field(
+        description="how sure that is, 0.5 for not at all; null without a test", examples=[0.5]
+    )
+    decided_s: float = Field(description="length of the stretch of data that decided", examples=[20.0])
+    settled: bool = Field(
+        description="no change within the window: `parameters` hold for one state of the machine", examples=[False]
+    )
+    current: tuple[Parameter, ...] = Field(
+        description="readings of the data since the last change, at most one window, changed parameters with the "
+        "others held at nominal; empty while there is too little"
+    )
+
+
+class Detectable(BaseModel):
+    """Smallest change of one parameter, alone, that would be found with 95 % probability."""
+
+    model_config = JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    loss: float = Field(description="relative change downwards; -1: not even a total loss", examples=[-0.025])
+    gain: float = Field(description="relative change upwards", examples=[0.026])
+    length_s: float = Field(description="data that takes", examples=[60.0])
+
+
+class SensorFault(BaseModel):
+    """One fault of a sensor, or of one of several that contradict each other."""
+
+    model_config = JSON
+
+    states: tuple[str, ...] = Field(description="what the channels in question measure", examples=[("y1",)])
+    kind: str = Field(description="stuck, clipped, offset, gain, delay, swapped or incoherent", examples=["gain"])
+    text: str = Field(
+        description="channels, value found and what was expected, in a sentence",
+        examples=["gain of y1 is 20 % lower than when it was commissioned"],
+    )
+    value: float | None = Field(
+        description="stuck: s; clipped: part of the samples; offset: SI; gain: relative; delay: s; otherwise the share "
+        "of motion that the sensors have in common",
+        examples=[-0.2],
+    )
+    z: float | None = Field(description="in standard errors; null where no chance is involved", examples=[41.0])
+
+
+class Shape(BaseModel):
+    """Whether one channel's vibration is as it was on the healthy machine, where no equation can be evaluated."""
+
+    model_config = JSON
+
+    state: str = Field(description="what the channel measures", examples=["y1"])
+    verdict: str = Field(description="not changed, changed or not evaluable", examples=["not changed"])
+    z: float | None = Field(description="distance from the healthy shape, a standard normal value", examples=[0.4])
+    limit: float = Field(description="what z must exceed to be called changed", examples=[3.1])
+    text: str = Field(description="the same in a sentence", examples=["y1: not changed"])

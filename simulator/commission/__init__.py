@@ -1,0 +1,1 @@
+"""``rotortrain commission``: the command, and the report that people read."""
