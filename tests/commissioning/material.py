@@ -1,0 +1,83 @@
+"""Healthy recordings of the shipped rotor kit, and machine files that tell less of it than is known."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from models.commissioning.commission import Commissioning, commission
+from models.commissioning.commissioned import RecordingEntry
+from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
+from models.machine import Machine, MachineFile, load_machine
+from models.signals.block import FloatArray, SampleBlock
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
+
+__all__ = ["LAB", "NOTHING", "PARTIAL", "commissioned", "healthy", "recording", "samples_of", "stream", "with_samples"]
+
+LAB = load_machine("lab")
+_PHYSICS = ("rotor", "operation", "condition")
+_UNKNOWN = ("k_by_N_per_m", "k_bz_N_per_m", "c_by_N_s_per_m", "c_bz_N_s_per_m", "e_m")
+
+
+def _less(machine: Machine) -> tuple[MachineFile, MachineFile]:
+    fields = machine.model_dump()
+    rotor = {name: value for name, value in fields["rotor"].items() if name not in _UNKNOWN}
+    without = {name: value for name, value in fields.items() if name not in _PHYSICS}
+    return MachineFile.model_validate(without), MachineFile.model_validate(without | {"rotor": rotor})
+
+
+NOTHING, PARTIAL = _less(LAB)
+"""The rotor kit with channels and sampling alone, and with masses and shaft besides."""
+
+
+@cache
+def stream(duration_s: float, seed: int, *events: Event) -> tuple[SampleBlock, ...]:
+    """Blocks of the shipped healthy scenario with events of one's own."""
+    scenario, machine = load_scenario("healthy")
+    scenario = scenario.overridden(duration_s=duration_s, seed=seed, faults=events)
+    return tuple(block for block, _ in blocks(scenario, machine))
+
+
+def samples_of(stream_: Sequence[SampleBlock]) -> FloatArray:
+    """All samples, shape (n_samples, n_channels)."""
+    return np.asarray(np.concatenate([block.samples for block in stream_]), dtype=np.float64)
+
+
+def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[SampleBlock]:
+    """The same blocks with other samples in them."""
+    found, at = [], 0
+    for block in stream_:
+        n_samples = block.samples.shape[0]
+        part = samples[at : at + n_samples].astype(block.samples.dtype)
+        found.append(replace(block, samples=part))
+        at += n_samples
+    return found
+
+
+def recording(machine: MachineFile, stream_: Sequence[SampleBlock], name: str = "healthy.mcap") -> HealthyRecording:
+    """What a recording of these blocks gives."""
+    return healthy_from_blocks(name, machine, ((block, "") for block in stream_))
+
+
+def healthy(machine: MachineFile, duration_s: float, seed: int, name: str = "healthy.mcap") -> HealthyRecording:
+    """A recording of the healthy rotor kit."""
+    return recording(machine, stream(duration_s, seed), name)
+
+
+def commissioned(machine: MachineFile, *recordings: HealthyRecording, wished: float | None = None) -> Commissioning:
+    """Commission on recordings that are in no file."""
+    entries = [
+        RecordingEntry(
+            name=one.name,
+            sha256="0" * 64,
+            start_ns=one.hops[0].start_ns,
+            end_ns=one.hops[-1].end_ns,
+            used_s=one.duration_s,
+            gaps=one.gaps,
+        )
+        for one in recordings
+        if one.hops
+    ]
+    return commission(machine, recordings, entries, wished=wished)

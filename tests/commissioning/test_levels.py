@@ -1,0 +1,120 @@
+"""What is learned at each level of knowledge, and that it comes back from its file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.commissioning.commissioned import FILE, Commissioned, load_commissioned
+from models.commissioning.conditions import OperatingRange
+from models.commissioning.installed import install
+from models.commissioning.knowledge import KnowledgeLevel, knowledge_of
+from models.errors import BundleError
+from models.machine import MachineFile
+from models.physics.parameters import FAULT_FIELDS, PARAMETERS
+from simulator.scenario import Event
+from tests.commissioning.material import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
+
+HEALTHY_S = 189.0
+
+
+def test_a_machine_file_says_how_much_is_known() -> None:
+    assert knowledge_of(LAB).level is KnowledgeLevel.FULL
+    assert knowledge_of(PARTIAL).level is KnowledgeLevel.PARTIAL
+    assert "k_by_N_per_m, k_bz_N_per_m, c_by_N_s_per_m, c_bz_N_s_per_m, e_m" in knowledge_of(PARTIAL).text
+    assert knowledge_of(NOTHING).level is KnowledgeLevel.NONE
+    assert PARTIAL.rotor is not None
+    rotor = PARTIAL.rotor.model_copy(update={"I2_kg_m2": None})
+    without_inertia = PARTIAL.model_copy(update={"rotor": rotor})
+    assert knowledge_of(without_inertia).level is KnowledgeLevel.NONE
+    assert "lacks I2_kg_m2" in knowledge_of(without_inertia).text
+
+
+@pytest.mark.slow
+def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
+    made = commissioned(PARTIAL, healthy(PARTIAL, HEALTHY_S, 41))
+    assert made.report.verdict in {"commissioned", "limited"}
+    assert made.machine is not None
+    assert made.commissioned is not None
+    assert made.commissioned.identified is not None
+    errors = np.sqrt(np.diag(made.commissioned.identified.matrix()))
+    for name, error in zip(PARAMETERS, errors.tolist(), strict=True):
+        found, true = (getattr(machine.rotor, FAULT_FIELDS[name]) for machine in (made.machine, LAB))
+        assert 0 < error < 0.03, name
+        assert abs(np.log(found / true)) < 4 * error, name
+    phase = made.machine.operation.unbalance_phase_rad
+    assert abs(phase - LAB.operation.unbalance_phase_rad) < 0.1
+    assert made.machine.operation.speed_rpm == pytest.approx(LAB.operation.speed_rpm, rel=1e-4)
+    summaries = {one.name: one for one in made.report.parameters}
+    assert summaries["k_by"].commissioning_error == pytest.approx(errors[0], rel=0.1)
+    assert summaries["k_by"].identified == made.machine.rotor.k_by_N_per_m
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("machine", "level"), [(LAB, "full"), (PARTIAL, "partial"), (NOTHING, "none")])
+def test_what_was_commissioned_comes_back_from_its_file(machine: MachineFile, level: str, tmp_path: Path) -> None:
+    made = commissioned(machine, healthy(machine, HEALTHY_S, 41))
+    assert made.commissioned is not None
+    assert made.report.level == level
+    (tmp_path / FILE).write_text(made.commissioned.model_dump_json(indent=1))
+    again = load_commissioned(tmp_path, machine)
+    assert again == made.commissioned
+    assert again.identity == made.commissioned.identity
+    installed = install(machine, tmp_path)
+    assert installed.identity == again.identity
+    assert (installed.known is None) == (level == "none")
+    if again.baseline is not None:
+        window = healthy(machine, HEALTHY_S, 43).windows()[0]
+        fresh = made.commissioned.baseline
+        assert fresh is not None
+        first, second = fresh.diagnostician().diagnose(window), again.baseline.diagnostician().diagnose(window)
+        assert first.parameters == second.parameters
+
+
+def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path) -> None:
+    made = commissioned(NOTHING, healthy(NOTHING, HEALTHY_S, 41)).commissioned
+    assert made is not None
+    path = tmp_path / FILE
+    path.write_text(made.model_dump_json())
+    with pytest.raises(BundleError, match="commissioned for demo/lab, not for demo/other"):
+        load_commissioned(tmp_path, NOTHING.model_copy(update={"name": "other"}))
+    fewer = NOTHING.model_copy(update={"sensors": NOTHING.sensors[1:]})
+    with pytest.raises(BundleError, match=r"sensors in the machine file of demo/lab differ.*commission"):
+        load_commissioned(tmp_path, fewer)
+    with pytest.raises(BundleError, match="must be commissioned from healthy recordings first"):
+        install(NOTHING, None)
+    fields = json.loads(made.model_dump_json())
+    fields["baseline"]["covariance"][0][0] = "NaN"
+    path.write_text(json.dumps(fields))
+    with pytest.raises(BundleError, match=r"baseline\.covariance"):
+        load_commissioned(tmp_path, NOTHING)
+    del fields["baseline"], fields["shape"]
+    path.write_text(json.dumps(fields))
+    with pytest.raises(BundleError, match="neither a baseline nor a healthy shape"):
+        load_commissioned(tmp_path, NOTHING)
+
+
+def test_outside_the_commissioned_conditions_is_said_so() -> None:
+    windows = healthy(NOTHING, HEALTHY_S, 41).windows()
+    conditions = OperatingRange.of(windows)
+    assert all(conditions.outside(window) == "" for window in windows)
+    faster = Event(at_s=0.0, speed_rpm=1.12 * LAB.operation.speed_rpm)
+    (window,) = recording(NOTHING, stream(66.0, 44, faster)).windows()
+    assert conditions.outside(window).startswith("speed is 1478 rpm, commissioned is 1320 rpm")
+    quiet = Event(at_s=0.0, excitation_level=0.01)
+    (window,) = recording(NOTHING, stream(66.0, 45, quiet)).windows()
+    assert conditions.outside(window).startswith("random vibration of")
+
+
+def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> None:
+    little = commissioned(NOTHING, healthy(NOTHING, 66.0, 46))
+    much = commissioned(NOTHING, healthy(NOTHING, HEALTHY_S, 41))
+    for one, other in zip(little.report.parameters[:4], much.report.parameters[:4], strict=True):
+        assert one.commissioning_error is not None
+        assert other.commissioning_error is not None
+        assert one.commissioning_error > 1.3 * other.commissioning_error
+        assert one.detectable_loss is not None
+        assert other.detectable_loss is not None
+        assert one.detectable_loss < other.detectable_loss < 0
+    assert isinstance(much.commissioned, Commissioned)

@@ -1,0 +1,151 @@
+"""Recordings that are not fit: refused or limited, with a sentence that says what to record instead."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from models.commissioning.commission import Commissioning
+from models.machine import MachineFile
+from models.signals.block import SampleBlock
+from simulator.scenario import Event
+from tests.commissioning.material import (
+    LAB,
+    NOTHING,
+    commissioned,
+    healthy,
+    recording,
+    samples_of,
+    stream,
+    with_samples,
+)
+
+HEALTHY_S = 130.0
+
+
+def verdict_of(made: Commissioning, check: str) -> tuple[str, str, str]:
+    """Verdict, text and advice of one check."""
+    found = next(one for one in made.report.checks if one.name == check)
+    return found.verdict, found.text, found.advice
+
+
+def made_of(blocks: Sequence[SampleBlock], machine: MachineFile = NOTHING) -> Commissioning:
+    """Commission on blocks."""
+    return commissioned(machine, recording(machine, blocks))
+
+
+def refused(made: Commissioning) -> bool:
+    return made.commissioned is None and made.report.verdict == "refused"
+
+
+def test_too_short() -> None:
+    made = made_of(stream(30.0, 51))
+    assert refused(made)
+    assert verdict_of(made, "enough data")[1].startswith("too short: 25 s of usable data")
+    assert "record at least 360 s without interruption" in made.report.summary
+
+
+def test_full_of_gaps() -> None:
+    kept = [block for number, block in enumerate(stream(HEALTHY_S, 52)) if number % 200 < 130]
+    made = made_of(kept)
+    assert refused(made)
+    _, text, advice = verdict_of(made, "enough data")
+    assert text.startswith("too many gaps:")
+    assert advice.startswith("find out why 3")
+
+
+def test_a_few_gaps_are_told_and_cost_their_hops() -> None:
+    kept = [block for number, block in enumerate(stream(HEALTHY_S, 52)) if number != 700]
+    made = made_of(kept)
+    assert not refused(made)
+    assert "1 gaps of 0.1 s" in verdict_of(made, "enough data")[1]
+
+
+def test_clipped() -> None:
+    blocks = stream(HEALTHY_S, 52)
+    samples = samples_of(blocks)
+    limit = 1.5 * samples[:, 0].std()
+    samples[:, 0] = np.clip(samples[:, 0], -limit, limit)
+    made = made_of(with_samples(blocks, samples))
+    assert refused(made)
+    _, text, advice = verdict_of(made, "sensors")
+    assert "y1" in text
+    assert "cut off at" in text
+    assert "record again" in advice
+
+
+def test_a_stuck_channel() -> None:
+    blocks = stream(HEALTHY_S, 52)
+    samples = samples_of(blocks)
+    samples[100_000:, 4] = samples[100_000, 4]
+    made = made_of(with_samples(blocks, samples))
+    assert refused(made)
+    assert verdict_of(made, "sensors")[0] == "refused"
+
+
+def test_speed_that_runs_away() -> None:
+    made = made_of(stream(HEALTHY_S, 53, Event(at_s=0.0, ramp_s=HEALTHY_S, speed_rpm=2 * LAB.operation.speed_rpm)))
+    assert refused(made)
+    _, text, advice = verdict_of(made, "stationary")
+    assert "the speed goes from" in text
+    assert "one file for each speed" in advice
+
+
+def test_vibration_that_grows() -> None:
+    made = made_of(stream(HEALTHY_S, 54, Event(at_s=65.0, excitation_level=4.0)))
+    assert refused(made)
+    assert "in the second half is" in verdict_of(made, "stationary")[1]
+
+
+def test_a_machine_that_changed_meanwhile() -> None:
+    made = made_of(stream(2 * HEALTHY_S, 55, Event(at_s=130.0, parameter="k_by", relative_change=-0.3)))
+    assert refused(made)
+    _, text, _ = verdict_of(made, "halves agree")
+    assert text.startswith("bearing stiffness, horizontal differs between the halves")
+
+
+def test_another_machine_that_hums() -> None:
+    blocks = stream(HEALTHY_S, 56)
+    samples = samples_of(blocks)
+    turned = 2 * np.pi * 48.6 * np.arange(samples.shape[0]) / LAB.rate_hz
+    for column, channel in enumerate(LAB.sensors[:8]):
+        moved_m = 20e-6 if channel.location == "bearing" else 60e-6
+        hum = 2 * np.pi * 48.6 * np.cos(turned) if channel.quantity == "velocity" else np.sin(turned)
+        samples[:, column] += moved_m * hum / channel.to_si
+    made = made_of(with_samples(blocks, samples))
+    verdict, text, advice = verdict_of(made, "second excitation")
+    assert verdict in {"limited", "refused"}
+    assert "a steady line at 48.60 Hz" in text
+    assert "neighbouring machine" in advice
+
+
+def test_a_healthy_recording_has_no_foreign_line() -> None:
+    for seed in (57, 58, 59):
+        assert verdict_of(made_of(stream(HEALTHY_S, seed)), "second excitation")[0] == "passed"
+
+
+def test_a_file_that_describes_another_machine() -> None:
+    softer = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update={"k_by_N_per_m": 4.4e4})})
+    made = commissioned(softer, healthy(softer, HEALTHY_S, 52))
+    assert refused(made)
+    _, text, advice = verdict_of(made, "agrees with the parameters in the machine file")
+    assert text.startswith("bearing stiffness, horizontal differs between the healthy data and the parameters")
+    assert "leave out of [rotor]" in advice
+
+
+def test_sensors_that_allow_no_equation_are_limited_to_changed_or_not() -> None:
+    bearing = tuple(channel for channel in NOTHING.sensors if channel.location != "disc")
+    machine = NOTHING.model_copy(update={"sensors": bearing})
+    columns = [n for n, channel in enumerate(NOTHING.sensors) if channel.location != "disc"]
+    blocks = [replace(block, samples=block.samples[:, columns]) for block in stream(400.0, 60)]
+    made = made_of(blocks, machine)
+    verdict, text, advice = verdict_of(made, "equations")
+    assert verdict == "limited"
+    assert "changed or not changed" in text
+    assert "at the disc" in advice
+    assert made.commissioned is not None
+    assert made.commissioned.baseline is None
+    assert made.commissioned.shape is not None
+    assert not any(row.used for row in made.report.equations)
+    short = made_of(blocks[:1000], machine)
+    assert refused(short)
