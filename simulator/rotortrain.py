@@ -321,6 +321,46 @@ def commission(
             raise typer.Exit(3)
 
 
+@app.command()
+def unknown(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the windows' records, numbers and section.")],
+    machine: Annotated[
+        list[str] | None,
+        typer.Option("--machine", "-m", help="Machine to commission; may be given several times. All if left out."),
+    ] = None,
+    windows: Annotated[int, typer.Option(min=1, help="Windows per true change and machine.")] = 100,
+    commissionings: Annotated[
+        int, typer.Option(min=1, help="How often a machine is commissioned from scratch; they share the windows.")
+    ] = 5,
+    healthy: Annotated[int, typer.Option(min=1, help="Healthy windows of a commissioning.")] = 6,
+    seed: SeedOption = _SEED,
+    processes: ProcessesOption = _CORES,
+    page: Annotated[
+        Path | None, typer.Option("--page", help="Page (Markdown) in which the section is put, or replaced.")
+    ] = None,
+) -> None:
+    """Commission machines without telling their parameters, and count what is found on them later.
+
+    Rotors of finite elements and the shipped machines. Every window is kept, so an interrupted campaign carries on
+    where it stopped.
+
+    Example: rotortrain unknown --machine overhung --windows 100 --out unknown
+    """
+    with _running():
+        from simulator.campaigns.unknown_command import watch_unknown  # noqa: PLC0415  # start-up stays free of numpy and torch
+
+        watch_unknown(
+            machine or (),
+            out,
+            windows=windows,
+            commissionings=commissionings,
+            healthy=healthy,
+            seed=seed,
+            processes=processes,
+            page=page,
+        )
+
+
 @contextmanager
 def _running() -> Iterator[None]:
     """Run a command's work: linear algebra on one thread, the workers are processes; trouble is told in a sentence.

@@ -1,0 +1,228 @@
+"""How well a machine is watched that was commissioned without any of its parameters.
+
+Every machine is commissioned several times, each time from scratch on healthy windows of its own, so that the
+commissioning's own error is sampled as well; against each commissioning, windows of later days are read, healthy and
+changed. Every window becomes a record, one per line, so that a campaign can be stopped and carried on.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.learned import learn_baseline
+from models.diagnosis.readings import Diagnostician
+from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError, RecordingError
+from simulator.campaigns.draws import Layout
+from simulator.campaigns.unknown_subjects import Later, subject_named
+
+__all__ = ["CELLS", "UnknownPlan", "UnknownRecord", "commissioned", "read_unknown", "run_unknown"]
+
+CELLS: tuple[dict[str, float], ...] = (
+    {},
+    {"k_by": -0.1},
+    {"c_by": -0.3},
+    {"k_bz": -0.1},
+    {"c_bz": -0.3},
+    {"e": 0.2},
+)
+"""True changes; the first cell is healthy."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownPlan:
+    """What to run.
+
+    Attributes
+    ----------
+    machines : tuple of str
+        Among `simulator.campaigns.unknown_subjects.SUBJECTS`.
+    seed : int
+    windows : int
+        Of each cell and machine, spread evenly over the commissionings.
+    commissionings : int
+    healthy : int
+        Windows of a commissioning.
+    rate : float
+        Declared false alarms per window.
+    """
+
+    machines: tuple[str, ...]
+    seed: int
+    windows: int
+    commissionings: int = 5
+    healthy: int = 6
+    rate: float = 0.01
+
+    def numbers(self, commissioning: int) -> range:
+        """Numbers of the windows that each cell has in a commissioning."""
+        share, rest = divmod(self.windows, self.commissionings)
+        return range(share + (commissioning < rest))
+
+
+class UnknownRecord(BaseModel):
+    """One window, read against one commissioning.
+
+    Attributes
+    ----------
+    machine : str
+    commissioning, cell, number : int
+    layout : Layout
+        Alternates with the number.
+    cutoff_hz : float
+    change, error : dict of str to float
+        Relative changes and standard errors.
+    named : tuple of str
+        Parameters said to have changed at the declared rate.
+    outside : bool
+        Whether it is said to be outside the model.
+    misfit_z : float or None
+    refused : str
+        Why the machine was not commissioned, or the window not read.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    machine: str
+    commissioning: int
+    cell: int
+    number: int
+    layout: Layout
+    cutoff_hz: float
+    change: dict[str, float] = {}
+    error: dict[str, float] = {}
+    named: tuple[str, ...] = ()
+    outside: bool = False
+    misfit_z: float | None = None
+    refused: str = ""
+
+
+def commissioned(windows: Sequence[WindowStatistics]) -> Diagnostician:
+    """Commission on healthy windows alone; the one place where that is decided.
+
+    Raises
+    ------
+    EstimationError
+        If the windows do not suffice.
+    """
+    return BaselineDiagnostician(learn_baseline(windows))
+
+
+def run_unknown(plan: UnknownPlan, kept: Path, processes: int, progress: Callable[[str, int, int], None]) -> None:
+    """Read window after window, appending to a file of records; what is there already is not done again.
+
+    Parameters
+    ----------
+    plan : UnknownPlan
+    kept : Path
+        JSON lines.
+    processes : int
+    progress : callable
+        Called with the machine, its windows done and its windows in all.
+
+    Raises
+    ------
+    RecordingError
+        If records that are already there are damaged.
+    """
+    records = list(read_unknown(kept))
+    if records:  # a line that was cut short would swallow the next one
+        kept.write_text("".join(map(_line, records)), encoding="utf-8")
+    done = {(one.machine, one.commissioning, one.cell, one.number) for one in records}
+    with ProcessPoolExecutor(processes) as pool, kept.open("a", encoding="utf-8") as out:
+        for machine in plan.machines:
+            tasks: list[tuple[int, int, tuple[int, ...]]] = []
+            finished = 0
+            for commissioning in range(plan.commissionings):
+                for cell in range(len(CELLS)):
+                    numbers = plan.numbers(commissioning)
+                    missing = tuple(n for n in numbers if (machine, commissioning, cell, n) not in done)
+                    finished += len(numbers) - len(missing)
+                    if missing:
+                        tasks.append((commissioning, cell, missing))
+            total = plan.windows * len(CELLS)
+            progress(machine, finished, total)
+            for read in pool.map(partial(_read, plan, machine), tasks):
+                out.writelines(map(_line, read))
+                out.flush()
+                finished += len(read)
+                progress(machine, finished, total)
+
+
+def _line(record: UnknownRecord) -> str:
+    return record.model_dump_json(exclude_defaults=True) + "\n"
+
+
+def read_unknown(path: Path) -> Iterator[UnknownRecord]:
+    """Read records back, none if there is no file; a last line cut short by an interruption is left out.
+
+    Raises
+    ------
+    RecordingError
+        If a line is damaged.
+    """
+    if not path.exists():
+        return
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines()
+    for number, line in enumerate(lines, start=1):
+        try:
+            yield UnknownRecord.model_validate_json(line)
+        except ValidationError as error:
+            if number == len(lines) and not text.endswith("\n"):
+                return
+            raise RecordingError(f"{path}: line {number} is not a record of this campaign") from error
+
+
+@lru_cache(maxsize=2)
+def _commissioned(machine: str, seed: int, commissioning: int, healthy: int) -> Diagnostician | str:
+    try:
+        return commissioned(subject_named(machine).healthy(seed, commissioning, healthy))
+    except EstimationError as error:
+        return str(error)
+
+
+def _read(plan: UnknownPlan, machine: str, task: tuple[int, int, tuple[int, ...]]) -> list[UnknownRecord]:
+    commissioning, cell, numbers = task
+    diagnostician = _commissioned(machine, plan.seed, commissioning, plan.healthy)
+    subject = subject_named(machine)
+    records = []
+    for number in numbers:
+        layout = Layout(number % 2)
+        window, cutoff_hz = subject.later(Later(plan.seed, commissioning, cell, number, layout, CELLS[cell]))
+        known = {
+            "machine": machine,
+            "commissioning": commissioning,
+            "cell": cell,
+            "number": number,
+            "layout": layout,
+            "cutoff_hz": cutoff_hz,
+        }
+        records.append(UnknownRecord.model_validate(known | _opinion(diagnostician, window, plan.rate)))
+    return records
+
+
+def _opinion(diagnostician: Diagnostician | str, window: WindowStatistics, rate: float) -> dict[str, object]:
+    if isinstance(diagnostician, str):
+        return {"refused": f"not commissioned: {diagnostician}"}
+    try:
+        diagnosis = diagnostician.diagnose(window)
+    except EstimationError as error:
+        return {"refused": str(error)}
+    if not diagnosis.evaluable:
+        return {"refused": next((one.reason for one in diagnosis.parameters), "nothing was read")}
+    verdict = isolate_window(diagnosis, rate)
+    read = diagnosis.evaluable
+    return {
+        "change": {one.name: one.change for one in read},
+        "error": {one.name: one.standard_error for one in read},
+        "named": verdict.changed,
+        "outside": verdict.outside,
+        "misfit_z": diagnosis.misfit_z,
+    }

@@ -1,0 +1,187 @@
+"""Machines that are to be commissioned without their parameters: finite elements, and the shipped ones kept secret.
+
+A subject gives healthy windows of one commissioning, which has one source of one cutoff and level, and single windows
+of later days, each with a cutoff, level, noise and direction of its own. All are independent realisations, and no two
+purposes share a random number.
+"""
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+
+from models.diagnosis.window import WindowStatistics
+from models.machine import ConditionRange, Machine, load_machine
+from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
+from simulator.finite_elements.machines import ROTORS, rotor_named
+from simulator.finite_elements.observed import WindowSizes, plan, sampled, windows_of
+from simulator.finite_elements.rotor import BeamRotor
+from simulator.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+from simulator.finite_elements.scenes import ConditionRange as SceneRange
+
+__all__ = ["SHIPPED", "SUBJECTS", "Later", "Subject", "subject_named"]
+
+SHIPPED = ("lab", "heavy", "light")
+SUBJECTS: tuple[str, ...] = (*(rotor.name for rotor in ROTORS), *SHIPPED)
+"""Machines of another model class first, then the shipped ones."""
+
+_COMMISSIONED_CUTOFFS_HZ = (40.0, 160.0)
+_OTHER_CUTOFF = math.log(1.25)
+_SPEED_TOLERANCE = 0.01
+_SETTLING_S = 0.1
+
+
+class _Use(IntEnum):
+    """Part of every seed."""
+
+    COMMISSIONING = 1
+    LATER = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Later:
+    """Which later window.
+
+    Attributes
+    ----------
+    seed : int
+        Of the whole campaign.
+    commissioning : int
+        Number of the commissioning it is read against.
+    cell, number : int
+    layout : Layout
+    changes : dict of str to float
+        True relative changes.
+    """
+
+    seed: int
+    commissioning: int
+    cell: int
+    number: int
+    layout: Layout
+    changes: dict[str, float]
+
+
+class Subject(Protocol):
+    """A machine to commission."""
+
+    @property
+    def description(self) -> str:
+        """What it is, in a few words."""
+
+    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
+        """Windows of 60 s of one commissioning, which do not overlap."""
+
+    def later(self, which: Later) -> tuple[WindowStatistics, float]:
+        """One window of 60 s, and the cutoff of its excitation, Hz."""
+
+
+def subject_named(name: str) -> Subject:
+    """Look a machine of `SUBJECTS` up.
+
+    Raises
+    ------
+    KeyError
+        If it is not among them.
+    """
+    return _Shipped(load_machine(name)) if name in SHIPPED else _Beam(rotor_named(name))
+
+
+def _generator(name: str, seed: int, commissioning: int, use: _Use, *which: int) -> np.random.Generator:
+    own = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")
+    return np.random.default_rng([seed, own, commissioning, use, *which])
+
+
+def _commissioned_cutoff(name: str, seed: int, commissioning: int) -> float:
+    rng = _generator(name, seed, commissioning, _Use.COMMISSIONING, 1)
+    low, high = np.log(_COMMISSIONED_CUTOFFS_HZ)
+    return float(np.exp(rng.uniform(low, high)))
+
+
+def _other_cutoff(limits: tuple[float, float], commissioned: float, rng: np.random.Generator) -> float:
+    """A cutoff that is at least a quarter off the commissioned one."""
+    while True:
+        cutoff_hz = float(rng.uniform(*limits))
+        if abs(math.log(cutoff_hz / commissioned)) > _OTHER_CUTOFF:
+            return cutoff_hz
+
+
+@dataclass(frozen=True, slots=True)
+class _Beam:
+    rotor: BeamRotor
+
+    @property
+    def description(self) -> str:
+        return self.rotor.description
+
+    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
+        cutoff_hz = _commissioned_cutoff(self.rotor.name, seed, commissioning)
+        rng = _generator(self.rotor.name, seed, commissioning, _Use.COMMISSIONING)
+        limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
+        condition = drawn_condition(self.rotor, SourceLayout.ONE_SOURCE, limits, {}, rng)
+        sizes = plan(WindowSizes())
+        duration_s = (sizes.preamble + count * sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
+        return tuple(windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)[:count])
+
+    def later(self, which: Later) -> tuple[WindowStatistics, float]:
+        name = self.rotor.name
+        rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
+        commissioned = _commissioned_cutoff(name, which.seed, which.commissioning)
+        cutoff_hz = _other_cutoff(SceneRange().cutoff_hz, commissioned, rng)
+        layout = SourceLayout.ONE_SOURCE if which.layout is Layout.ONE_SOURCE else SourceLayout.INDEPENDENT
+        limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
+        condition = drawn_condition(self.rotor, layout, limits, which.changes, rng)
+        sizes = plan(WindowSizes())
+        duration_s = (sizes.preamble + sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
+        (window,) = windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)
+        return window, cutoff_hz
+
+
+@dataclass(frozen=True, slots=True)
+class _Shipped:
+    machine: Machine
+
+    @property
+    def description(self) -> str:
+        return f"{self.machine.description}, six degrees of freedom"
+
+    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
+        cutoff_hz = _commissioned_cutoff(self.machine.name, seed, commissioning)
+        rng = _generator(self.machine.name, seed, commissioning, _Use.COMMISSIONING)
+        limits = ConditionRange(
+            cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02)
+        )
+        draw = Draw(
+            _within(self.machine, limits),
+            int(rng.integers(2**62)),
+            Purpose.TRAINING,
+            layout=Layout.ONE_SOURCE,
+            fixed_condition=True,
+        )
+        return tuple(simulate_window(draw, number) for number in range(1, count + 1))
+
+    def later(self, which: Later) -> tuple[WindowStatistics, float]:
+        name = self.machine.name
+        rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
+        own = self.machine.condition
+        commissioned = _commissioned_cutoff(name, which.seed, which.commissioning)
+        cutoff_hz = _other_cutoff(own.cutoff_hz, commissioned, rng)
+        limits = own.model_copy(update={"cutoff_hz": (cutoff_hz, cutoff_hz)})
+        draw = Draw(
+            _within(self.machine, limits),
+            int(rng.integers(2**62)),
+            Purpose.EVALUATION,
+            faults=which.changes,
+            layout=which.layout,
+        )
+        return simulate_window(draw, which.number), cutoff_hz
+
+
+def _within(machine: Machine, limits: ConditionRange) -> Machine:
+    """The machine in windows of 60 s, at its commissioned speed, with other ranges of the condition."""
+    window = machine.window.model_copy(update={"length_s": 60.0, "max_span_s": 90.0})
+    operation = machine.operation.model_copy(update={"speed_tolerance": _SPEED_TOLERANCE})
+    return machine.model_copy(update={"window": window, "operation": operation, "condition": limits})
