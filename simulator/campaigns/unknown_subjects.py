@@ -122,7 +122,7 @@ class _Beam:
         rng = _generator(self.rotor.name, seed, commissioning, _Use.COMMISSIONING)
         limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
         condition = drawn_condition(self.rotor, SourceLayout.ONE_SOURCE, limits, {}, rng)
-        sizes = plan(WindowSizes())
+        sizes = plan(self.rotor, WindowSizes())
         duration_s = (sizes.preamble + count * sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
         return tuple(windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)[:count])
 
@@ -134,7 +134,7 @@ class _Beam:
         layout = SourceLayout.ONE_SOURCE if which.layout is Layout.ONE_SOURCE else SourceLayout.INDEPENDENT
         limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
         condition = drawn_condition(self.rotor, layout, limits, which.changes, rng)
-        sizes = plan(WindowSizes())
+        sizes = plan(self.rotor, WindowSizes())
         duration_s = (sizes.preamble + sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
         (window,) = windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)
         return window, cutoff_hz

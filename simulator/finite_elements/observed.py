@@ -1,16 +1,17 @@
 """A finite-element rotor as its sensors see it: samples, windows of the monitor, a recording, a machine file."""
 
 import hashlib
+import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 
-from models.diagnosis.moments import Plan
+from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.physics.matrices import STATE_INDEX
+from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
@@ -28,6 +29,7 @@ __all__ = [
     "WindowSizes",
     "descriptor",
     "machine_file",
+    "machine_of",
     "plan",
     "record_run",
     "sampled",
@@ -41,8 +43,6 @@ MOTION = PROBES[:8]
 
 _START_NS = 1_767_225_600_000_000_000
 _UNITS = {"displacement": ("um", 1e-6), "velocity": ("mm/s", 1e-3), "acceleration": ("m/s2", 1.0)}
-_STATE_ORDER = tuple(sorted(PROBES[:8], key=STATE_INDEX.__getitem__))
-_LAG_STEP_S, _LAG_TO_S = 0.001, 0.125
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,26 +149,21 @@ def _channel(probe: str) -> Channel:
     )
 
 
-def plan(sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True) -> Plan:
-    """Sizes of the sliding window for SI samples as `sampled` gives them."""
-    lags = np.arange(0, round(_LAG_TO_S * RATE_HZ) + 1, round(_LAG_STEP_S * RATE_HZ))
-    segment = round(sizes.segment_s * RATE_HZ)
-    first, last = (round(edge * sizes.segment_s) for edge in sizes.band_hz)
-    order = [name for name in (*_STATE_ORDER, *PROBES[8:]) if name in probes]
-    return Plan(
-        rate_hz=RATE_HZ,
-        states=tuple(order),
-        columns=np.array([probes.index(name) for name in order], dtype=np.intp),
-        scales=np.ones(len(order)),
-        angle_column=len(probes) if phase_reference else None,
-        hop=round(sizes.hop_s * RATE_HZ),
-        preamble=max(int(lags[-1]), segment // 2),
-        segment=segment,
-        lags=lags,
-        bins=np.arange(first, last + 1),
-        hops=round(sizes.length_s / sizes.hop_s),
-        max_span_ns=round(1.5 * sizes.length_s * 1e9),
+def machine_of(
+    rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
+) -> MachineFile:
+    """Load what `machine_file` writes."""
+    return MachineFile.model_validate(
+        tomllib.loads(machine_file(rotor, sizes, probes, phase_reference=phase_reference))
     )
+
+
+def plan(
+    rotor: BeamRotor, sizes: WindowSizes, probes: tuple[str, ...] = MOTION, *, phase_reference: bool = True
+) -> Plan:
+    """Sizes of the monitor's sliding window, for SI samples as `sampled` gives them."""
+    monitored = plan_for(machine_of(rotor, sizes, probes, phase_reference=phase_reference))
+    return replace(monitored, scales=np.ones(len(monitored.states)))
 
 
 def windows_of(samples: FloatArray, sizes: Plan) -> list[WindowStatistics]:

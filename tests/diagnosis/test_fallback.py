@@ -29,7 +29,7 @@ def recorded(seed: int, count: int, change: float = 0.0, condition: int = 1) -> 
     rng = np.random.default_rng([71, condition])
     drawn = drawn_condition(rotor, SourceLayout.ONE_SOURCE, limits, changes, rng)
     samples = sampled(rotor, drawn, count * LENGTH_S + 2.6, [seed, condition], PROBES)
-    return tuple(windows_of(samples, plan(WindowSizes(length_s=LENGTH_S), PROBES)))
+    return tuple(windows_of(samples, plan(rotor, WindowSizes(length_s=LENGTH_S), PROBES)))
 
 
 def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_windows() -> None:
@@ -105,7 +105,7 @@ def test_what_cannot_be_compared_says_why_and_is_neither_changed_nor_healthy() -
         "it does not move": still,
         "not measured": replace(window, states=("psi", "z1", "y2_ddot")),
         "commissioned at": replace(window, speed_rad_s=1.5 * window.speed_rad_s),
-        "speed nan rpm": replace(window, speed_rad_s=float("nan")),
+        "its speed is not known": replace(window, speed_rad_s=float("nan")),
         "its lags differ from the 126 lags up to 0.125 s": replace(window, lags_s=window.lags_s[:50]),
     }
     for reason, case in cases.items():

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from models.diagnosis.moments import plan_for
+from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.physics.excitation import Source, source_spectrum
 from models.signals.channels import ChannelDescriptor
@@ -25,6 +27,7 @@ from simulator.finite_elements.observed import (
     WindowSizes,
     descriptor,
     machine_file,
+    machine_of,
     plan,
     record_run,
     sampled,
@@ -232,7 +235,7 @@ def test_changes_reach_what_they_name() -> None:
 def test_windows_hold_what_the_plan_says_and_see_the_unbalance() -> None:
     rotor = rotor_named("between")
     condition = drawn_condition(rotor, SourceLayout.ONE_SOURCE, COMMISSIONED, {}, np.random.default_rng(3))
-    sizes = plan(WindowSizes(length_s=20.0))
+    sizes = plan(rotor, WindowSizes(length_s=20.0))
     assert sizes.states == ("y1", "y2", "z1", "z2", "y1_dot", "y2_dot", "z1_dot", "z2_dot")
     found = windows_of(sampled(rotor, condition, 43.0, 8), sizes)
     assert [window.duration_s for window in found] == [20.0, 20.0]
@@ -263,6 +266,25 @@ def test_a_recording_is_what_a_live_machine_sends(tmp_path: Path) -> None:
     expected = sampled(rotor, condition, 1.05, 3, probes)
     assert stored * [1e-6, 1e-6, 1.0, 1.0] == pytest.approx(expected, rel=1e-6, abs=1e-12)
     assert [one.log_time_ns for one in messages[1:]] == [block.end_ns for block, _ in blocks]
+
+
+def test_a_recording_read_back_gives_the_windows_that_the_rotor_gives(tmp_path: Path) -> None:
+    rotor, sizes = rotor_named("overhung"), WindowSizes(length_s=20.0)
+    condition = RunCondition(forces(rotor), rotor.speed_rad_s)
+    path = tmp_path / "run.mcap"
+    record_run(path, rotor, condition, 23.0, 3)
+    machine = machine_of(rotor, sizes)
+    monitored, sliding, found = plan_for(machine), SlidingWindow(plan_for(machine)), []
+    for message in read_recording(path, keys={machine.keys.stream}):
+        block, schema = decode_block(message.payload, message.attachment, message.encoding)
+        assert schema == machine.descriptor.schema_hash
+        for _ in sliding.feed(monitored.to_si(block.samples), block.start_ns):
+            found.append(sliding.statistics())
+    (direct,) = windows_of(sampled(rotor, condition, 23.0, 3), plan(rotor, sizes))
+    assert found[-1] is not None
+    assert len(found) == 4
+    scale = np.sqrt(np.outer(np.diag(direct.correlation[0]), np.diag(direct.correlation[0])))
+    assert found[-1].correlation / scale == pytest.approx(direct.correlation / scale, abs=1e-5)
 
 
 def test_the_machine_file_tells_channels_and_sampling_and_nothing_of_the_rotor() -> None:

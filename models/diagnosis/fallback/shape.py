@@ -171,6 +171,8 @@ class HealthyShape(BaseModel):
         if self.speed_rad_s is not None:
             slowest, fastest = self.speed_rad_s
             now = window.speed_rad_s
+            if not math.isfinite(now):
+                return "its speed is not known"
             if not slowest * (1 - _SPEED_TOLERANCE) <= now <= fastest * (1 + _SPEED_TOLERANCE):
                 rpm = 30 / math.pi
                 seen = f"{slowest * rpm:.0f} to {fastest * rpm:.0f} rpm"
