@@ -188,7 +188,7 @@ def plan(hops: int = 12, hop_s: float = 5.0, states: tuple[str, ...] = STATES) -
 def windows(samples: FloatArray, sizes: Plan) -> list[WindowStatistics]:
     """Windows of a recording that do not overlap."""
     sliding, found = SlidingWindow(sizes), []
-    for _ in sliding.feed(samples, 0):
+    for _ in sliding.feed(sizes.to_si(samples), 0):
         statistics = sliding.statistics()
         if statistics is not None:
             found.append(statistics)

@@ -3,12 +3,13 @@
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
+from models.diagnosis.baseline.gain import gain_suspicion
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import (
     Baseline,
@@ -144,13 +145,18 @@ class BaselineDiagnostician:
             else ParameterReading(name, self.by, float(values[names.index(name)]), errors[names.index(name)])
             for name in self._parameters
         )
-        return Diagnosis(
+        diagnosis = Diagnosis(
             by=self.by,
             parameters=parameters,
             covariance=covariance if known else None,
             common=positive(common[np.ix_(known, known)]) if known else None,
             misfit_z=_misfit(changes),
         )
+        suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
+        if suspicion is None:
+            return diagnosis
+        misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
+        return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:
         n = len(self._names)

@@ -2,10 +2,11 @@
 
 import itertools
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from models.diagnosis.baseline.consistency import LeftOut, allowance_of, left_out
 from models.diagnosis.baseline.kernels import LONGEST_LAG_STEP_S
 from models.diagnosis.baseline.kinematics import not_measured, state_of
 from models.diagnosis.baseline.lag_moments import LagMoments, RowWindow, row_window, shared_covariance
@@ -38,6 +39,8 @@ class Baseline:
         Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
     duration_s : float
         Healthy data.
+    consistency : tuple of LeftOut
+        Every healthy window of every row against what the windows of other conditions teach.
     """
 
     relations: tuple[Relation | None, ...]
@@ -45,6 +48,7 @@ class Baseline:
     covariance: FloatArray
     rotations: tuple[Rotation, ...]
     duration_s: float
+    consistency: tuple[LeftOut, ...] = ()
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -95,23 +99,30 @@ def learn_baseline(
             raise EstimationError(f"healthy window: {reason}")
     states = tuple(name for name in windows[0].states if all(name in window.states for window in windows))
     learned = learned_rows(rows)
+    groups = ("",) * len(windows) if conditions is None else tuple(conditions)
     relations: list[Relation | None] = []
     reasons, parts = [], []
+    consistency: list[LeftOut] = []
     for row in learned:
         relation, contributions, reason = _learn(row, windows, states)
+        if relation is not None:
+            found = left_out(row, [one.moments for one in contributions], groups)
+            relation = replace(relation, allowance=allowance_of(found))
+            consistency += found
         relations.append(relation)
         reasons.append(reason)
         parts.append(contributions)
     if all(relation is None for relation in relations):
         raise EstimationError("; ".join(dict.fromkeys(reasons)))
     coordinates = _coordinates(rows, learned, relations)
-    found = [rotation_of(window, coordinates) for window in windows]
+    rotations = [rotation_of(window, coordinates) for window in windows]
     return Baseline(
         relations=tuple(relations),
         reasons=tuple(reasons),
         covariance=_covariance(learned, relations, parts),
-        rotations=rotations_by_speed([one for one in found if one is not None]),
+        rotations=rotations_by_speed([one for one in rotations if one is not None]),
         duration_s=sum(window.duration_s for window in windows),
+        consistency=tuple(consistency),
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from models.diagnosis.baseline.excitation import lag_beyond_memory
+from models.diagnosis.baseline.flatness import stretching
 from models.diagnosis.baseline.lag_moments import LAG_FROM_S, LagMoments, RowWindow, inverse
 from models.diagnosis.baseline.rows import Row
 from models.errors import EstimationError
@@ -21,6 +22,7 @@ __all__ = ["Contribution", "Relation", "RowChange", "change_of", "fit_row", "lag
 
 _ITERATIONS = 8
 _FITS = 3.0  # standard deviations of χ² within which a relation is taken to fit
+_LAG_ROUNDS = 2
 _CONVERGED = 1e-4  # standard errors
 
 
@@ -43,6 +45,9 @@ class Relation:
     misfit : float
         χ² of the fit per degree of freedom.
     degrees_of_freedom : int
+    allowance : float
+        Factor on the variances of every later window, from how well the relation holds in conditions that it was not
+        learned in; at least 1.
     """
 
     row: str
@@ -52,6 +57,7 @@ class Relation:
     covariance: FloatArray
     misfit: float
     degrees_of_freedom: int
+    allowance: float = 1.0
 
     @property
     def combination(self) -> FloatArray:
@@ -90,7 +96,7 @@ class RowChange:
     combination : ndarray, shape (n_terms,)
         The window's own force.
     widening : float
-        Scatter from hop to hop over what the spectra expect, at least 1.
+        Scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance.
     chi2 : float
         What the change leaves, in units of all its errors.
     degrees_of_freedom : int
@@ -130,13 +136,18 @@ class Fit:
 
 
 def _prior(row: Row, start: FloatArray, *, minimal: bool) -> FloatArray:
-    """Precision of the coefficients expected beforehand; `minimal` leaves out what can be left out."""
-    precision = np.zeros(row.n_coefficients)
+    """Precision of what is expected of the coefficients, shape (n, n); `minimal` leaves out what can be left out."""
+    precision = np.zeros((row.n_coefficients, row.n_coefficients))
     for number, term in enumerate(row.terms[1:]):
         spread = term.without if minimal and term.without is not None else term.spread
-        if spread is not None:
-            unit = 1.0 if term.in_units_of is None else start[term.in_units_of - 1]
-            precision[number] = 1 / (spread * unit) ** 2
+        if spread is None:
+            continue
+        along, unit = np.zeros(row.n_coefficients), 1.0
+        along[number] = 1.0
+        if term.in_units_of is not None:
+            along[term.in_units_of - 1] = -term.about
+            unit = start[term.in_units_of - 1]
+        precision += np.outer(along, along) / (spread * unit) ** 2
     return precision
 
 
@@ -154,11 +165,20 @@ def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
 
 
 def lags_of(row: Row, windows: Sequence[RowWindow]) -> list[float]:
-    """Shortest lag of every window, beyond its excitation's memory, from a first fit."""
+    """Shortest lag of every window, beyond its excitation's memory, from first fits.
+
+    The colour of the force is known as well as the relation is. Of the fits without and with the optional terms the one
+    that remembers longer is believed, twice.
+    """
     parts = [window.beyond(LAG_FROM_S) for window in windows]
-    start = _start(row, parts)
-    combination = np.concatenate([[1.0], -_fit(parts, start, _prior(row, start, minimal=False)).coefficients])
-    return [lag_beyond_memory(window, combination) for window in windows]
+    lags = [0.0] * len(windows)
+    for _ in range(_LAG_ROUNDS):
+        for fit in fit_row(row, parts):
+            combination = np.concatenate([[1.0], -fit.coefficients])
+            found = [lag_beyond_memory(window, combination) for window in windows]
+            lags = [max(one, other) for one, other in zip(lags, found, strict=True)]
+        parts = [window.beyond(lag) for window, lag in zip(windows, lags, strict=True)]
+    return lags
 
 
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
@@ -175,7 +195,7 @@ def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
     return _fit(parts, full.coefficients, _prior(row, start, minimal=True)), full
 
 
-def learn_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Relation, list[Contribution]]:
+def learn_row(row: Row, parts: Sequence[LagMoments], *, widened: bool = True) -> tuple[Relation, list[Contribution]]:
     """Learn the relation of a row.
 
     Parameters
@@ -183,6 +203,8 @@ def learn_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Relation, list[Con
     row : Row
     parts : sequence of LagMoments
         One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
+    widened : bool
+        Whether the covariance is widened to what the windows object to (`flatness`), which takes most of the time.
 
     Raises
     ------
@@ -194,10 +216,10 @@ def learn_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Relation, list[Con
     # its covariance says, to where the terms' own noise hides the misfit.
     minimal, full = fit_row(row, parts)
     chosen, covariance = full, full.covariance
+    prior = _prior(row, _start(row, parts), minimal=False)
     if minimal.fits:
-        start = _start(row, parts)
         chosen = minimal
-        covariance = _fit(parts, minimal.coefficients, _prior(row, start, minimal=False), iterations=1).covariance
+        covariance = _fit(parts, minimal.coefficients, prior, iterations=1).covariance
     b = chosen.coefficients
     spread = np.sqrt(np.diag(covariance))
     for own in row.own:
@@ -209,13 +231,16 @@ def learn_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Relation, list[Con
                     "more than the unbalance moves the machine"
                 )
     misfit = chosen.chi2 / chosen.degrees_of_freedom
+    stretch = np.sqrt(max(1.0, misfit)) * np.eye(b.size)
+    if widened:
+        stretch = stretch @ stretching(parts, b, covariance, prior)
     first = parts[0].of
     relation = Relation(
         row=row.name,
         states=first.formation.states,
         references=first.references,
         coefficients=b,
-        covariance=covariance * max(1.0, misfit),
+        covariance=stretch @ covariance @ stretch.T,
         misfit=misfit,
         degrees_of_freedom=chosen.degrees_of_freedom,
     )
@@ -223,7 +248,7 @@ def learn_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Relation, list[Con
     for part in parts:
         W, kept = inverse(part.covariance(relation.combination))
         widening = max(1.0, part.scatter(relation.combination, W, kept))
-        contributions.append(Contribution(part, covariance @ part.values[:, 1:].T @ W / widening))
+        contributions.append(Contribution(part, stretch @ covariance @ part.values[:, 1:].T @ W / widening))
     return relation, contributions
 
 
@@ -251,7 +276,7 @@ def _least_squares(Q: FloatArray, C: FloatArray, prior: FloatArray) -> tuple[Flo
     scale = 1 / np.sqrt(np.diag(Q))
     root = float(eigh(Q * np.outer(scale, scale), C * np.outer(scale, scale), eigvals_only=True)[0])
     k = min(1.0, root)
-    normal = Q[1:, 1:] - k * C[1:, 1:] + np.diag(prior)
+    normal = Q[1:, 1:] - k * C[1:, 1:] + prior
     unit = 1 / np.sqrt(np.diag(normal))
     covariance = np.linalg.pinv(normal * np.outer(unit, unit), hermitian=True) * np.outer(unit, unit)
     return covariance @ (Q[1:, 0] - k * C[1:, 0]), covariance
@@ -294,12 +319,12 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
         combination = signatures @ np.concatenate([[1.0], -d])
         own_covariance = moments.covariance(combination)
         W_own, own_rank = inverse(own_covariance)
-        widening = max(1.0, moments.scatter(combination, W_own, own_rank))
+        widening = max(1.0, moments.scatter(combination, W_own, own_rank)) * relation.allowance
         W, rank = inverse(own_covariance * widening + uncertain)
         Q = Z.T @ W @ Z
         C = signatures.T @ moments.noise(W) @ signatures * widening
         before = d
-        d, covariance = _least_squares(Q, C, np.zeros(d.size))
+        d, covariance = _least_squares(Q, C, np.zeros((d.size, d.size)))
         if np.all(np.abs(d - before) <= _CONVERGED * np.sqrt(np.abs(np.diag(covariance)))):
             break
     if not np.all(np.diag(covariance) > 0):

@@ -31,7 +31,9 @@ class Term:
     spread : float or None
         Standard deviation expected beforehand of the coefficient; None where nothing is expected.
     in_units_of : int or None
-        Term whose coefficient `spread` is a multiple of.
+        Term whose coefficient `spread` and `about` are multiples of.
+    about : float
+        Value expected beforehand.
     without : float or None
         Expected spread of a term that is left out wherever the relation holds without it.
     times_speed : bool
@@ -41,6 +43,7 @@ class Term:
     motions: tuple[Motion, ...]
     spread: float | None = None
     in_units_of: int | None = None
+    about: float = 0.0
     without: float | None = None
     times_speed: bool = False
 
@@ -120,7 +123,8 @@ def _bearing_and_disc(plane: str) -> tuple[Term, ...]:
         Term((Motion(one, 0),)),
         Term((Motion(one, 1),)),
         Term((Motion(two, 2),)),
-        Term((Motion(one, 2),), spread=1.0, in_units_of=2),
+        # what moves with the bearing, from next to nothing to as much as the disc
+        Term((Motion(one, 2),), spread=0.4, in_units_of=2, about=0.4),
         Term((Motion(two, 0), Motion(one, 0, -1.0)), spread=0.5, without=0.02),
     )
 

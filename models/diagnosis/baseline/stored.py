@@ -1,155 +1,254 @@
-"""A baseline as JSON: a few hundred numbers, no code, back again bit for bit."""
+"""A baseline as JSON: some hundred numbers and no code, restored to the last bit.
 
-from typing import Annotated, Self
+Numbers are written with as many digits as it takes to read the same number back, so that a restored baseline gives the
+same diagnoses as the one that was stored.
+"""
+
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from models.diagnosis.baseline.consistency import Agreement, LeftOut
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import Baseline
 from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import Rotation
 from models.signals.block import FloatArray
 
-__all__ = ["BaselineRecord", "RelationRecord", "RotationRecord"]
+__all__ = ["BaselineRecord", "RelationRecord", "RotationRecord", "from_json", "to_json"]
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
-_Finite = Annotated[float, Field(allow_inf_nan=False)]
-_Vector = tuple[_Finite, ...]
+_STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Vector = tuple[_Number, ...]
 _Matrix = tuple[_Vector, ...]
 
 
-def _vector(values: FloatArray) -> _Vector:
-    return tuple(values.tolist())
-
-
-def _matrix(values: FloatArray) -> _Matrix:
-    return tuple(tuple(row) for row in values.tolist())
-
-
-def _check_square(name: str, matrix: _Matrix, size: int) -> None:
-    if len(matrix) != size or any(len(row) != size for row in matrix):
-        raise ValueError(f"{name} is not {size} by {size}")
-
-
 class RelationRecord(BaseModel):
-    """One relation, see `models.diagnosis.baseline.relation.Relation`."""
+    """One learned row."""
 
     model_config = _STRICT
 
     row: str
-    states: tuple[str, ...]
-    references: tuple[str, ...]
-    coefficients: _Vector
+    states: tuple[str, ...] = Field(min_length=1)
+    references: tuple[str, ...] = Field(min_length=1)
+    coefficients: _Vector = Field(min_length=1)
     covariance: _Matrix
-    misfit: float = Field(ge=0, allow_inf_nan=False)
+    misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     degrees_of_freedom: int = Field(ge=1)
+    allowance: Annotated[float, Field(ge=1, allow_inf_nan=False)] = 1.0
 
     @model_validator(mode="after")
-    def _sized(self) -> Self:
-        _check_square("covariance", self.covariance, len(self.coefficients))
+    def _square(self) -> Self:
+        _check_covariance(f"row {self.row}", self.covariance, len(self.coefficients))
         return self
 
 
 class RotationRecord(BaseModel):
-    """Synchronous vectors at one speed, see `models.diagnosis.baseline.unbalance.Rotation`."""
+    """Synchronous vectors at one speed."""
 
     model_config = _STRICT
 
-    coordinates: tuple[str, ...]
+    coordinates: tuple[str, ...] = Field(min_length=1)
     vectors: _Vector
     covariance: _Matrix
-    speed_rad_s: float = Field(gt=0, allow_inf_nan=False)
+    speed_rad_s: _Number
 
     @model_validator(mode="after")
-    def _sized(self) -> Self:
+    def _square(self) -> Self:
         size = 2 * len(self.coordinates)
         if len(self.vectors) != size:
-            raise ValueError(f"vectors are {len(self.vectors)}, expected {size}")
-        _check_square("covariance", self.covariance, size)
+            raise ValueError(f"{len(self.vectors)} numbers in vectors, {size} are expected of {len(self.coordinates)}")
+        _check_covariance("rotation", self.covariance, size)
         return self
 
 
-class BaselineRecord(BaseModel):
-    """A baseline, see `models.diagnosis.baseline.learned.Baseline`."""
+class _AgreementRecord(BaseModel):
+    """A healthy window's reading of one parameter against the others."""
 
     model_config = _STRICT
 
+    parameter: str
+    change: _Number
+    standard_error: _Positive
+
+
+class _LeftOutRecord(BaseModel):
+    """A healthy window against the others."""
+
+    model_config = _STRICT
+
+    row: str
+    window: int = Field(ge=0)
+    condition: str
+    agreements: tuple[_AgreementRecord, ...]
+    misfit: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    degrees_of_freedom: int = Field(ge=1)
+
+
+class BaselineRecord(BaseModel):
+    """What was learned on a healthy machine, as plain numbers.
+
+    Attributes
+    ----------
+    relations : tuple
+        One for each learned row, or null.
+    reasons : tuple of str
+        Why there is none.
+    covariance : tuple of tuple of float
+        Of the coefficients of all rows.
+    rotations : tuple
+        Synchronous vectors by speed.
+    duration_s : float
+    consistency : tuple
+        Healthy windows against each other.
+    """
+
+    model_config = _STRICT
+
+    format: Literal[1] = 1
     relations: tuple[RelationRecord | None, ...]
     reasons: tuple[str, ...]
     covariance: _Matrix
     rotations: tuple[RotationRecord, ...]
-    duration_s: float = Field(gt=0, allow_inf_nan=False)
+    duration_s: _Positive
+    consistency: tuple[_LeftOutRecord, ...] = ()
 
     @model_validator(mode="after")
-    def _sized(self) -> Self:
-        if len(self.reasons) != len(self.relations):
-            raise ValueError(f"reasons are {len(self.reasons)}, expected {len(self.relations)}")
-        _check_square("covariance", self.covariance, len(self.covariance))
+    def _complete(self) -> Self:
+        if len(self.relations) != len(self.reasons):
+            raise ValueError(f"{len(self.relations)} relations have {len(self.reasons)} reasons")
+        for relation, reason in zip(self.relations, self.reasons, strict=True):
+            if (relation is None) == (reason == ""):
+                raise ValueError("a relation is there, or a reason why not; never both or neither")
+        _check_covariance("coefficients", self.covariance, len(self.covariance))
         return self
 
     @classmethod
-    def of(cls, baseline: Baseline) -> "BaselineRecord":
-        """What a baseline looks like on disk."""
+    def of(cls, baseline: Baseline) -> Self:
+        """Record of a baseline.
+
+        Raises
+        ------
+        pydantic.ValidationError
+            If a number in it is not finite.
+        """
         return cls(
             relations=tuple(None if one is None else _relation(one) for one in baseline.relations),
             reasons=baseline.reasons,
-            covariance=_matrix(baseline.covariance),
-            rotations=tuple(
-                RotationRecord(
-                    coordinates=one.coordinates,
-                    vectors=_vector(one.vectors),
-                    covariance=_matrix(one.covariance),
-                    speed_rad_s=one.speed_rad_s,
-                )
-                for one in baseline.rotations
-            ),
-            duration_s=baseline.duration_s,
-        )
-
-    def baseline(self) -> Baseline:
-        """The baseline it describes."""
-        return Baseline(
-            relations=tuple(
-                None
-                if one is None
-                else Relation(
-                    one.row,
-                    one.states,
-                    one.references,
-                    np.array(one.coefficients, dtype=np.float64),
-                    np.array(one.covariance, dtype=np.float64),
-                    one.misfit,
-                    one.degrees_of_freedom,
-                )
-                for one in self.relations
-            ),
-            reasons=self.reasons,
-            covariance=np.array(self.covariance, dtype=np.float64),
-            rotations=tuple(
-                Rotation(
-                    one.coordinates,
-                    np.array(one.vectors, dtype=np.float64),
-                    np.array(one.covariance, dtype=np.float64),
-                    one.speed_rad_s,
-                )
-                for one in self.rotations
-            ),
-            duration_s=self.duration_s,
+            covariance=_rows(baseline.covariance),
+            rotations=tuple(_rotation(one) for one in baseline.rotations),
+            duration_s=float(baseline.duration_s),
+            consistency=tuple(_left_out(one) for one in baseline.consistency),
         )
 
     def diagnostician(self) -> BaselineDiagnostician:
         """What reads windows against it."""
         return BaselineDiagnostician(self.baseline())
 
+    def baseline(self) -> Baseline:
+        """The baseline, to the last bit."""
+        return Baseline(
+            relations=tuple(None if one is None else _restored(one) for one in self.relations),
+            reasons=self.reasons,
+            covariance=_array(self.covariance),
+            rotations=tuple(
+                Rotation(one.coordinates, _array(one.vectors), _array(one.covariance), one.speed_rad_s)
+                for one in self.rotations
+            ),
+            duration_s=self.duration_s,
+            consistency=tuple(
+                LeftOut(
+                    row=one.row,
+                    window=one.window,
+                    condition=one.condition,
+                    agreements=tuple(
+                        Agreement(each.parameter, each.change, each.standard_error) for each in one.agreements
+                    ),
+                    misfit=one.misfit,
+                    degrees_of_freedom=one.degrees_of_freedom,
+                )
+                for one in self.consistency
+            ),
+        )
 
-def _relation(relation: Relation) -> RelationRecord:
+
+def to_json(baseline: Baseline) -> str:
+    """Write a baseline as JSON."""
+    return BaselineRecord.of(baseline).model_dump_json()
+
+
+def from_json(text: str | bytes) -> Baseline:
+    """Read a baseline from JSON.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        Naming what is missing, not finite or of the wrong shape.
+    """
+    return BaselineRecord.model_validate_json(text).baseline()
+
+
+def _check_covariance(of: str, matrix: _Matrix, size: int) -> None:
+    if len(matrix) != size or any(len(row) != size for row in matrix):
+        raise ValueError(f"{of}: covariance is not {size} by {size}")
+    if any(matrix[i][i] < 0 for i in range(size)):
+        raise ValueError(f"{of}: a variance is negative")
+
+
+def _relation(one: Relation) -> RelationRecord:
     return RelationRecord(
-        row=relation.row,
-        states=relation.states,
-        references=relation.references,
-        coefficients=_vector(relation.coefficients),
-        covariance=_matrix(relation.covariance),
-        misfit=relation.misfit,
-        degrees_of_freedom=relation.degrees_of_freedom,
+        row=one.row,
+        states=one.states,
+        references=one.references,
+        coefficients=tuple(one.coefficients.tolist()),
+        covariance=_rows(one.covariance),
+        misfit=float(one.misfit),
+        degrees_of_freedom=one.degrees_of_freedom,
+        allowance=float(one.allowance),
     )
+
+
+def _restored(one: RelationRecord) -> Relation:
+    return Relation(
+        row=one.row,
+        states=one.states,
+        references=one.references,
+        coefficients=_array(one.coefficients),
+        covariance=_array(one.covariance),
+        misfit=one.misfit,
+        degrees_of_freedom=one.degrees_of_freedom,
+        allowance=one.allowance,
+    )
+
+
+def _rotation(one: Rotation) -> RotationRecord:
+    return RotationRecord(
+        coordinates=one.coordinates,
+        vectors=tuple(one.vectors.tolist()),
+        covariance=_rows(one.covariance),
+        speed_rad_s=float(one.speed_rad_s),
+    )
+
+
+def _left_out(one: LeftOut) -> _LeftOutRecord:
+    return _LeftOutRecord(
+        row=one.row,
+        window=one.window,
+        condition=one.condition,
+        agreements=tuple(
+            _AgreementRecord(parameter=each.parameter, change=each.change, standard_error=each.standard_error)
+            for each in one.agreements
+        ),
+        misfit=float(one.misfit),
+        degrees_of_freedom=one.degrees_of_freedom,
+    )
+
+
+def _rows(matrix: FloatArray) -> _Matrix:
+    return tuple(tuple(row) for row in matrix.tolist())
+
+
+def _array(numbers: _Vector | _Matrix) -> FloatArray:
+    return np.array(numbers, dtype=np.float64)
