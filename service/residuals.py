@@ -235,7 +235,8 @@ class BaselineEvaluator:
         self._conditions = commissioned.conditions
         self._shape = commissioned.shape
         self._length_s = machine.window.length_s
-        self._baseline = None if commissioned.baseline is None else commissioned.baseline.diagnostician()
+        record = commissioned.baseline
+        self._baseline = None if record is None else record.diagnostician()
 
     @property
     def by(self) -> str:

@@ -68,7 +68,7 @@ def test_what_was_commissioned_comes_back_from_its_file(machine: MachineFile, le
         window = healthy(machine, HEALTHY_S, 43).windows()[0]
         fresh = made.commissioned.baseline
         assert fresh is not None
-        first, second = fresh.diagnostician().diagnose(window), again.baseline.diagnostician().diagnose(window)
+        first, second = (one.diagnostician().diagnose(window) for one in (fresh, again.baseline))
         assert first.parameters == second.parameters
 
 

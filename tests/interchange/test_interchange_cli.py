@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 
-from models.machine import load_machine
+from models.machine import load_machine_file
 from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
 from tests.interchange.material import stretches
 
@@ -47,7 +47,7 @@ def test_the_example_goes_through_import_and_export(tmp_path: Path) -> None:
     assert "20000 samples in 100 blocks, 2026-01-01T00:00:00.000000Z to 2026-01-01T00:00:10.000000Z" in found.stdout
     assert "gaps: none" in found.stdout
     assert "keyphasor: 296 pulses, 1773 rpm on average" in found.stdout
-    (stretch,) = stretches(recording, load_machine(machine))
+    (stretch,) = stretches(recording, load_machine_file(machine))
     np.testing.assert_allclose(stretch.samples[:, :8], expected, rtol=1e-6, atol=1e-6)
     out = tmp_path / "healthy.parquet"
     found = run("export", recording, "--to", "parquet", "--out", out, "--to-time", "2026-01-01T00:00:02Z")

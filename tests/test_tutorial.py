@@ -1,0 +1,82 @@
+"""The tutorial: every command in it is run, and what it says of the rotor is so."""
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+_COMMANDS = [line for block in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in block.splitlines() if line]
+_PROGRAMS = {"rotorwatch": "service.rotorwatch", "rotortrain": "simulator.rotortrain"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The example's folder after all commands."""
+    first, *commands = _COMMANDS
+    assert first == "cd docs/examples/fe_rotor"
+    place = tmp_path_factory.mktemp("tutorial") / "fe_rotor"
+    shutil.copytree(ROOT / "docs" / "examples" / "fe_rotor", place, ignore=shutil.ignore_patterns("*.mcap"))
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    for command in commands:
+        program, *arguments = command.split()
+        words = [sys.executable, "-m", _PROGRAMS[program]] if program in _PROGRAMS else [program]
+        found = subprocess.run(
+            [*words, *arguments], cwd=place, env=variables, capture_output=True, text=True, timeout=250, check=False
+        )
+        assert found.returncode == 0, f"{command}: {found.stdout}{found.stderr}"
+    return place
+
+
+def reports(folder: Path, name: str) -> list[dict[str, Any]]:
+    lines = (folder / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+    messages = [json.loads(line) for line in lines]
+    return [entry["message"] for entry in messages if entry["topic"].endswith("/report")]
+
+
+def alarms(folder: Path, name: str) -> list[dict[str, Any]]:
+    lines = (folder / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+    return [entry["message"]["data"] for entry in map(json.loads, lines) if "/alarm/event" in entry["topic"]]
+
+
+def test_nothing_is_raised_on_the_healthy_half_that_was_not_seen(folder: Path) -> None:
+    found = [report for report in reports(folder, "healthy") if report["filled"] == 1.0]
+    assert len(found) > 15
+    assert {report["state"] for report in found} == {"healthy"}
+    assert not alarms(folder, "healthy")
+    assert all(not report["verdict"]["changed"] for report in found)
+
+
+def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
+    first, second, *rest = [report for report in reports(folder, "changed") if report["filled"] == 1.0]
+    named = [[finding["name"] for finding in report["verdict"]["changed"]] for report in (first, second, *rest)]
+    assert named[1] == ["k_by"]
+    assert all(names in ([], ["k_by"]) for names in named)
+    for report in (second, *rest):
+        by_name = {reading["name"]: reading for reading in report["parameters"]}
+        low, high = by_name["k_by"]["interval_95"]
+        assert low < high < -0.05
+        for name in ("c_by", "k_bz", "c_bz", "e"):
+            assert abs(by_name[name]["z"]) < 3.5, name
+    (alarm,) = alarms(folder, "changed")
+    assert (alarm["parameter"], alarm["kind"]) == ("k_by", "raised")
+    assert alarm["text"] in PAGE
+
+
+def test_what_the_commissioning_said_is_on_the_page(folder: Path) -> None:
+    report = json.loads((folder / "bundle" / "report.json").read_text(encoding="utf-8"))
+    assert report["level"] == "none"
+    assert report["verdict"] == "limited"
+    loss = {one["name"]: one["detectable_loss"] for one in report["parameters"]}
+    assert f"{-loss['k_by']:.0%}".replace("%", " %") in PAGE
+    assert loss["c_by"] < -0.5
+    assert (folder / "bundle" / "report.html").stat().st_size > 10_000
+    assert (folder / "changed.png").stat().st_size > 10_000
+    assert len((folder / "changed.csv").read_text(encoding="utf-8").splitlines()) > 10_000
