@@ -342,7 +342,7 @@ def unknown(
     """Commission machines without telling their parameters, and count what is found on them later.
 
     Rotors of finite elements and the shipped machines. Every window is kept, so an interrupted campaign carries on
-    where it stopped.
+    where it stopped; for another version of this program take another directory.
 
     Example: rotortrain unknown --machine overhung --windows 100 --out unknown
     """

@@ -19,8 +19,7 @@ from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
 from simulator.finite_elements.machines import ROTORS, rotor_named
 from simulator.finite_elements.observed import WindowSizes, plan, sampled, windows_of
 from simulator.finite_elements.rotor import BeamRotor
-from simulator.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
-from simulator.finite_elements.scenes import ConditionRange as SceneRange
+from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 
 __all__ = ["SHIPPED", "SUBJECTS", "Later", "Subject", "subject_named"]
 

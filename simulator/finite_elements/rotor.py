@@ -45,7 +45,9 @@ class Bearing:
     housing_kg : float
         Mass that moves with it.
     cubic_N_per_m3 : float
-        Force that grows with the third power of the displacement, in y and in z.
+        Force over the third power of the displacement, in y.
+    cubic_ratio_z : float
+        The same in z over that in y.
     """
 
     node: int
@@ -58,7 +60,6 @@ class Bearing:
     housing_kg: float = 0.0
     cubic_N_per_m3: float = 0.0
     cubic_ratio_z: float = 1.0
-    """Cubic stiffness in z over that in y."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from simulator.finite_elements.forces import Force, covariance_under
 from simulator.finite_elements.observed import RunCondition
 from simulator.finite_elements.rotor import BeamRotor
 
-__all__ = ["COMMISSIONED", "ConditionRange", "SourceLayout", "drawn_condition"]
+__all__ = ["COMMISSIONED", "SceneRange", "SourceLayout", "drawn_condition"]
 
 
 class SourceLayout(StrEnum):
@@ -23,7 +23,7 @@ class SourceLayout(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class ConditionRange:
+class SceneRange:
     """From and to of everything that is drawn, uniformly.
 
     Attributes
@@ -42,14 +42,14 @@ class ConditionRange:
     speed_relative: tuple[float, float] = (0.99, 1.01)
 
 
-COMMISSIONED = ConditionRange(cutoff_hz=(80.0, 80.0), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02))
+COMMISSIONED = SceneRange(cutoff_hz=(80.0, 80.0), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02))
 """One cutoff and one level, as a healthy recording has them."""
 
 
 def drawn_condition(
     rotor: BeamRotor,
     layout: SourceLayout,
-    limits: ConditionRange,
+    limits: SceneRange,
     changes: dict[str, float],
     rng: np.random.Generator,
 ) -> RunCondition:

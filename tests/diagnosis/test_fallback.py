@@ -14,7 +14,7 @@ from models.errors import EstimationError
 from models.physics.parameters import PARAMETERS
 from simulator.finite_elements.machines import rotor_named
 from simulator.finite_elements.observed import WindowSizes, plan, sampled, windows_of
-from simulator.finite_elements.scenes import COMMISSIONED, ConditionRange, SourceLayout, drawn_condition
+from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 
 PROBES = ("y1", "z1", "y2_ddot")
 LENGTH_S = 20.0
@@ -24,7 +24,7 @@ LENGTH_S = 20.0
 def recorded(seed: int, count: int, change: float = 0.0, condition: int = 1) -> tuple[WindowStatistics, ...]:
     """One recording; `condition` 1 is that of commissioning, others have a cutoff of their own."""
     rotor = rotor_named("overhung")
-    limits = COMMISSIONED if condition == 1 else replace(ConditionRange(), speed_relative=(1.0, 1.0))
+    limits = COMMISSIONED if condition == 1 else replace(SceneRange(), speed_relative=(1.0, 1.0))
     changes = {"k_by": change} if change else {}
     rng = np.random.default_rng([71, condition])
     drawn = drawn_condition(rotor, SourceLayout.ONE_SOURCE, limits, changes, rng)
