@@ -15,6 +15,7 @@ import numpy.typing as npt
 from models.diagnosis.likelihood.bins import BinGroups, group_bins
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import goodness_of_fit
+from models.diagnosis.likelihood.integrated import integrated
 from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Workspace
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
@@ -92,6 +93,7 @@ class LikelihoodFit:
             If a channel has no power in the band (a dead sensor), two carry the same signal, the search finds no
             maximum, or nothing within the model comes near the window.
         """
+        window = integrated(window)
         speed = self._speed(window)
         excluded = _near_rotation(window.frequencies_hz, speed)
         power = self._checked_power(window, ~excluded)
@@ -131,6 +133,7 @@ class LikelihoodFit:
             None if there is no such window, or the stretch says anything that the window does not: diagnose it then.
             Whether the stretch is outside the model is not tested closely, so there is no misfit.
         """
+        stretch = integrated(stretch)
         line, speed = self._line, self._speed(stretch)
         if line is None:
             return None
