@@ -14,6 +14,7 @@ import numpy as np
 
 from models.commissioning.commissioned import Commissioned, IdentifiedRecord
 from models.commissioning.installed import Installed
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.likelihood.lengths import LengthFits
@@ -235,13 +236,12 @@ class BaselineEvaluator:
         self._conditions = commissioned.conditions
         self._shape = commissioned.shape
         self._length_s = machine.window.length_s
-        record = commissioned.baseline
-        self._baseline = None if record is None else record.diagnostician()
+        self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
 
     @property
     def by(self) -> str:
         """The baseline, or nothing but the shapes of channels."""
-        return _SHAPE if self._baseline is None else self._baseline.by
+        return self._baselines[0][1].by if self._baselines else _SHAPE
 
     @property
     def takes_short(self) -> bool:
@@ -260,14 +260,24 @@ class BaselineEvaluator:
         if outside:
             raise EstimationError(f"{self._place}: not evaluable here: {outside}")
         speed = float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else None
-        if self._baseline is not None:
-            deciding = determined(self._baseline.diagnose(window), window, self._length_s)
+        if self._baselines:
+            deciding = determined(self._baseline_for(window).diagnose(window), window, self._length_s)
         else:
             deciding = Diagnosis(
                 _SHAPE, tuple(ParameterReading(name, _SHAPE, reason=_TOO_FEW) for name in PARAMETERS), covariance=_EMPTY
             )
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window)
         return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
+
+    def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:
+        """The baseline of these conditions."""
+        reasons = []
+        for conditions, baseline in self._baselines:
+            outside = conditions.outside(window)
+            if not outside:
+                return baseline
+            reasons.append(outside)
+        raise EstimationError(f"{self._place}: not evaluable here: {'; '.join(reasons)}")
 
 
 def _row_readings(deciding: Diagnosis, window: WindowStatistics) -> tuple[EquationReading, ...]:

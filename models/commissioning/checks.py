@@ -6,9 +6,11 @@ from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.stats import norm
 
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.lines import foreign_lines
+from models.diagnosis.baseline.consistency import LeftOut
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.isolation import isolate_window
@@ -16,7 +18,17 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.physics.parameters import PARAMETER_TEXT
 
-__all__ = ["Check", "check_agreement", "check_data", "check_halves", "check_lines", "check_sensors_of", "check_steady"]
+__all__ = [
+    "SAME_SPEED",
+    "Check",
+    "check_agreement",
+    "check_data",
+    "check_halves",
+    "check_lines",
+    "check_recordings",
+    "check_sensors_of",
+    "check_steady",
+]
 
 _FEWEST_HOPS = 8
 _FEW_WINDOWS = 6
@@ -24,6 +36,8 @@ _MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
 _STEADY_SPEED = 0.05
 _STEADY_LEVEL = 2.0
 """Ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute."""
+SAME_SPEED = 0.03
+"""Relative difference within which speeds count as one."""
 _RATE = 1e-3
 """Probability that a healthy machine fails a comparison of its own windows."""
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5
@@ -142,6 +156,54 @@ def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
     )
     dominant = any(line.share > _DOMINANT_LINE for _, line in loud)
     return Check(name=name, verdict="refused" if dominant else "limited", text=text, advice=advice)
+
+
+def check_recordings(consistency: Sequence[LeftOut], speeds_rad_s: Mapping[str, float]) -> Check | None:
+    """Whether the recordings tell of one machine, each read against what the others teach; None for a single one.
+
+    Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
+    limits what can be said between the speeds.
+
+    Parameters
+    ----------
+    consistency : sequence of LeftOut
+    speeds_rad_s : mapping of str to float
+        Mean speed of each recording.
+    """
+    name = "recordings agree"
+    if len(speeds_rad_s) < 2:
+        return None
+    readings = [(abs(a.z), a, one.condition) for one in consistency for a in one.agreements]
+    if not readings:
+        text = "the recordings cannot be compared: none teaches enough without the others"
+        return Check(
+            name=name, verdict="limited", text=text, advice="record at least two full windows of each condition"
+        )
+    worst, agreement, recording = max(readings, key=lambda each: each[0])
+    limit = float(norm.isf(_RATE / (2 * len(readings))))
+    if worst <= limit:
+        return Check(
+            name=name, verdict="passed", text=f"one relation holds in all: at most {worst:.1f} standard errors"
+        )
+    text = (
+        f"{PARAMETER_TEXT[agreement.parameter]} of {recording} differs from the other recordings by "
+        f"{agreement.change:+.1%}, {worst:.1f} standard errors"
+    )
+    speeds = sorted(speeds_rad_s.values())
+    if speeds[-1] <= speeds[0] * (1 + SAME_SPEED) or not np.all(np.isfinite(speeds)):
+        return Check(
+            name=name,
+            verdict="refused",
+            text=f"{text}, at one speed",
+            advice="the machine was not the same in all of them, or the load changes its bearing: commission on "
+            "recordings of one load, or find out what changed",
+        )
+    return Check(
+        name=name,
+        verdict="limited",
+        text=f"{text}; a baseline is kept for each speed, and nothing is said between the speeds",
+        advice="record at more speeds between these if the machine runs there",
+    )
 
 
 def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:

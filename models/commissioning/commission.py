@@ -1,49 +1,36 @@
 """Commission a machine from healthy recordings, with as much physics as its file gives."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import pairwise
 
 import numpy as np
 
 from models.commissioning.checks import (
     Check,
-    check_agreement,
     check_data,
-    check_halves,
     check_lines,
     check_sensors_of,
     check_steady,
 )
-from models.commissioning.commissioned import Commissioned, IdentifiedRecord, RecordingEntry, described
+from models.commissioning.commissioned import (
+    Commissioned,
+    RecordingEntry,
+    described,
+)
 from models.commissioning.conditions import OperatingRange
 from models.commissioning.healthy import HealthyRecording
-from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel, knowledge_of
+from models.commissioning.levels import LEVELS, Learned, Piece, Progress, pieces_of
 from models.commissioning.report import CommissioningReport, EquationRow, parameter_summaries
-from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.fallback.shape import HealthyShape, learn_shape
-from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.networks.equations import EQUATIONS, missing
-from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import learn_sensor_reference
-from models.diagnosis.verdict.determined import determined, with_shared_error
-from models.diagnosis.window import WindowStatistics, window_statistics
 from models.errors import EstimationError
 from models.machine import Machine, MachineFile
 from models.physics.parameters import FAULT_FIELDS, PARAMETERS
 
 __all__ = ["Commissioning", "commission"]
-
-_Read = tuple[str, int, Diagnosis]
-_SHORTEST_HOPS = 4
-"""Fewer say too little of how they scatter."""
-_TABLES = ("rotor", "operation", "condition")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,29 +51,6 @@ class Commissioning:
     machine: Machine | None
 
 
-@dataclass(frozen=True, slots=True)
-class _Learned:
-    """What one level of knowledge made of the windows."""
-
-    checks: tuple[Check, ...]
-    diagnoses: tuple[_Read, ...] = ()
-    compared: tuple[_Read, ...] = ()
-    machine: Machine | None = None
-    identified: IdentifiedRecord | None = None
-    baseline: BaselineRecord | None = None
-    shape: HealthyShape | None = None
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class _Piece:
-    """A healthy window and where it comes from."""
-
-    recording: str
-    late: bool
-    window: WindowStatistics
-
-
 def commission(
     machine: MachineFile,
     recordings: Sequence[HealthyRecording],
@@ -95,7 +59,7 @@ def commission(
     wished: float | None = None,
     replaces: Commissioned | None = None,
     why: str = "",
-    progress: Callable[[str, int, int], None] = lambda *_: None,
+    progress: Progress = lambda *_: None,
 ) -> Commissioning:
     """Commission a machine.
 
@@ -117,8 +81,8 @@ def commission(
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]
-    pieces = [] if checks[0].verdict == "refused" else _pieces(recordings)
-    learned = _Learned(())
+    pieces = [] if checks[0].verdict == "refused" else pieces_of(recordings)
+    learned = Learned(())
     if pieces:
         by_recording = {
             one.name: [piece.window for piece in pieces if piece.recording == one.name] for one in recordings
@@ -130,14 +94,14 @@ def commission(
         checks += [check_sensors_of(findings), check_steady(recordings, by_recording), check_lines(recordings)]
         if all(check.verdict != "refused" for check in checks):
             try:
-                learned = _LEVELS[knowledge.level](machine, pieces, progress)
+                learned = LEVELS[knowledge.level](machine, pieces, progress)
             except EstimationError as error:
-                learned = _Learned((_not_learned(knowledge.level, str(error)),))
+                learned = Learned((_not_learned(knowledge.level, str(error)),))
             checks += learned.checks
     refused = any(check.verdict == "refused" for check in checks)
     windows = [piece.window for piece in pieces]
     commissioned = None
-    if not refused and (learned.machine is not None or learned.baseline is not None or learned.shape is not None):
+    if not refused and (learned.machine is not None or learned.baselines or learned.shape is not None):
         commissioned = Commissioned(
             site=machine.site,
             machine=machine.name,
@@ -149,30 +113,13 @@ def commission(
             recordings=tuple(entries),
             conditions=OperatingRange.of(windows),
             identified=learned.identified,
-            baseline=learned.baseline,
+            baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
         )
     return Commissioning(
         _report(machine, recordings, checks, learned, commissioned, pieces, wished), commissioned, learned.machine
     )
-
-
-def _pieces(recordings: Sequence[HealthyRecording]) -> list[_Piece]:
-    """Windows that do not overlap, none longer than the monitor's, at least two of every stretch that allows it."""
-    found = []
-    for recording in recordings:
-        plan = recording.plan
-        for stretch in recording.stretches:
-            count = max(2, -(-len(stretch) // plan.hops)) if len(stretch) >= 2 * _SHORTEST_HOPS else 1
-            if len(stretch) < _SHORTEST_HOPS:
-                continue
-            cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
-            windows = [window_statistics(plan, stretch[a:b]) for a, b in pairwise(cuts.tolist())]
-            found += [
-                _Piece(recording.name, 2 * number >= len(windows), window) for number, window in enumerate(windows)
-            ]
-    return found
 
 
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:
@@ -184,129 +131,13 @@ def _not_learned(level: KnowledgeLevel, text: str) -> Check:
     )
 
 
-def _read_known(
-    machine: Machine, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]
-) -> tuple[_Read, ...]:
-    found = []
-    for number, piece in enumerate(pieces):
-        diagnosis = LikelihoodFit(machine).diagnose(piece.window)
-        found.append(
-            (piece.recording, piece.window.end_ns, determined(diagnosis, piece.window, machine.window.length_s))
-        )
-        progress("comparing with theory", number + 1, len(pieces))
-    return tuple(found)
-
-
-def _learn_full(machine: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]) -> _Learned:
-    assert isinstance(machine, Machine)  # noqa: S101  # the level says so
-    read = _read_known(machine, pieces, progress)
-    check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
-    if check.verdict == "refused":
-        check = check.model_copy(
-            update={
-                "advice": "the file describes another machine than was recorded: correct it, or leave out of [rotor] "
-                "what is not known for certain, so that it is identified"
-            }
-        )
-    return _Learned((check,), read, read, machine)
-
-
-def _learn_partial(
-    machine: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]
-) -> _Learned:
-    windows = [piece.window for piece in pieces]
-    identified = identify(machine, windows, partial(progress, "identifying the rotor"))
-    read = tuple(
-        (piece.recording, piece.window.end_ns, with_shared_error(stated, identified.covariance))
-        for piece, diagnosis in zip(pieces, identified.diagnoses, strict=True)
-        for stated in [determined(diagnosis, piece.window, machine.window.length_s)]
-    )
-    filled = identified.machine.model_dump(mode="json", include=set(_TABLES))
-    record = IdentifiedRecord(
-        machine=filled,
-        names=identified.names,
-        covariance=tuple(tuple(row) for row in identified.covariance.tolist()),
-    )
-    check = check_agreement([each for _, _, each in read], "the identified rotor")
-    return _Learned((check,), read, read, identified.machine, record)
-
-
-def _learn_none(_: MachineFile, pieces: Sequence[_Piece], progress: Callable[[str, int, int], None]) -> _Learned:
-    windows = [piece.window for piece in pieces]
-    try:
-        shape = learn_shape(windows)
-        no_shape = ""
-    except EstimationError as error:
-        shape, no_shape = None, str(error)
-    evaluable = [
-        row for row, reason in evaluable_rows(windows[0].states, windows[0].synchronous is not None) if not reason
-    ]
-    if not evaluable:
-        return _without_equations(shape, no_shape)
-    baseline = learn_baseline(windows, [piece.recording for piece in pieces])
-    diagnostician = BaselineDiagnostician(baseline)
-    read = []
-    for number, piece in enumerate(pieces):
-        read.append((piece.recording, piece.window.end_ns, diagnostician.diagnose(piece.window)))
-        progress("learning the relations", number + 1, len(pieces))
-    compared = _halves(pieces)
-    return _Learned(
-        (check_halves([each for _, _, each in compared]),),
-        tuple(read),
-        compared,
-        baseline=BaselineRecord.of(baseline),
-        shape=shape,
-    )
-
-
-def _without_equations(shape: HealthyShape | None, no_shape: str) -> _Learned:
-    advice = (
-        "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in that "
-        "plane"
-    )
-    if shape is None:
-        check = Check(
-            name="equations", verdict="refused", text=f"these sensors allow no equation; {no_shape}", advice=advice
-        )
-        return _Learned((check,))
-    text = (
-        "these sensors allow no equation: each channel will only be called changed or not changed, and no part of the "
-        "machine will be named"
-    )
-    return _Learned((Check(name="equations", verdict="limited", text=text, advice=advice),), shape=shape)
-
-
-def _halves(pieces: Sequence[_Piece]) -> tuple[_Read, ...]:
-    """Every window read against what the other halves of the recordings teach."""
-    found: list[_Read] = []
-    for late in (False, True):
-        teaching = [piece for piece in pieces if piece.late is not late]
-        asked = [piece for piece in pieces if piece.late is late]
-        if not teaching or not asked:
-            continue
-        try:
-            half = learn_baseline([piece.window for piece in teaching], [piece.recording for piece in teaching])
-        except EstimationError:
-            continue  # half of the data is too little for this machine; the whole may be enough
-        diagnostician = BaselineDiagnostician(half)
-        found += [(p.recording, p.window.end_ns, diagnostician.diagnose(p.window)) for p in asked]
-    return tuple(sorted(found, key=lambda read: read[1]))
-
-
-_LEVELS = {
-    KnowledgeLevel.FULL: _learn_full,
-    KnowledgeLevel.PARTIAL: _learn_partial,
-    KnowledgeLevel.NONE: _learn_none,
-}
-
-
 def _report(
     machine: MachineFile,
     recordings: Sequence[HealthyRecording],
     checks: Sequence[Check],
-    learned: _Learned,
+    learned: Learned,
     commissioned: Commissioned | None,
-    pieces: Sequence[_Piece],
+    pieces: Sequence[Piece],
     wished: float | None,
 ) -> CommissioningReport:
     knowledge = knowledge_of(machine)
@@ -362,7 +193,7 @@ def _summary(verdict: str, checks: Sequence[Check], evaluable: Sequence[str]) ->
     return read
 
 
-def _equations(machine: MachineFile, learned: _Learned) -> tuple[EquationRow, ...]:
+def _equations(machine: MachineFile, learned: Learned) -> tuple[EquationRow, ...]:
     """The whole table: what is compared with theory where the rotor is known, and what is learned where it is not."""
     states = machine.descriptor.states
     known = learned.machine is not None

@@ -30,7 +30,15 @@ from models.machine import Machine, MachineFile
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = ["FILE", "Commissioned", "IdentifiedRecord", "RecordingEntry", "described", "load_commissioned"]
+__all__ = [
+    "FILE",
+    "Commissioned",
+    "ConditionBaseline",
+    "IdentifiedRecord",
+    "RecordingEntry",
+    "described",
+    "load_commissioned",
+]
 
 FILE = "commissioned.json"
 _STRICT = ConfigDict(extra="forbid", frozen=True)
@@ -75,6 +83,15 @@ class IdentifiedRecord(BaseModel):
         return np.array(self.covariance, dtype=np.float64)
 
 
+class ConditionBaseline(BaseModel):
+    """A baseline and the conditions it was learned in."""
+
+    model_config = _STRICT
+
+    conditions: OperatingRange
+    baseline: BaselineRecord
+
+
 class Commissioned(BaseModel):
     """What a machine's monitor compares later data with."""
 
@@ -91,7 +108,9 @@ class Commissioned(BaseModel):
     recordings: tuple[RecordingEntry, ...] = Field(min_length=1)
     conditions: OperatingRange
     identified: IdentifiedRecord | None = Field(default=None, description="level partial")
-    baseline: BaselineRecord | None = Field(default=None, description="level none")
+    baselines: tuple[ConditionBaseline, ...] = Field(
+        default=(), description="level none: one for all conditions, or one for each speed where they differ"
+    )
     shape: HealthyShape | None = Field(default=None, description="where no equation can be evaluated, or beside it")
     sensors: SensorReference | None = None
 
@@ -99,7 +118,7 @@ class Commissioned(BaseModel):
     def _of_its_level(self) -> Self:
         if self.level is KnowledgeLevel.PARTIAL and self.identified is None:
             raise ValueError("level is partial, but there is no identified rotor")
-        if self.level is KnowledgeLevel.NONE and self.baseline is None and self.shape is None:
+        if self.level is KnowledgeLevel.NONE and not self.baselines and self.shape is None:
             raise ValueError("level is none, but there is neither a baseline nor a healthy shape")
         return self
 

@@ -50,7 +50,7 @@ def with_samples(stream_: Sequence[SampleBlock], samples: FloatArray) -> list[Sa
     found, at = [], 0
     for block in stream_:
         n_samples = block.samples.shape[0]
-        part = samples[at : at + n_samples].astype(block.samples.dtype)
+        part = samples[at : at + n_samples].astype(np.float32)
         found.append(replace(block, samples=part))
         at += n_samples
     return found

@@ -64,11 +64,9 @@ def test_what_was_commissioned_comes_back_from_its_file(machine: MachineFile, le
     installed = install(machine, tmp_path)
     assert installed.identity == again.identity
     assert (installed.known is None) == (level == "none")
-    if again.baseline is not None:
+    for fresh, restored in zip(made.commissioned.baselines, again.baselines, strict=True):
         window = healthy(machine, HEALTHY_S, 43).windows()[0]
-        fresh = made.commissioned.baseline
-        assert fresh is not None
-        first, second = (one.diagnostician().diagnose(window) for one in (fresh, again.baseline))
+        first, second = (one.baseline.diagnostician().diagnose(window) for one in (fresh, restored))
         assert first.parameters == second.parameters
 
 
@@ -85,11 +83,11 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
     with pytest.raises(BundleError, match="must be commissioned from healthy recordings first"):
         install(NOTHING, None)
     fields = json.loads(made.model_dump_json())
-    fields["baseline"]["covariance"][0][0] = "NaN"
+    fields["baselines"][0]["baseline"]["covariance"][0][0] = "NaN"
     path.write_text(json.dumps(fields))
-    with pytest.raises(BundleError, match=r"baseline\.covariance"):
+    with pytest.raises(BundleError, match=r"baselines\.0\.baseline\.covariance"):
         load_commissioned(tmp_path, NOTHING)
-    del fields["baseline"], fields["shape"]
+    del fields["baselines"], fields["shape"]
     path.write_text(json.dumps(fields))
     with pytest.raises(BundleError, match="neither a baseline nor a healthy shape"):
         load_commissioned(tmp_path, NOTHING)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from models.ingest import Gate
-from models.machine import Machine, load_machine
+from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
@@ -47,7 +47,7 @@ def signals(count: int, rate_hz: float = RATE_HZ) -> tuple[FloatArray, FloatArra
     )
 
 
-def imported(folder: Path, source: Path, mapping: str, described: Machine | None = None) -> tuple[Imported, Path]:
+def imported(folder: Path, source: Path, mapping: str, described: MachineFile | None = None) -> tuple[Imported, Path]:
     """Import a file with a mapping given as text."""
     described = described or machine()
     file = folder / "mapping.toml"
@@ -56,7 +56,7 @@ def imported(folder: Path, source: Path, mapping: str, described: Machine | None
     return import_file(source, load_mapping(file, described), described, out, overwrite=True), out
 
 
-def stretches(recording: Path, described: Machine | None = None) -> list[Stretch]:
+def stretches(recording: Path, described: MachineFile | None = None) -> list[Stretch]:
     """What a monitor makes of a recording: nothing may be refused, and gaps are where its gate sees them."""
     described = described or machine()
     gate = Gate(described)

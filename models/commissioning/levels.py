@@ -1,0 +1,232 @@
+"""What each level of knowledge makes of healthy windows."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from types import MappingProxyType
+
+import numpy as np
+
+from models.commissioning.checks import SAME_SPEED, Check, check_agreement, check_halves, check_recordings
+from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord
+from models.commissioning.conditions import OperatingRange
+from models.commissioning.healthy import HealthyRecording
+from models.commissioning.identified import identify
+from models.commissioning.knowledge import KnowledgeLevel
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.learned import Baseline, learn_baseline
+from models.diagnosis.baseline.rows import evaluable_rows
+from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.fallback.shape import HealthyShape, learn_shape
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.verdict.determined import determined, with_shared_error
+from models.diagnosis.window import WindowStatistics, window_statistics
+from models.errors import EstimationError
+from models.machine import Machine, MachineFile
+
+__all__ = ["LEVELS", "Learned", "Piece", "Progress", "Read", "pieces_of"]
+
+Read = tuple[str, int, Diagnosis]
+"""Recording, end of the window, and what was read in it."""
+
+Progress = Callable[[str, int, int], None]
+"""Told what is being done, how much of it is done, and how much there is."""
+
+_TABLES = ("rotor", "operation", "condition")
+_SHORTEST_HOPS = 4
+"""Fewer say too little of how they scatter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """What one level of knowledge made of the windows."""
+
+    checks: tuple[Check, ...]
+    diagnoses: tuple[Read, ...] = ()
+    compared: tuple[Read, ...] = ()
+    machine: Machine | None = None
+    identified: IdentifiedRecord | None = None
+    baselines: tuple[ConditionBaseline, ...] = ()
+    shape: HealthyShape | None = None
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A healthy window and where it comes from."""
+
+    recording: str
+    late: bool
+    window: WindowStatistics
+
+
+def pieces_of(recordings: Sequence[HealthyRecording]) -> list[Piece]:
+    """Windows that do not overlap, none longer than the monitor's, at least two of every stretch that allows it."""
+    found = []
+    for recording in recordings:
+        plan = recording.plan
+        for stretch in recording.stretches:
+            count = max(2, -(-len(stretch) // plan.hops)) if len(stretch) >= 2 * _SHORTEST_HOPS else 1
+            if len(stretch) < _SHORTEST_HOPS:
+                continue
+            cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
+            windows = [window_statistics(plan, stretch[a:b]) for a, b in pairwise(cuts.tolist())]
+            found += [
+                Piece(recording.name, 2 * number >= len(windows), window) for number, window in enumerate(windows)
+            ]
+    return found
+
+
+def _read_known(machine: Machine, pieces: Sequence[Piece], progress: Progress) -> tuple[Read, ...]:
+    found = []
+    for number, piece in enumerate(pieces):
+        diagnosis = LikelihoodFit(machine).diagnose(piece.window)
+        found.append(
+            (piece.recording, piece.window.end_ns, determined(diagnosis, piece.window, machine.window.length_s))
+        )
+        progress("comparing with theory", number + 1, len(pieces))
+    return tuple(found)
+
+
+def _learn_full(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+    assert isinstance(machine, Machine)  # noqa: S101  # the level says so
+    read = _read_known(machine, pieces, progress)
+    check = check_agreement([each for _, _, each in read], "the parameters in the machine file")
+    if check.verdict == "refused":
+        check = check.model_copy(
+            update={
+                "advice": "the file describes another machine than was recorded: correct it, or leave out of [rotor] "
+                "what is not known for certain, so that it is identified"
+            }
+        )
+    return Learned((check,), read, read, machine)
+
+
+def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+    windows = [piece.window for piece in pieces]
+    identified = identify(machine, windows, partial(progress, "identifying the rotor"))
+    read = tuple(
+        (piece.recording, piece.window.end_ns, with_shared_error(stated, identified.covariance))
+        for piece, diagnosis in zip(pieces, identified.diagnoses, strict=True)
+        for stated in [determined(diagnosis, piece.window, machine.window.length_s)]
+    )
+    filled = identified.machine.model_dump(mode="json", include=set(_TABLES))
+    record = IdentifiedRecord(
+        machine=filled,
+        names=identified.names,
+        covariance=tuple(tuple(row) for row in identified.covariance.tolist()),
+    )
+    check = check_agreement([each for _, _, each in read], "the identified rotor")
+    return Learned((check,), read, read, identified.machine, record)
+
+
+def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+    windows = [piece.window for piece in pieces]
+    try:
+        shape = learn_shape(windows)
+        no_shape = ""
+    except EstimationError as error:
+        shape, no_shape = None, str(error)
+    evaluable = [
+        row for row, reason in evaluable_rows(windows[0].states, windows[0].synchronous is not None) if not reason
+    ]
+    if not evaluable:
+        return _without_equations(shape, no_shape)
+    groups = [list(pieces)]
+    baselines = [_baseline(groups[0])]
+    agreement = check_recordings(baselines[0].consistency, _speeds(pieces))
+    if agreement is not None and agreement.verdict == "limited":
+        groups = _by_speed(pieces)
+        baselines = [_baseline(group) for group in groups]
+    read: list[Read] = []
+    compared: list[Read] = []
+    for group, baseline in zip(groups, baselines, strict=True):
+        diagnostician = BaselineDiagnostician(baseline)
+        for piece in group:
+            read.append((piece.recording, piece.window.end_ns, diagnostician.diagnose(piece.window)))
+            progress("learning the relations", len(read), len(pieces))
+        compared += _halves(group)
+    halves = check_halves([each for _, _, each in compared])
+    return Learned(
+        (halves,) if agreement is None else (agreement, halves),
+        tuple(read),
+        tuple(compared),
+        baselines=tuple(
+            ConditionBaseline(
+                conditions=OperatingRange.of([piece.window for piece in group]), baseline=BaselineRecord.of(baseline)
+            )
+            for group, baseline in zip(groups, baselines, strict=True)
+        ),
+        shape=shape,
+    )
+
+
+def _baseline(pieces: Sequence[Piece]) -> Baseline:
+    return learn_baseline([piece.window for piece in pieces], [piece.recording for piece in pieces])
+
+
+def _speeds(pieces: Sequence[Piece]) -> dict[str, float]:
+    """Mean speed of each recording, rad/s; nan where it is not known."""
+    return {
+        name: float(np.mean([piece.window.speed_rad_s for piece in pieces if piece.recording == name]))
+        for name in dict.fromkeys(piece.recording for piece in pieces)
+    }
+
+
+def _by_speed(pieces: Sequence[Piece]) -> list[list[Piece]]:
+    """Pieces in groups of one speed, slowest first."""
+    speeds = _speeds(pieces)
+    groups: list[list[Piece]] = []
+    last = -np.inf
+    for name in sorted(speeds, key=speeds.__getitem__):
+        if speeds[name] > last * (1 + SAME_SPEED) or not groups:
+            groups.append([])
+        groups[-1] += [piece for piece in pieces if piece.recording == name]
+        last = speeds[name]
+    return groups
+
+
+def _without_equations(shape: HealthyShape | None, no_shape: str) -> Learned:
+    advice = (
+        "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in that "
+        "plane"
+    )
+    if shape is None:
+        check = Check(
+            name="equations", verdict="refused", text=f"these sensors allow no equation; {no_shape}", advice=advice
+        )
+        return Learned((check,))
+    text = (
+        "these sensors allow no equation: each channel will only be called changed or not changed, and no part of the "
+        "machine will be named"
+    )
+    return Learned((Check(name="equations", verdict="limited", text=text, advice=advice),), shape=shape)
+
+
+def _halves(pieces: Sequence[Piece]) -> tuple[Read, ...]:
+    """Every window read against what the other halves of the recordings teach."""
+    found: list[Read] = []
+    for late in (False, True):
+        teaching = [piece for piece in pieces if piece.late is not late]
+        asked = [piece for piece in pieces if piece.late is late]
+        if not teaching or not asked:
+            continue
+        try:
+            half = learn_baseline([piece.window for piece in teaching], [piece.recording for piece in teaching])
+        except EstimationError:
+            continue  # half of the data is too little for this machine; the whole may be enough
+        diagnostician = BaselineDiagnostician(half)
+        found += [(p.recording, p.window.end_ns, diagnostician.diagnose(p.window)) for p in asked]
+    return tuple(sorted(found, key=lambda read: read[1]))
+
+
+LEVELS: Mapping[KnowledgeLevel, Callable[[MachineFile, Sequence[Piece], Progress], Learned]] = MappingProxyType(
+    {
+        KnowledgeLevel.FULL: _learn_full,
+        KnowledgeLevel.PARTIAL: _learn_partial,
+        KnowledgeLevel.NONE: _learn_none,
+    }
+)
+"""How to learn at each level."""
