@@ -1,0 +1,148 @@
+"""Pictures of what a commissioning can tell: healthy readings, and what limits them."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
+
+from models.commissioning.report import CommissioningReport, HealthyReading, ParameterSummary
+from models.diagnosis.verdict.stretch import to_scale
+from simulator.commission.svg import COLOURS, GREY, INK, WIDTH_IN
+from simulator.commission.units import percent
+
+__all__ = ["draw_budget", "draw_readings"]
+
+_Z95 = 1.959964
+_ROW_IN, _PANEL_IN = 0.42, 1.75
+_ROOM = 0.35
+_MOST_LABELS = 24
+
+
+def draw_readings(report: CommissioningReport, recordings: Sequence[str]) -> Figure | None:
+    """Each parameter's healthy readings with 95 % intervals against zero, by recording; None without readings.
+
+    Parameters
+    ----------
+    report : CommissioningReport
+    recordings : sequence of str
+        Names, in the order in which they are numbered.
+    """
+    read = [one for one in report.parameters if one.readings]
+    if not read:
+        return None
+    columns = min(2, len(read))
+    rows = -(-len(read) // columns)
+    figure = Figure(figsize=(WIDTH_IN, 0.5 + _PANEL_IN * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, parameter in zip(panels, read, strict=False):
+        _readings(axes, parameter, recordings)
+    for axes in panels[len(read) :]:
+        axes.set_visible(False)
+    figure.supylabel("change from healthy, %", fontsize=9)
+    figure.supxlabel("healthy windows in order of time, by number of the recording", fontsize=9)
+    return figure
+
+
+def _readings(axes: Axes, parameter: ParameterSummary, recordings: Sequence[str]) -> None:
+    axes.axhline(0, color=INK, linewidth=1.0)
+    start, ticks = 0.0, []
+    labelled = math.ceil(len(recordings) / _MOST_LABELS)
+    for name in dict.fromkeys(recordings):
+        number = recordings.index(name)
+        own = sorted((one for one in parameter.readings if one.recording == name), key=_time)
+        if not own:
+            continue
+        if start:
+            axes.axvline(start - 0.5, color=GREY, linewidth=0.7, linestyle=":")
+        x = start + np.arange(len(own))
+        change = 100 * np.array([one.relative_change for one in own])
+        reach = 100 * _Z95 * np.array([one.standard_error for one in own])
+        axes.errorbar(
+            x, change, yerr=reach, color=COLOURS[number % len(COLOURS)], marker="o", markersize=4, linestyle="",
+            linewidth=1.1, capsize=2.5,
+        )  # fmt: skip
+        if number % labelled == 0:
+            ticks.append((float(x.mean()), str(number + 1)))
+        start += len(own)
+    axes.set_xlim(-0.5 - _ROOM, start - 0.5 + _ROOM)
+    axes.set_xticks([at for at, _ in ticks], [text for _, text in ticks])
+    axes.tick_params(axis="x", length=0)
+    axes.grid(visible=False, axis="x")
+    axes.set_title(f"{parameter.text} ({parameter.name})")
+
+
+def _time(reading: HealthyReading) -> int:
+    return reading.end_ns
+
+
+def draw_budget(report: CommissioningReport) -> Figure | None:
+    """Standard errors of a window and of the commissioning against what a wished change allows; None without them.
+
+    Parameters
+    ----------
+    report : CommissioningReport
+    """
+    read = [one for one in report.parameters if one.window_error]
+    if not read:
+        return None
+    figure = Figure(figsize=(WIDTH_IN, 1.35 + _ROW_IN * len(read)), layout="constrained")
+    axes = figure.subplots()
+    y = np.arange(len(read))
+    own = np.array([one.window_error or 0.0 for one in read])
+    shared = np.array([one.commissioning_error or 0.0 for one in read])
+    total = np.hypot(own, shared)
+    axes.hlines(y, np.minimum(own, np.where(shared > 0, shared, own)), total, color=GREY, linewidth=1.0, zorder=1)
+    axes.plot(own, y, linestyle="", marker="o", markersize=7, color=COLOURS[0], label="one window")
+    if shared.any():
+        axes.plot(
+            shared[shared > 0], y[shared > 0], linestyle="", marker="s", markersize=6.5, color=COLOURS[1],
+            label="commissioning (part of every later interval)",
+        )  # fmt: skip
+    axes.plot(total, y, linestyle="", marker="|", markersize=15, markeredgewidth=2, color=INK, label="both together")
+    limits = [(at, _allowed(one)) for at, one in enumerate(read)]
+    known = [(at, limit) for at, limit in limits if limit is not None]
+    if known:
+        sizes = sorted({one.wished for one in read if one.wished is not None})
+        axes.vlines(
+            [limit for _, limit in known],
+            [at - 0.42 for at, _ in known],
+            [at + 0.42 for at, _ in known],
+            color=COLOURS[2],
+            linewidth=2.2,
+            linestyle=(0, (3, 1.2)),
+            label=f"at most this to find the wished change of {' or '.join(percent(size) for size in sizes)}",
+        )
+    axes.set_xscale("log")
+    low = min([*own, *shared[shared > 0], *(limit for _, limit in known)])
+    high = max([*total, *(limit for _, limit in known)])
+    axes.set_xlim(low / 1.5, high * 1.5)
+    axes.set_xticks(_ticks(low / 1.5, high * 1.5))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{100 * value:g}%"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.minorticks_off()
+    axes.set_yticks(y, [f"{one.text} ({one.name})" for one in read])
+    axes.set_ylim(len(read) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=False, axis="y")
+    axes.set_xlabel("standard error of a relative change (logarithmic)")
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+def _allowed(parameter: ParameterSummary) -> float | None:
+    """Standard error, of window and commissioning together, with which the wished change is just found."""
+    own, gain, wished = parameter.window_error, parameter.detectable_gain, parameter.wished
+    if own is None or gain is None or wished is None:
+        return None
+    now = math.hypot(own, parameter.commissioning_error or 0.0)
+    # A gain, the stricter side: as the report reckons what the wished change takes.
+    return abs(to_scale(parameter.name, wished)) * now / to_scale(parameter.name, gain)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    """1, 2 and 5 of each decade inside the limits."""
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    return [step * 10.0**decade for decade in decades for step in (1, 2, 5) if low <= step * 10.0**decade <= high]

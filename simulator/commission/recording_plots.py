@@ -1,0 +1,263 @@
+"""Pictures of the healthy recordings themselves: spectra of every channel, speed and level over time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from models.commissioning.healthy import HealthyRecording
+from models.commissioning.lines import Line, foreign_lines
+from models.diagnosis.window import WindowStatistics, window_statistics
+from models.signals.block import FloatArray
+from simulator.commission.svg import BAND, COLOURS, GREY, INK, WIDTH_IN
+from simulator.commission.units import channel_text, channel_unit
+
+__all__ = ["Portrait", "draw_levels", "draw_spectra", "portrait"]
+
+_PANEL_IN = 1.6
+_STYLES = ("-", "--", ":")
+_BEYOND_BAND = 0.04
+_PLACES = ("y1", "z1", "y2", "z2", "psi", "phi")
+_ORDERS = ("", "_dot", "_ddot")
+_RPM = 30 / np.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Portrait:
+    """What the pictures show of one recording.
+
+    Attributes
+    ----------
+    number : int
+        Its number on the page, from 1.
+    statistics : WindowStatistics
+        Of all its hops.
+    density : ndarray, shape (n_bins, n)
+        Amplitude spectral density with the rotation in it, one-sided, SI/√Hz.
+    time_s : ndarray, shape (n_hops,)
+        Middle of each hop from the beginning of the recording.
+    broken : ndarray of bool, shape (n_hops,)
+        Whether a gap lies before the hop.
+    lines : tuple of Line
+        Steady lines that do not belong to the rotation.
+    """
+
+    number: int
+    statistics: WindowStatistics
+    density: FloatArray
+    time_s: FloatArray
+    broken: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    lines: tuple[Line, ...]
+
+    @property
+    def speed_hz(self) -> float:
+        """Mean speed, nan if unknown."""
+        return self.statistics.speed_rad_s / (2 * np.pi)
+
+    @property
+    def levels(self) -> FloatArray:
+        """Rms of the random part hop by hop, shape (n_hops, n), SI."""
+        powers = np.diagonal(self.statistics.hop_correlation[:, 0], axis1=1, axis2=2)
+        return np.asarray(np.sqrt(np.maximum(powers, 0.0)), dtype=np.float64)
+
+
+def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
+    """Statistics of a whole recording; None if it holds no usable data.
+
+    Parameters
+    ----------
+    number : int
+        Its number on the page.
+    recording : HealthyRecording
+    """
+    hops = recording.hops
+    if not hops:
+        return None
+    statistics = window_statistics(recording.plan, hops, lagged=False)
+    n = len(recording.plan.states)
+    power = np.mean([np.mean(np.abs(hop.segments[:, :, :n]) ** 2, axis=0) for hop in hops], axis=0)
+    starts = np.array([hop.start_ns for hop in hops], dtype=np.int64)
+    first = [len(stretch) for stretch in recording.stretches]
+    broken = np.zeros(len(hops), dtype=np.bool_)
+    broken[np.cumsum(first)[:-1]] = True
+    return Portrait(
+        number=number,
+        statistics=statistics,
+        density=np.asarray(np.sqrt(2 * power), dtype=np.float64),
+        time_s=(starts - starts[0]) / 1e9 + recording.plan.hop / recording.plan.rate_hz / 2,
+        broken=broken,
+        lines=foreign_lines(recording),
+    )
+
+
+def _ordered(states: Sequence[str]) -> list[str]:
+    """Bearing before disc, displacement before velocity, the two planes side by side."""
+    return sorted(states, key=_rank)
+
+
+def _rank(state: str) -> tuple[int, int, int]:
+    place, _, ending = state.partition("_")
+    at = _PLACES.index(place)
+    return at // 2, _ORDERS.index(f"_{ending}" if ending else ""), at % 2
+
+
+def draw_spectra(portraits: Sequence[Portrait]) -> Figure:
+    """Spectra of every channel, all recordings in each.
+
+    Parameters
+    ----------
+    portraits : sequence of Portrait
+        At least one.
+    """
+    states = _ordered(portraits[0].statistics.states)
+    columns = min(2, len(states))
+    rows = -(-len(states) // columns)
+    figure = Figure(figsize=(WIDTH_IN, 0.6 + _PANEL_IN * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex=True).ravel()
+    for axes, state in zip(panels, states, strict=False):
+        _spectrum(axes, state, portraits)
+    for axes in panels[len(states) :]:
+        axes.set_visible(False)
+    for axes in panels[max(0, len(states) - columns) : len(states)]:
+        axes.xaxis.set_tick_params(labelbottom=True)
+    figure.supxlabel("frequency, Hz", fontsize=9)
+    if len(portraits) > 1:
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper left", ncols=min(6, len(portraits)))
+    return figure
+
+
+def _spectrum(axes: Axes, state: str, portraits: Sequence[Portrait]) -> None:
+    unit, scale = channel_unit(state)
+    frequencies = portraits[0].statistics.frequencies_hz
+    axes.axvspan(float(frequencies[0]), float(frequencies[-1]), facecolor=BAND, edgecolor="none", zorder=0)
+    for one in portraits:
+        column = one.statistics.states.index(state)
+        density = scale * one.density[:, column]
+        if density.max() > 0:
+            axes.semilogy(frequencies, density, label=f"recording {one.number}", **_line(one.number))
+    _mark_rotation(axes, portraits, float(frequencies[-1]))
+    for one in portraits:
+        for line in one.lines:
+            if line.state == state:
+                axes.annotate(
+                    f"{line.frequency_hz:.1f} Hz", (line.frequency_hz, 1), xycoords=("data", "axes fraction"),
+                    xytext=(0, -2), textcoords="offset points", ha="center", va="top", fontsize=8, color=COLOURS[1],
+                )  # fmt: skip
+    axes.set_xlim(0, float(frequencies[-1]) * (1 + _BEYOND_BAND))
+    axes.set_title(channel_text(state))
+    axes.set_ylabel(f"{unit}/√Hz")
+
+
+def _line(number: int) -> dict[str, str | float]:
+    at = number - 1
+    return {
+        "color": COLOURS[at % len(COLOURS)],
+        "linestyle": _STYLES[at // len(COLOURS) % len(_STYLES)],
+        "linewidth": 0.9,
+    }
+
+
+def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float) -> None:
+    speeds = sorted({round(one.speed_hz, 1) for one in portraits if np.isfinite(one.speed_hz)})
+    apart = 0.03 * highest_hz
+    labelled = -np.inf
+    for speed in speeds:
+        for order in (1, 2):
+            if order * speed > highest_hz:
+                continue
+            axes.axvline(order * speed, color=GREY, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
+            if (order == 1 and speed - labelled < apart) or (order == 2 and len(speeds) > 1):
+                continue
+            labelled = speed if order == 1 else labelled
+            axes.annotate(
+                f"{order}×", (order * speed, 1), xycoords=("data", "axes fraction"), xytext=(2, -1),
+                textcoords="offset points", ha="left", va="top", fontsize=8, color=INK,
+            )  # fmt: skip
+
+
+def draw_levels(portraits: Sequence[Portrait]) -> Figure:
+    """Speed and level of random vibration hop by hop, the recordings one after the other.
+
+    Parameters
+    ----------
+    portraits : sequence of Portrait
+        At least one.
+    """
+    speeds_known = any(np.isfinite(one.statistics.hop_speed_rad_s).any() for one in portraits)
+    heights = [1.0, 1.8] if speeds_known else [1.8]
+    figure = Figure(figsize=(WIDTH_IN, 0.7 + 1.4 * sum(heights)), layout="constrained")
+    panels = figure.subplots(len(heights), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
+    states = _ordered(portraits[0].statistics.states)
+    columns = [portraits[0].statistics.states.index(state) for state in states]
+    reference = np.median(np.concatenate([one.levels for one in portraits]), axis=0)
+    total_s = sum(float(one.time_s[-1]) for one in portraits)
+    unit_s, unit = (60.0, "min") if total_s > 300 else (1.0, "s")
+    space_s = 0.02 * total_s
+    start_s = 0.0
+    for one in portraits:
+        half_s = float(one.time_s[0])
+        x = (start_s + one.time_s) / unit_s
+        if start_s:
+            for axes in panels:
+                axes.axvline((start_s - space_s / 2) / unit_s, color=GREY, linewidth=0.7, linestyle=":")
+        panels[0].annotate(
+            str(one.number), (float(x[0] + x[-1]) / 2, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
+            textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
+        )  # fmt: skip
+        if speeds_known:
+            rpm = _RPM * one.statistics.hop_speed_rad_s
+            panels[0].plot(*_pieces(x, rpm, one.broken), color=INK, marker=".", markersize=3)
+        for state, column in zip(states, columns, strict=True):
+            ratio = one.levels[:, column] / max(float(reference[column]), np.finfo(float).tiny)
+            panels[-1].plot(*_pieces(x, ratio, one.broken), label=channel_text(state), **_channel_line(state))
+        start_s += float(one.time_s[-1]) + half_s + space_s
+    if speeds_known:
+        panels[0].set_ylabel("speed, rpm")
+        _not_too_narrow(panels[0])
+    panels[-1].set_ylabel("level (rms) over its median")
+    panels[-1].set_yscale("log", base=2)
+    panels[-1].set_ylim(*_level_limits(portraits, reference))
+    panels[-1].yaxis.set_major_formatter(lambda value, _: f"{value:g}×")
+    panels[-1].set_xlabel(f"time from the beginning of each recording, one after the other, {unit}")
+    handles, labels = panels[-1].get_legend_handles_labels()
+    kept = dict(zip(labels, handles, strict=True))
+    figure.legend(kept.values(), kept.keys(), loc="outside lower left", ncols=3, fontsize=8)
+    return figure
+
+
+def _pieces(
+    x: FloatArray, y: FloatArray, broken: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> tuple[FloatArray, FloatArray]:
+    """The same points with a hole wherever a gap lies."""
+    at = np.flatnonzero(broken)
+    return np.insert(x, at, np.nan), np.insert(y, at, np.nan)
+
+
+def _channel_line(state: str) -> dict[str, str | float]:
+    place, _, ending = state.partition("_")
+    return {
+        "color": COLOURS[_PLACES.index(place)],
+        "linestyle": _STYLES[_ORDERS.index(f"_{ending}" if ending else "")],
+        "marker": ".",
+        "markersize": 3,
+        "linewidth": 1.0,
+    }
+
+
+def _not_too_narrow(axes: Axes) -> None:
+    """At least a per cent of the speed from bottom to top: a steady speed must look steady."""
+    low, high = axes.get_ylim()
+    middle = (low + high) / 2
+    reach = max((high - low) / 2, 0.01 * abs(middle))
+    axes.set_ylim(middle - reach, middle + reach)
+
+
+def _level_limits(portraits: Sequence[Portrait], reference: FloatArray) -> tuple[float, float]:
+    """At least half to double."""
+    ratios = np.concatenate([one.levels for one in portraits]) / np.maximum(reference, np.finfo(float).tiny)
+    seen = ratios[np.isfinite(ratios) & (ratios > 0)]
+    low, high = (float(seen.min()), float(seen.max())) if seen.size else (1.0, 1.0)
+    return min(0.45, low / 1.2), max(2.2, high * 1.2)
