@@ -328,6 +328,12 @@ def unknown(
         list[str] | None,
         typer.Option("--machine", "-m", help="Machine to commission; may be given several times. All if left out."),
     ] = None,
+    level: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--level", help='What the machine files tell: "none" (if left out), "partial", "full"; repeatable.'
+        ),
+    ] = None,
     windows: Annotated[int, typer.Option(min=1, help="Windows per true change and machine.")] = 100,
     commissionings: Annotated[
         int, typer.Option(min=1, help="How often a machine is commissioned from scratch; they share the windows.")
@@ -339,7 +345,7 @@ def unknown(
         Path | None, typer.Option("--page", help="Page (Markdown) in which the section is put, or replaced.")
     ] = None,
 ) -> None:
-    """Commission machines without telling their parameters, and count what is found on them later.
+    """Commission machines without telling all their parameters, and count what is found on them later.
 
     Rotors of finite elements and the shipped machines. Every window is kept, so an interrupted campaign carries on
     where it stopped; for another version of this program take another directory.
@@ -351,6 +357,7 @@ def unknown(
 
         watch_unknown(
             machine or (),
+            level or (),
             out,
             windows=windows,
             commissionings=commissionings,

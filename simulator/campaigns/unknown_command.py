@@ -5,6 +5,7 @@ from pathlib import Path
 
 import typer
 
+from models.commissioning.knowledge import KnowledgeLevel
 from models.errors import MachineFileError
 from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.unknown_page import placed, unknown_section
@@ -20,6 +21,7 @@ _RECORDS, _NUMBERS, _SECTION = "records.jsonl", "unknown.json", "unknown.md"
 
 def watch_unknown(
     machines: Sequence[str],
+    levels: Sequence[str],
     out: Path,
     *,
     windows: int,
@@ -34,15 +36,20 @@ def watch_unknown(
     Raises
     ------
     RotorwatchError
-        If a machine is not known, records are damaged, or a file cannot be written.
+        If a machine or level is not known, records are damaged, or a file cannot be written.
     """
     chosen = tuple(dict.fromkeys(machines)) or SUBJECTS
     for name in chosen:
         if name not in SUBJECTS:
             raise MachineFileError(f"--machine {name}: not among {', '.join(SUBJECTS)}")
+    known = [level.value for level in KnowledgeLevel]
+    for name in levels:
+        if name not in known:
+            raise MachineFileError(f"--level {name}: not among {', '.join(known)}")
+    asked = tuple(KnowledgeLevel(name) for name in dict.fromkeys(levels)) or (KnowledgeLevel.NONE,)
     if page is not None and not page.is_file():
         raise MachineFileError(f"--page {page}: no such page")
-    plan = UnknownPlan(chosen, seed, windows, commissionings, healthy)
+    plan = UnknownPlan(chosen, asked, seed, windows, commissionings, healthy)
     kept = out / f"{seed}-{healthy}-{_RECORDS}"
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -55,6 +62,11 @@ def watch_unknown(
         (out / _NUMBERS).write_text(summary.model_dump_json(indent=1) + "\n", encoding="utf-8")
         (out / _SECTION).write_text(section, encoding="utf-8")
     typer.echo(section)
+    known = [level.value for level in KnowledgeLevel]
+    for name in levels:
+        if name not in known:
+            raise MachineFileError(f"--level {name}: not among {', '.join(known)}")
+    asked = tuple(KnowledgeLevel(name) for name in dict.fromkeys(levels)) or (KnowledgeLevel.NONE,)
     if page is not None:
         with writing(page):
             page.write_text(placed(page.read_text(encoding="utf-8"), section), encoding="utf-8")

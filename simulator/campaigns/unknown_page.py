@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from models.commissioning.knowledge import KnowledgeLevel
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, percent, rate_text
 from simulator.campaigns.rates import Rate
@@ -28,8 +29,9 @@ def unknown_section(summary: UnknownSummary) -> str:
         *_machines(summary),
         *_goals(summary),
     ]
-    for name in summary.machines:
-        lines += _details(summary, name)
+    for level, name in summary.pairs:
+        if level is KnowledgeLevel.NONE:
+            lines += _details(summary, name)
     return "\n".join([*lines, *_command(summary), END]) + "\n"
 
 
@@ -44,7 +46,8 @@ def placed(page: str, section: str) -> str:
 
 def _introduction(summary: UnknownSummary) -> tuple[str, ...]:
     return (
-        "Level *none*: the monitor knows channels and sampling and nothing of the rotor. Finite-element rotors, which",
+        "Level *none*: the monitor knows channels and sampling and nothing of the rotor; *partial*: masses and shaft,",
+        "as an engineer would weigh and measure them; *full*: all parameters. Finite-element rotors, which",
         "are another model class than the monitor's own, and the shipped machines with their parameters kept secret.",
         f"Every machine is commissioned {summary.commissionings} times from scratch, each time on",
         f"{summary.healthy_windows} healthy windows of 60 s with one source of random direction, one cutoff (40 to",
@@ -60,14 +63,15 @@ def _introduction(summary: UnknownSummary) -> tuple[str, ...]:
 
 def _machines(summary: UnknownSummary) -> list[str]:
     rows = []
-    for name, description in summary.machines.items():
-        cells = {_key(cell): cell for cell in summary.of(name)}
+    for level, name in summary.pairs:
+        cells = {_key(cell): cell for cell in summary.of(level, name)}
         healthy, changed = cells.get(""), [cell for key, cell in cells.items() if key]
         if healthy is None:
             continue
         rows.append(
             (
-                f"**{name}**: {description}",
+                level,
+                f"**{name}**: {summary.machines[name]}",
                 rate_text(healthy.detected),
                 *(_located(changed, kind) for kind in ("k", "c", "e")),
                 rate_text(pooled(cell.other for cell in changed)),
@@ -76,6 +80,7 @@ def _machines(summary: UnknownSummary) -> list[str]:
             )
         )
     head = (
+        "level",
         "machine",
         "healthy: any named",
         "k −10 % located",
@@ -90,31 +95,41 @@ def _machines(summary: UnknownSummary) -> list[str]:
 
 def _goals(summary: UnknownSummary) -> list[str]:
     rows = []
-    for name in summary.machines:
-        cells = summary.of(name)
+    for level, name in summary.pairs:
+        cells = summary.of(level, name)
         bearing = [cell for cell in cells if cell.truth and "e" not in cell.truth]
         for kind, change in (("k", "−10 %"), ("c", "−30 %")):
             rate = pooled(cell.exact for cell in bearing if next(iter(cell.truth)).startswith(kind))
-            rows.append((name, f"{kind} {change} located in at least 95 %", rate, rate and rate.rate >= _LOCATED))
+            rows.append(
+                (level, name, f"{kind} {change} located in at least 95 %", rate, rate and rate.rate >= _LOCATED)
+            )
         rate = pooled(cell.other for cell in bearing)
-        rows.append((name, "another parameter named in at most 1 %", rate, rate and rate.rate <= _OTHER))
+        rows.append((level, name, "another parameter named in at most 1 %", rate, rate and rate.rate <= _OTHER))
         rate = pooled(cell.detected for cell in cells if not cell.truth)
         rows.append(
-            (name, f"false alarms at the declared {percent(summary.rate, 0)}", rate, rate and rate.low <= summary.rate)
+            (
+                level,
+                name,
+                f"false alarms at the declared {percent(summary.rate, 0)}",
+                rate,
+                rate and rate.low <= summary.rate,
+            )
         )
-    met = [row for row in rows if row[3]]
-    missed = [(name, what, rate_text(rate)) for name, what, rate, good in rows if rate is not None and not good]
+    met = [row for row in rows if row[4]]
+    missed = [
+        (level, name, what, rate_text(rate)) for level, name, what, rate, good in rows if rate is not None and not good
+    ]
     lines = paragraph(
         "Wanted: k −10 % and c −30 % located in at least 95 % of windows, another parameter named in at most 1 %,",
         f"false alarms at the declared rate within its interval. {len(met)} met, {len(missed)} missed.",
     )
-    return [*lines, "", *(table(("machine", "wanted", "measured"), missed) if missed else [])]
+    return [*lines, "", *(table(("level", "machine", "wanted", "measured"), missed) if missed else [])]
 
 
 def _details(summary: UnknownSummary, name: str) -> list[str]:
     rows = []
     for layout in Layout:
-        for cell in summary.of(name, layout):
+        for cell in summary.of(KnowledgeLevel.NONE, name, layout):
             changed = next(iter(cell.truth), None)
             reading = cell.readings.get(changed) if changed else None
             read = "–" if reading is None else f"{percent(reading.median)} ± {percent(reading.median_error)}"
@@ -146,11 +161,12 @@ def _details(summary: UnknownSummary, name: str) -> list[str]:
         "covered",
         "others covered",
     )
-    return [f"### {name}", "", *table(head, rows)]
+    return [f"### {name}, level none", "", *table(head, rows)]
 
 
 def _command(summary: UnknownSummary) -> list[str]:
-    machines = " ".join(f"--machine {name}" for name in summary.machines)
+    options = [f"--level {level}" for level in dict.fromkeys(level for level, _ in summary.pairs)]
+    machines = " ".join([*options, *(f"--machine {name}" for name in summary.machines)])
     return [
         "```sh",
         f"rotortrain unknown {machines} --windows {summary.windows} --commissionings {summary.commissionings} "

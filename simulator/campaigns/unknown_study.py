@@ -1,4 +1,4 @@
-"""How well a machine is watched that was commissioned without any of its parameters.
+"""How well a machine is watched that was commissioned without its parameters, or with some of them.
 
 Every machine is commissioned several times, each time from scratch on healthy windows of its own, so that the
 commissioning's own error is sampled as well; against each commissioning, windows of later days are read, healthy and
@@ -11,14 +11,21 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from models.commissioning.identified import identify
+from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import learn_baseline
-from models.diagnosis.readings import Diagnostician
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.readings import Diagnosis, Diagnostician
+from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, RecordingError
+from models.machine import Machine, MachineFile
+from models.signals.block import FloatArray
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.unknown_subjects import Later, subject_named
 
@@ -43,6 +50,8 @@ class UnknownPlan:
     ----------
     machines : tuple of str
         Among `simulator.campaigns.unknown_subjects.SUBJECTS`.
+    levels : tuple of KnowledgeLevel
+        A machine without a file of a level is left out there.
     seed : int
     windows : int
         Of each cell and machine, spread evenly over the commissionings.
@@ -54,11 +63,19 @@ class UnknownPlan:
     """
 
     machines: tuple[str, ...]
+    levels: tuple[KnowledgeLevel, ...]
     seed: int
     windows: int
     commissionings: int = 5
     healthy: int = 6
     rate: float = 0.01
+
+    def pairs(self) -> Iterator[tuple[KnowledgeLevel, str]]:
+        """Levels and the machines that have a file of them."""
+        for level in self.levels:
+            for machine in self.machines:
+                if subject_named(machine).file(level) is not None:
+                    yield level, machine
 
     def numbers(self, commissioning: int) -> range:
         """Numbers of the windows that each cell has in a commissioning."""
@@ -71,6 +88,7 @@ class UnknownRecord(BaseModel):
 
     Attributes
     ----------
+    level : KnowledgeLevel
     machine : str
     commissioning, cell, number : int
     layout : Layout
@@ -89,6 +107,7 @@ class UnknownRecord(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    level: KnowledgeLevel = KnowledgeLevel.NONE
     machine: str
     commissioning: int
     cell: int
@@ -103,15 +122,36 @@ class UnknownRecord(BaseModel):
     refused: str = ""
 
 
-def commissioned(windows: Sequence[WindowStatistics]) -> Diagnostician:
-    """Commission on healthy windows alone; the one place where that is decided.
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """Windows compared with a machine's theory, each from a cold start: no two share their condition."""
+
+    machine: Machine
+    shared: FloatArray | None
+
+    @property
+    def by(self) -> str:
+        return "likelihood"
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        read = determined(LikelihoodFit(self.machine).diagnose(window), window, self.machine.window.length_s)
+        return read if self.shared is None else with_shared_error(read, self.shared)
+
+
+def commissioned(level: KnowledgeLevel, machine: MachineFile, windows: Sequence[WindowStatistics]) -> Diagnostician:
+    """Commission on healthy windows with what the machine file tells; the one place where that is decided.
 
     Raises
     ------
     EstimationError
         If the windows do not suffice.
     """
-    return BaselineDiagnostician(learn_baseline(windows))
+    if level is KnowledgeLevel.NONE:
+        return BaselineDiagnostician(learn_baseline(windows))
+    if isinstance(machine, Machine):
+        return _Compared(machine, None)
+    identified = identify(machine, windows)
+    return _Compared(identified.machine, identified.covariance)
 
 
 def run_unknown(plan: UnknownPlan, kept: Path, processes: int, progress: Callable[[str, int, int], None]) -> None:
@@ -124,7 +164,7 @@ def run_unknown(plan: UnknownPlan, kept: Path, processes: int, progress: Callabl
         JSON lines.
     processes : int
     progress : callable
-        Called with the machine, its windows done and its windows in all.
+        Called with machine and level, the windows done and the windows in all.
 
     Raises
     ------
@@ -134,25 +174,26 @@ def run_unknown(plan: UnknownPlan, kept: Path, processes: int, progress: Callabl
     records = list(read_unknown(kept))
     if records:  # a line that was cut short would swallow the next one
         kept.write_text("".join(map(_line, records)), encoding="utf-8")
-    done = {(one.machine, one.commissioning, one.cell, one.number) for one in records}
+    done = {(one.level, one.machine, one.commissioning, one.cell, one.number) for one in records}
     with ProcessPoolExecutor(processes) as pool, kept.open("a", encoding="utf-8") as out:
-        for machine in plan.machines:
+        for level, machine in plan.pairs():
             tasks: list[tuple[int, int, tuple[int, ...]]] = []
             finished = 0
             for commissioning in range(plan.commissionings):
                 for cell in range(len(CELLS)):
                     numbers = plan.numbers(commissioning)
-                    missing = tuple(n for n in numbers if (machine, commissioning, cell, n) not in done)
+                    missing = tuple(n for n in numbers if (level, machine, commissioning, cell, n) not in done)
                     finished += len(numbers) - len(missing)
                     if missing:
                         tasks.append((commissioning, cell, missing))
             total = plan.windows * len(CELLS)
-            progress(machine, finished, total)
-            for read in pool.map(partial(_read, plan, machine), tasks):
+            label = f"{machine}, {level}"
+            progress(label, finished, total)
+            for read in pool.map(partial(_read, plan, level, machine), tasks):
                 out.writelines(map(_line, read))
                 out.flush()
                 finished += len(read)
-                progress(machine, finished, total)
+                progress(label, finished, total)
 
 
 def _line(record: UnknownRecord) -> str:
@@ -181,22 +222,31 @@ def read_unknown(path: Path) -> Iterator[UnknownRecord]:
 
 
 @lru_cache(maxsize=2)
-def _commissioned(machine: str, seed: int, commissioning: int, healthy: int) -> Diagnostician | str:
+def _commissioned(
+    level: KnowledgeLevel, machine: str, seed: int, commissioning: int, healthy: int
+) -> Diagnostician | str:
+    subject = subject_named(machine)
+    file = subject.file(level)
+    if file is None:
+        raise AssertionError("the plan leaves such machines out")
     try:
-        return commissioned(subject_named(machine).healthy(seed, commissioning, healthy))
+        return commissioned(level, file, subject.healthy(seed, commissioning, healthy))
     except EstimationError as error:
         return str(error)
 
 
-def _read(plan: UnknownPlan, machine: str, task: tuple[int, int, tuple[int, ...]]) -> list[UnknownRecord]:
+def _read(
+    plan: UnknownPlan, level: KnowledgeLevel, machine: str, task: tuple[int, int, tuple[int, ...]]
+) -> list[UnknownRecord]:
     commissioning, cell, numbers = task
-    diagnostician = _commissioned(machine, plan.seed, commissioning, plan.healthy)
+    diagnostician = _commissioned(level, machine, plan.seed, commissioning, plan.healthy)
     subject = subject_named(machine)
     records = []
     for number in numbers:
         layout = Layout(number % 2)
         window, cutoff_hz = subject.later(Later(plan.seed, commissioning, cell, number, layout, CELLS[cell]))
         known = {
+            "level": level,
             "machine": machine,
             "commissioning": commissioning,
             "cell": cell,
@@ -213,7 +263,7 @@ def _opinion(diagnostician: Diagnostician | str, window: WindowStatistics, rate:
         return {"refused": f"not commissioned: {diagnostician}"}
     try:
         diagnosis = diagnostician.diagnose(window)
-    except EstimationError as error:
+    except (EstimationError, np.linalg.LinAlgError) as error:
         return {"refused": str(error)}
     if not diagnosis.evaluable:
         return {"refused": next((one.reason for one in diagnosis.parameters), "nothing was read")}

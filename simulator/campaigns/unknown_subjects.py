@@ -13,11 +13,13 @@ from typing import Protocol
 
 import numpy as np
 
+from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.window import WindowStatistics
-from models.machine import ConditionRange, Machine, load_machine
+from models.machine import ConditionRange, Machine, MachineFile, load_machine
+from models.physics.parameters import KnownRotor
 from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
 from simulator.finite_elements.machines import ROTORS, rotor_named
-from simulator.finite_elements.observed import WindowSizes, plan, sampled, windows_of
+from simulator.finite_elements.observed import WindowSizes, machine_of, plan, sampled, windows_of
 from simulator.finite_elements.rotor import BeamRotor
 from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 
@@ -31,6 +33,7 @@ _COMMISSIONED_CUTOFFS_HZ = (40.0, 160.0)
 _OTHER_CUTOFF = math.log(1.25)
 _SPEED_TOLERANCE = 0.01
 _SETTLING_S = 0.1
+_GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 
 
 class _Use(IntEnum):
@@ -70,6 +73,9 @@ class Subject(Protocol):
     @property
     def description(self) -> str:
         """What it is, in a few words."""
+
+    def file(self, level: KnowledgeLevel) -> MachineFile | None:
+        """Its machine file at a level of knowledge; None where its model class has no such file."""
 
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
         """Windows of 60 s of one commissioning, which do not overlap."""
@@ -116,6 +122,14 @@ class _Beam:
     def description(self) -> str:
         return self.rotor.description
 
+    def file(self, level: KnowledgeLevel) -> MachineFile | None:
+        bare = machine_of(self.rotor, WindowSizes())
+        if level is KnowledgeLevel.NONE:
+            return bare
+        if level is KnowledgeLevel.FULL:
+            return None
+        return bare.model_copy(update={"rotor": _as_weighed(self.rotor)})
+
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
         cutoff_hz = _commissioned_cutoff(self.rotor.name, seed, commissioning)
         rng = _generator(self.rotor.name, seed, commissioning, _Use.COMMISSIONING)
@@ -147,6 +161,15 @@ class _Shipped:
     def description(self) -> str:
         return f"{self.machine.description}, six degrees of freedom"
 
+    def file(self, level: KnowledgeLevel) -> MachineFile | None:
+        machine = _within(self.machine, self.machine.condition)
+        if level is KnowledgeLevel.FULL:
+            return machine
+        content = machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"})
+        if level is KnowledgeLevel.PARTIAL:
+            content["rotor"] = machine.rotor.model_dump(include=set(_GEOMETRY))
+        return MachineFile.model_validate(content)
+
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
         cutoff_hz = _commissioned_cutoff(self.machine.name, seed, commissioning)
         rng = _generator(self.machine.name, seed, commissioning, _Use.COMMISSIONING)
@@ -177,6 +200,22 @@ class _Shipped:
             layout=which.layout,
         )
         return simulate_window(draw, which.number), cutoff_hz
+
+
+def _as_weighed(rotor: BeamRotor) -> KnownRotor:
+    """Masses and shaft as an engineer would write them down: half the shaft between bearing and disc to either."""
+    bearing, disc = rotor.bearings[0], rotor.discs[0]
+    length_m = rotor.length_m / rotor.elements * abs(disc.node - bearing.node)
+    half_kg = rotor.density_kg_m3 * rotor.area_m2 * length_m / 2
+    return KnownRotor(
+        m1_kg=bearing.housing_kg + half_kg,
+        m2_kg=disc.mass_kg + half_kg,
+        I2_kg_m2=disc.mass_kg * disc.radius_m**2 / 4,
+        I2p_kg_m2=disc.mass_kg * disc.radius_m**2 / 2,
+        shaft_length_m=length_m,
+        shaft_diameter_m=rotor.diameter_m,
+        shaft_E_Pa=rotor.E_Pa,
+    )
 
 
 def _within(machine: Machine, limits: ConditionRange) -> Machine:

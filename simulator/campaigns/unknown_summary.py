@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from models.commissioning.knowledge import KnowledgeLevel
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.unknown_study import CELLS, UnknownPlan, UnknownRecord
@@ -47,6 +48,7 @@ class CellSummary(BaseModel):
 
     Attributes
     ----------
+    level : KnowledgeLevel
     machine : str
     truth : dict of str to float
     layout : Layout or None
@@ -66,6 +68,7 @@ class CellSummary(BaseModel):
 
     model_config = _STRICT
 
+    level: KnowledgeLevel
     machine: str
     truth: dict[str, float]
     layout: Layout | None
@@ -92,9 +95,15 @@ class UnknownSummary(BaseModel):
     rate: float
     cells: tuple[CellSummary, ...]
 
-    def of(self, machine: str, layout: Layout | None = None) -> tuple[CellSummary, ...]:
-        """Cells of one machine."""
-        return tuple(cell for cell in self.cells if cell.machine == machine and cell.layout == layout)
+    @property
+    def pairs(self) -> tuple[tuple[KnowledgeLevel, str], ...]:
+        """Levels and machines, in their order."""
+        return tuple(dict.fromkeys((cell.level, cell.machine) for cell in self.cells))
+
+    def of(self, level: KnowledgeLevel, machine: str, layout: Layout | None = None) -> tuple[CellSummary, ...]:
+        """Cells of one machine at one level."""
+        wanted = (level, machine, layout)
+        return tuple(cell for cell in self.cells if (cell.level, cell.machine, cell.layout) == wanted)
 
 
 def pooled(rates: Iterable[Rate]) -> Rate | None:
@@ -117,19 +126,21 @@ def summarize_unknown(
         Machines and what they are.
     """
     cells = []
-    for machine in plan.machines:
+    for level, machine in dict.fromkeys((one.level, one.machine) for one in records):
+        if level not in plan.levels or machine not in plan.machines:
+            continue
         for layout in (None, *Layout):
             for number, truth in enumerate(CELLS):
                 own = [
                     one
                     for one in records
-                    if (one.machine, one.cell) == (machine, number)
+                    if (one.level, one.machine, one.cell) == (level, machine, number)
                     and layout in (None, one.layout)
                     and one.commissioning < plan.commissionings
                     and one.number in plan.numbers(one.commissioning)
                 ]
                 if own:
-                    cells.append(_cell(machine, truth, layout, own))
+                    cells.append(_cell(level, machine, truth, layout, own))
     return UnknownSummary(
         machines={name: descriptions[name] for name in plan.machines},
         seed=plan.seed,
@@ -141,13 +152,16 @@ def summarize_unknown(
     )
 
 
-def _cell(machine: str, truth: dict[str, float], layout: Layout | None, own: list[UnknownRecord]) -> CellSummary:
+def _cell(
+    level: KnowledgeLevel, machine: str, truth: dict[str, float], layout: Layout | None, own: list[UnknownRecord]
+) -> CellSummary:
     def exact(one: UnknownRecord) -> bool:
         return not one.refused and set(one.named) == set(truth)
 
     numbers = sorted({one.commissioning for one in own})
     names = dict.fromkeys(name for one in own for name in one.change)
     return CellSummary(
+        level=level,
         machine=machine,
         truth=truth,
         layout=layout,

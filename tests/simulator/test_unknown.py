@@ -1,21 +1,24 @@
 """The campaign on machines without parameters: its windows, its records, its sums and its section."""
 
 import math
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from models.commissioning.knowledge import KnowledgeLevel, knowledge_of
 from models.errors import RecordingError
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.unknown_command import watch_unknown
 from simulator.campaigns.unknown_page import BEGIN, END, placed, unknown_section
 from simulator.campaigns.unknown_study import CELLS, UnknownPlan, UnknownRecord, read_unknown, run_unknown
-from simulator.campaigns.unknown_subjects import SUBJECTS, Later, subject_named
+from simulator.campaigns.unknown_subjects import SHIPPED, SUBJECTS, Later, subject_named
 from simulator.campaigns.unknown_summary import summarize_unknown
+from simulator.rotortrain import app
+
+NONE = KnowledgeLevel.NONE
 
 
 def later(**other: object) -> Later:
@@ -61,12 +64,12 @@ def test_a_true_change_is_in_the_window() -> None:
 
 
 def test_an_interrupted_campaign_carries_on_and_gives_the_same_records(tmp_path: Path) -> None:
-    plan = UnknownPlan(("overhung",), seed=5, windows=2, commissionings=1, healthy=4)
+    plan = UnknownPlan(("overhung",), (NONE,), seed=5, windows=2, commissionings=1, healthy=4)
     kept = tmp_path / "records.jsonl"
     seen: list[tuple[str, int, int]] = []
     run_unknown(plan, kept, 1, lambda *done: seen.append(done))
-    assert seen[0] == ("overhung", 0, 12)
-    assert seen[-1] == ("overhung", 12, 12)
+    assert seen[0] == ("overhung, none", 0, 12)
+    assert seen[-1] == ("overhung, none", 12, 12)
     whole = list(read_unknown(kept))
     assert [(one.cell, one.layout) for one in whole] == [(n // 2, Layout(n % 2)) for n in range(12)]
     assert all(set(one.change) == {"k_by", "c_by", "k_bz", "c_bz", "e"} for one in whole)
@@ -86,10 +89,10 @@ def test_an_interrupted_campaign_carries_on_and_gives_the_same_records(tmp_path:
 
 
 def test_a_machine_that_cannot_be_commissioned_counts_as_read_in_vain(tmp_path: Path) -> None:
-    plan = UnknownPlan(("stuck",), seed=5, windows=1, commissionings=1)
+    plan = UnknownPlan(("stuck",), (NONE,), seed=5, windows=1, commissionings=1)
     records = [record(cell, 0, refused="not commissioned: too little") for cell in range(len(CELLS))]
     summary = summarize_unknown(plan, [one.model_copy(update={"machine": "stuck"}) for one in records], {"stuck": "it"})
-    for cell in summary.of("stuck"):
+    for cell in summary.of(NONE, "stuck"):
         assert (cell.exact.count, cell.refused.count, cell.readings) == (0, 1, {})
     assert "| 100 % (2.5–100, 1 of 1) |" in unknown_section(summary)
 
@@ -107,7 +110,7 @@ def record(cell: int, number: int, commissioning: int = 0, **other: object) -> U
 
 
 def test_sums_count_what_they_say() -> None:
-    plan = UnknownPlan(("overhung",), seed=1, windows=4, commissionings=2)
+    plan = UnknownPlan(("overhung",), (NONE,), seed=1, windows=4, commissionings=2)
     records = [
         record(0, 0, named=("e",), change={"k_by": 0.03}, error={"k_by": 0.01}, outside=True),
         record(0, 1, change={"k_by": 0.01}, error={"k_by": 0.01}),
@@ -121,7 +124,7 @@ def test_sums_count_what_they_say() -> None:
         record(1, 0, 2, named=("k_by",)),  # beyond its commissionings
     ]
     summary = summarize_unknown(plan, records, {"overhung": "a rotor"})
-    healthy, changed = summary.of("overhung")
+    healthy, changed = summary.of(NONE, "overhung")
     assert (healthy.windows, changed.windows) == (4, 4)
     assert [one.count for one in (healthy.detected, healthy.exact, healthy.other)] == [1, 2, 1]
     assert [one.count for one in (healthy.outside, healthy.refused)] == [1, 1]
@@ -130,10 +133,10 @@ def test_sums_count_what_they_say() -> None:
     assert healthy.readings["k_by"].covered == Rate.of_counts(2, 3)
     assert healthy.readings["k_by"].z_rms == pytest.approx(math.sqrt(11 / 3))
     assert changed.readings["k_by"].covered == Rate.of_counts(3, 4)
-    assert summary.of("overhung", Layout.INDEPENDENT)[1].exact == Rate.of_counts(0, 2)
+    assert summary.of(NONE, "overhung", Layout.INDEPENDENT)[1].exact == Rate.of_counts(0, 2)
     section = unknown_section(summary)
-    assert "| **overhung**: a rotor | 25 % (0.631–80.6, 1 of 4) | 25 % (0.631–80.6, 1 of 4) | – |" in section
-    assert "| overhung | k −10 % located in at least 95 % | 25 %" in section
+    assert "| none | **overhung**: a rotor | 25 % (0.631–80.6, 1 of 4) | 25 % (0.631–80.6, 1 of 4) | – |" in section
+    assert "| none | overhung | k −10 % located in at least 95 % | 25 %" in section
 
 
 def test_the_section_replaces_itself_and_leaves_the_rest_of_the_page() -> None:
@@ -143,6 +146,32 @@ def test_the_section_replaces_itself_and_leaves_the_rest_of_the_page() -> None:
     after = once + "\n## Added later\n"
     twice = placed(after, f"{BEGIN}\nnew\n{END}\n")
     assert twice == after.replace("old", "new")
+
+
+def test_files_tell_what_their_level_allows() -> None:
+    for name in SUBJECTS:
+        subject = subject_named(name)
+        for level in KnowledgeLevel:
+            file = subject.file(level)
+            assert file is None or knowledge_of(file).level is level
+        assert (subject.file(KnowledgeLevel.FULL) is None) == (name not in SHIPPED)
+        partial = subject.file(KnowledgeLevel.PARTIAL)
+        assert partial is not None
+        assert partial.rotor is not None
+        assert set(partial.rotor.unknown) == {"k_by_N_per_m", "k_bz_N_per_m", "c_by_N_s_per_m", "c_bz_N_s_per_m", "e_m"}
+        assert partial.window.length_s == 60.0
+
+
+def test_levels_are_counted_apart(tmp_path: Path) -> None:
+    both = (KnowledgeLevel.NONE, KnowledgeLevel.FULL)
+    plan = UnknownPlan(("between", "lab"), both, seed=5, windows=1, commissionings=1, healthy=3)
+    assert list(plan.pairs()) == [(NONE, "between"), (NONE, "lab"), (KnowledgeLevel.FULL, "lab")]
+    full = UnknownPlan(("lab",), (KnowledgeLevel.FULL,), seed=5, windows=1, commissionings=1, healthy=3)
+    run_unknown(full, tmp_path / "records.jsonl", 1, lambda *_: None)
+    records = list(read_unknown(tmp_path / "records.jsonl"))
+    assert [one.named for one in records] == [tuple(truth) for truth in CELLS]
+    summary = summarize_unknown(plan, [*records, record(0, 0)], {"between": "", "lab": ""})
+    assert summary.pairs == ((KnowledgeLevel.FULL, "lab"),)
 
 
 def test_every_subject_can_be_had() -> None:
@@ -156,7 +185,7 @@ def test_the_command_writes_numbers_section_and_page(tmp_path: Path) -> None:
     page = tmp_path / "results.md"
     page.write_text("# Measured results\n", encoding="utf-8")
     watch_unknown(
-        ["overhung"], tmp_path / "out", windows=1, commissionings=1, healthy=3, seed=9, processes=1, page=page
+        ["overhung"], [], tmp_path / "out", windows=1, commissionings=1, healthy=3, seed=9, processes=1, page=page
     )
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"9-3-records.jsonl", "unknown.json", "unknown.md"}
     text = page.read_text(encoding="utf-8")
@@ -168,19 +197,17 @@ def test_the_command_writes_numbers_section_and_page(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (("--machine", "nobody", "--out", "x"), "--machine nobody: not among overhung, between"),
+        (("--level", "some", "--out", "x"), "--level some: not among full, partial, none"),
         (("--out", "x", "--page", "none.md"), "--page none.md: no such page"),
         ((), "Missing option '--out'"),
     ],
 )
-def test_wrong_arguments_exit_with_2_and_a_sentence(arguments: tuple[str, ...], message: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "simulator.rotortrain", "unknown", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-    )
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
+def test_wrong_arguments_exit_with_2_and_a_sentence(
+    arguments: tuple[str, ...], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["unknown", *arguments])
+    assert done.exit_code == 2
+    assert message in done.output
+    assert "Traceback" not in done.output
     assert not list(tmp_path.iterdir())
