@@ -1,0 +1,151 @@
+"""The monitor of a machine that was commissioned without its parameters, from block to alarm."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from models.commissioning.installed import Installed
+from models.errors import BundleError
+from models.machine import AlarmSettings, MachineFile
+from models.signals.block import SampleBlock
+from service.alarms import AlarmEvent
+from service.conversion import Identity, report
+from service.monitor import HealthState, MachineMonitor, WindowReport
+from simulator.scenario import Event
+from tests.commissioning.material import (
+    LAB,
+    NOTHING,
+    commissioned,
+    healthy,
+    recording,
+    samples_of,
+    stream,
+    with_samples,
+)
+
+HEALTHY_S, SEED = 370.0, 71
+MACHINE = NOTHING.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0)})
+
+
+@cache
+def installed() -> Installed:
+    made = commissioned(MACHINE, healthy(MACHINE, HEALTHY_S, SEED))
+    assert made.commissioned is not None
+    return Installed(MACHINE, None, made.commissioned)
+
+
+def feed(blocks: Sequence[SampleBlock], what: Installed) -> tuple[list[WindowReport], list[AlarmEvent]]:
+    monitor = MachineMonitor(what)
+    windows: list[WindowReport] = []
+    events: list[AlarmEvent] = []
+    for block in blocks:
+        outcome = monitor.step(block)
+        windows += outcome.windows
+        events += outcome.events
+    return windows, events
+
+
+def full(windows: Sequence[WindowReport]) -> list[WindowReport]:
+    return [window for window in windows if window.filled == 1.0]
+
+
+def test_the_healthy_machine_stays_healthy() -> None:
+    windows, events = feed(stream(130.0, SEED + 1), installed())
+    assert len(full(windows)) > 10
+    assert {window.state for window in full(windows)} == {HealthState.HEALTHY}
+    assert not events
+    readings = {reading.name: reading for reading in full(windows)[-1].parameters}
+    assert readings["EI"].reason
+    assert all(readings[name].change is not None for name in ("k_by", "c_by", "k_bz", "c_bz", "e"))
+    rows = {row.equation: row for row in full(windows)[-1].equations}
+    assert [reading.name for reading in rows["28 + 29"].parameters] == ["k_by", "c_by"]
+
+
+@pytest.mark.parametrize(("name", "change"), [("k_by", -0.2), ("c_bz", -0.4), ("e", 0.5)])
+def test_a_change_is_named_alone(name: str, change: float) -> None:
+    blocks = stream(75.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
+    windows, events = feed(blocks, installed())
+    verdict = full(windows)[-1].verdict
+    assert verdict is not None
+    assert [finding.name for finding in verdict.findings] == [name]
+    assert {event.alarm.parameter for event in events} == {name}
+    (reading,) = (one for one in verdict.current if one.name == name)
+    assert reading.interval is not None
+    low, high = reading.interval
+    assert low - 0.05 < change < high + 0.05
+    shown = report(Identity("demo", "lab", None, ""), full(windows)[-1])
+    assert [one.name for one in shown.verdict.changed] == [name] if shown.verdict else False
+
+
+def test_another_speed_is_not_evaluable_here_and_raises_nothing() -> None:
+    windows, events = feed(
+        stream(75.0, SEED + 3, Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm)), installed()
+    )
+    assert {window.state for window in full(windows)} == {HealthState.NOT_EVALUABLE}
+    assert all("not evaluable here: speed is 1518 rpm" in window.reason for window in full(windows))
+    assert not events
+
+
+def _faulty(kind: str) -> list[SampleBlock]:
+    """A healthy machine with a sensor at fault from the middle of the recording on."""
+    blocks = stream(130.0, SEED + 4)
+    samples = samples_of(blocks)
+    half = samples.shape[0] // 2
+    names = [channel.name for channel in LAB.sensors]
+    y1, y2, z1 = (names.index(name) for name in ("y1", "y2", "z1"))
+    match kind:
+        case "gain drift":
+            samples[half:, y2] *= np.linspace(1.0, 0.7, samples.shape[0] - half)
+        case "offset":
+            samples[half:, y1] += 8 * samples[:, y1].std()
+        case "stuck":
+            samples[half:, z1] = samples[half, z1]
+        case "clipped":
+            limit = 1.3 * samples[:, y2].std()
+            samples[half:, y2] = np.clip(samples[half:, y2], -limit, limit)
+        case "swapped":
+            samples[half:, [y1, z1]] = samples[half:, [z1, y1]]
+        case "delayed":
+            samples[half + 6 :, y1] = samples[half:-6, y1]
+    return with_samples(blocks, samples)
+
+
+@pytest.mark.parametrize("kind", ["gain drift", "offset", "stuck", "clipped", "swapped", "delayed"])
+def test_a_sensor_at_fault_is_told_from_the_machine(kind: str) -> None:
+    windows, events = feed(_faulty(kind), installed())
+    last = full(windows)[-1]
+    assert last.state is HealthState.DATA_HEALTH
+    assert last.sensors
+    assert last.sensors[0].text in last.reason
+    assert {event.alarm.parameter for event in events} == {"sensor"}
+
+
+def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
+    bearing = tuple(channel for channel in MACHINE.sensors if channel.location != "disc")
+    columns = [n for n, channel in enumerate(MACHINE.sensors) if channel.location != "disc"]
+    machine = MACHINE.model_copy(update={"sensors": bearing})
+
+    def seen(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
+        return [replace(block, samples=block.samples[:, columns]) for block in blocks]
+
+    made = commissioned(machine, recording(machine, seen(stream(HEALTHY_S, SEED))))
+    assert made.commissioned is not None
+    few = Installed(machine, None, made.commissioned)
+    windows, events = feed(seen(stream(70.0, SEED + 1)), few)
+    assert {window.state for window in full(windows)} == {HealthState.UNCHANGED}
+    assert not events
+    assert all("too few sensors" in window.reason for window in full(windows))
+    softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.4)
+    windows, events = feed(seen(stream(70.0, SEED + 5, softer)), few)
+    assert {event.alarm.parameter for event in events} == {"shape"}
+    assert full(windows)[-1].state is HealthState.ALERT
+    assert all(reading.change is None for reading in full(windows)[-1].parameters)
+
+
+def test_a_machine_that_is_neither_known_nor_commissioned_is_refused() -> None:
+    unknown: MachineFile = NOTHING
+    with pytest.raises(BundleError, match="neither known nor commissioned"):
+        MachineMonitor(Installed(unknown))
