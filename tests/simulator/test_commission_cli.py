@@ -1,0 +1,83 @@
+"""``rotortrain commission`` as a process: what it writes, what it refuses, and how a commissioning is replaced."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from models.commissioning.commissioned import load_commissioned
+from models.machine import load_machine_file
+from simulator.recorder import record
+from tests.commissioning.material import LAB, stream
+
+ROOT = Path(__file__).parents[2]
+SHIPPED = (ROOT / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
+NOTHING_KNOWN = re.sub(r"\[(rotor|operation|condition)\].*?(?=\n\[)", "", SHIPPED, flags=re.DOTALL)
+
+
+def run(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "simulator.rotortrain", "commission", *map(str, arguments)]
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
+    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=200, check=False)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("commission")
+    (place / "machine.toml").write_text(NOTHING_KNOWN, encoding="utf-8")
+    for name, duration_s, seed in (("monday", 190.0, 81), ("friday", 130.0, 82), ("short", 20.0, 83)):
+        record(LAB, ((block, ()) for block in stream(duration_s, seed)), place / f"{name}.mcap")
+    return place
+
+
+def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reason(folder: Path) -> None:
+    arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "--healthy", "friday.mcap", "--out", "kit")
+    found = run(folder, *arguments)
+    assert found.returncode == 0, found.stderr
+    assert "bundle: kit" in found.stdout
+    machine = load_machine_file(folder / "machine.toml")
+    first = load_commissioned(folder / "kit", machine)
+    assert (first.version, first.replaces, first.level) == (1, None, "none")
+    assert [one.name for one in first.recordings] == ["monday.mcap", "friday.mcap"]
+    assert [one.used_s for one in first.recordings] == [185.0, 125.0]
+    assert len({one.sha256 for one in first.recordings}) == 2
+    report = json.loads((folder / "kit" / "report.json").read_text(encoding="utf-8"))
+    assert report["identity"] == first.identity
+    assert "<html" in (folder / "kit" / "report.html").read_text(encoding="utf-8")
+
+    again = run(folder, *arguments)
+    assert again.returncode == 2
+    assert "kit holds version 1 of the commissioning of demo/lab: say why it is replaced" in again.stderr
+    assert load_commissioned(folder / "kit", machine) == first
+
+    again = run(folder, *arguments, "--why", "bearing exchanged")
+    assert again.returncode == 0, again.stderr
+    second = load_commissioned(folder / "kit", machine)
+    assert (second.version, second.replaces, second.why) == (2, first.identity, "bearing exchanged")
+    assert json.loads((folder / "kit" / "commissioned-1.json").read_text(encoding="utf-8"))["version"] == 1
+
+
+def test_a_recording_that_is_not_fit_is_refused_with_what_to_record(folder: Path) -> None:
+    found = run(folder, "--machine", "machine.toml", "--healthy", "short.mcap", "--out", "never")
+    assert found.returncode == 3
+    assert "too short: 15 s of usable data" in " ".join(found.stdout.split())
+    assert not (folder / "never" / "commissioned.json").exists()
+    report = json.loads((folder / "never" / "report.json").read_text(encoding="utf-8"))
+    assert report["verdict"] == "refused"
+    assert report["identity"] is None
+
+
+def test_recordings_and_machine_files_that_cannot_be_used(folder: Path) -> None:
+    (folder / "other.toml").write_text(NOTHING_KNOWN.replace('name = "lab"', 'name = "pump"', 1), encoding="utf-8")
+    found = run(folder, "--machine", "other.toml", "--healthy", "monday.mcap", "--out", "never")
+    assert found.returncode == 2
+    assert "no hop of 5 s of demo/pump in it; it holds rotorwatch/demo/lab/stream" in found.stderr
+    (folder / "broken.toml").write_text(NOTHING_KNOWN + "\nnonsense = 1\n", encoding="utf-8")
+    found = run(folder, "--machine", "broken.toml", "--healthy", "monday.mcap", "--out", "never")
+    assert found.returncode == 2
+    assert "nonsense" in found.stderr
+    assert "Traceback" not in found.stderr
