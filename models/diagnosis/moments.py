@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.pairs import MotionPair, motion_pairs, pair_powers
+from models.diagnosis.rotation import RotationLine, rotation_line
 from models.diagnosis.waveform import Waveform, waveform_of
-from models.machine import Machine
+from models.machine import MachineFile
 from models.physics.matrices import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS
@@ -41,7 +42,8 @@ class Plan:
     scales : ndarray
         Factor to SI for each of `states`.
     angle_column : int or None
-        Column of the shaft angle; without it the regressors are only the mean.
+        Column of the shaft angle; without it the regressors are the mean and, where `speed_rad_s` is given, the most
+        likely line near it.
     hop, preamble, segment : int
         Samples per hop, samples of history a hop needs before it, samples per spectral segment.
     lags : ndarray of int
@@ -52,6 +54,10 @@ class Plan:
         Hops in a full window.
     max_span_ns : int
         Oldest data a window may hold.
+    speed_rad_s : float or None
+        Speed to look for where there is no shaft angle; None: the rotation is not looked for.
+    speed_tolerance : float
+        How far the speed may be off, relative.
     """
 
     rate_hz: float
@@ -66,6 +72,8 @@ class Plan:
     bins: npt.NDArray[np.intp]
     hops: int
     max_span_ns: int
+    speed_rad_s: float | None = None
+    speed_tolerance: float = 0.0
 
     @property
     def lags_s(self) -> FloatArray:
@@ -90,12 +98,12 @@ class Plan:
         return np.column_stack([states, samples[:, self.angle_column].astype(np.float64)])
 
 
-def plan_for(machine: Machine, *, lagged: bool = True) -> Plan:
+def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
     """Derive the plan of a machine.
 
     Parameters
     ----------
-    machine : Machine
+    machine : MachineFile
     lagged : bool
         Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
     """
@@ -121,6 +129,8 @@ def plan_for(machine: Machine, *, lagged: bool = True) -> Plan:
         bins=np.arange(first, last + 1),
         hops=window.hops,
         max_span_ns=round(window.max_span_s * 1e9),
+        speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
+        speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
     )
 
 
@@ -139,6 +149,8 @@ class HopMoments:
         power spectral density per Hz.
     turned_rad : float
         Shaft angle covered in the hop (nan without a phase reference).
+    line : RotationLine or None
+        The most likely rotation where there is no phase reference. The regressors follow it, from an unknown angle.
     waveform : Waveform
         What the samples of each measured state look like and, last, those of the shaft angle if there is one.
     pair_powers : ndarray, shape (n_pairs, n_bands, 3)
@@ -150,6 +162,7 @@ class HopMoments:
     products: FloatArray
     segments: ComplexArray
     turned_rad: float
+    line: RotationLine | None
     waveform: Waveform
     pair_powers: ComplexArray
 
@@ -171,15 +184,20 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     """
     n_states = len(plan.states)
     x = samples[:, :n_states] - level
-    turned_rad = np.nan
-    ones = np.ones((samples.shape[0], 1))
-    if plan.angle_column is None:
-        a = np.hstack([x, ones])
-    else:
+    turned_rad, line = np.nan, None
+    regressors = [x, np.ones((samples.shape[0], 1))]
+    theta = None
+    if plan.angle_column is not None:
         theta = samples[:, n_states]
-        a = np.hstack([x, ones, np.cos(theta)[:, None], np.sin(theta)[:, None]])
         steps = np.diff(theta[plan.preamble - 1 :])
         turned_rad = float(np.sum((steps + np.pi) % (2 * np.pi) - np.pi))
+    elif plan.speed_rad_s is not None:
+        line = rotation_line(x, plan.rate_hz, plan.speed_rad_s, plan.speed_tolerance)
+        t_s = (np.arange(samples.shape[0]) - samples.shape[0] / 2) / plan.rate_hz
+        theta = np.zeros_like(t_s) if line is None else line.angle(t_s)
+    if theta is not None:
+        regressors += [np.cos(theta)[:, None], np.sin(theta)[:, None]]
+    a = np.hstack(regressors)
     segments = _segment_spectra(a, plan)
     waveform = waveform_of(samples[plan.preamble :])
     # The mean leaks from zero frequency into the lowest bins; the rotation obeys v = jωx and stays.
@@ -190,6 +208,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         products=_lagged_products(a, plan),
         segments=segments,
         turned_rad=turned_rad,
+        line=line,
         waveform=waveform,
         pair_powers=pair_powers(segments[:, :, :n_states] - level_left, plan.frequencies_hz, plan.pairs),
     )

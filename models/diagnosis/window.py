@@ -7,6 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan, hop_moments
+from models.diagnosis.synchronous import (
+    Rotation,
+    SpeedSource,
+    hop_coefficients,
+    regression,
+    relative_vectors,
+    rotation_of,
+)
 from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
 from models.signals.block import FloatArray
 
@@ -41,10 +49,22 @@ class WindowStatistics:
         q of x_n = Re{q e^{jθ}} over the window; None without a phase reference.
     hop_synchronous : ndarray of complex, shape (n_hops, n) or None
         The same of every hop alone.
+    relative_synchronous : ndarray of complex, shape (n_hops, n) or None
+        Where the speed is estimated: the same of every hop, from an angle at which `zero_angle_state` is largest.
+        Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a speed.
+    zero_angle_state : str
+        The state whose angle is zero there; empty otherwise.
+    speed_source : str
+        ``phase reference``, ``estimated`` (from the line in the vibration), or ``unknown``: the rotation was not taken
+        out then.
     speed_rad_s : float
-        Mean speed (nan without a phase reference).
+        Mean speed (nan if unknown).
     speed_range : tuple of float
-        Slowest and fastest hop, rad/s (nan without a phase reference).
+        Slowest and fastest hop, rad/s (nan if unknown).
+    hop_speed_rad_s : ndarray, shape (n_hops,)
+        Mean speed of each hop (nan if unknown).
+    removed_by_hop : bool
+        Whether the rotation was taken out hop by hop, each with its own amplitude.
     duration_s : float
         Length of the data in the window.
     waveforms : tuple of Waveform
@@ -65,11 +85,26 @@ class WindowStatistics:
     frequencies_hz: FloatArray
     synchronous: ComplexArray | None
     hop_synchronous: ComplexArray | None
+    relative_synchronous: ComplexArray | None
+    zero_angle_state: str
+    speed_source: SpeedSource
     speed_rad_s: float
     speed_range: tuple[float, float]
+    hop_speed_rad_s: FloatArray
+    removed_by_hop: bool
     duration_s: float
     waveforms: tuple[Waveform, ...]
     pair_powers: tuple[ComplexArray, ...]
+
+    @property
+    def phase_reference(self) -> bool:
+        """Whether the shaft angle is measured."""
+        return self.speed_source == "phase reference"
+
+    @property
+    def rotation_vectors(self) -> ComplexArray | None:
+        """Rotation-synchronous vectors of each hop, from an angle that may be another one in each; None if unknown."""
+        return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
 
     @property
     def hop_waveform(self) -> Waveform:
@@ -92,22 +127,43 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     """
     n = len(plan.states)
     n_lags = plan.lags_s.size if lagged else 1
+    rotation = rotation_of(plan, hops)
     products = np.stack([hop.products[:n_lags] for hop in hops])
+    segments = np.concatenate([hop.segments for hop in hops])
+    if rotation.source == "unknown":  # a line may ride along, but it is not the shaft's
+        products, segments = products[:, :, : n + 1, : n + 1], segments[:, :, : n + 1]
     total = products[0].copy()
     for hop in products[1:]:  # one by one, in order: the sum must not depend on how numpy would pair them
         total += hop
-    beta = _regression(total[0], n)
-    remove = np.hstack([np.eye(n), -beta])
-    hop_correlation = (remove @ products @ remove.T) / plan.hop
-    segments = np.concatenate([hop.segments for hop in hops])
-    rest = np.ascontiguousarray((segments @ remove.T).transpose(1, 2, 0))
-    spectrum = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
-    duration_s = len(hops) * plan.hop / plan.rate_hz
-    turned = [hop.turned_rad for hop in hops]
-    synchronous = hop_synchronous = None
+    synchronous = hop_synchronous = relative_synchronous = None
+    zero_angle_state = ""
+    if rotation.by_hop:
+        phase_reference = rotation.source == "phase reference"
+        level = regression(total[0] if phase_reference else total[0][: n + 1, : n + 1], n)
+        own = hop_coefficients(plan, hops, rotation, level[:, 0])
+        remove = np.concatenate([np.broadcast_to(np.eye(n), (len(hops), n, n)), -own.hops], axis=2)[:, np.newaxis]
+        hop_correlation = (remove @ products @ remove.transpose(0, 1, 3, 2)) / plan.hop
+        correlation = hop_correlation.sum(axis=0) / len(hops)
+        cleaned = segments[:, :, :n] - segments[:, :, n:] @ own.segments.transpose(0, 2, 1)
+        if phase_reference:
+            synchronous = _synchronous(level)
+        else:
+            vectors = np.stack([_synchronous(coefficients) for coefficients in own.hops])
+            relative_synchronous, zero_angle = relative_vectors(vectors)
+            zero_angle_state = plan.states[zero_angle]
+    else:
+        beta = regression(total[0], n)
+        remove = np.hstack([np.eye(n), -beta])
+        hop_correlation = (remove @ products @ remove.T) / plan.hop
+        correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
+        cleaned = segments @ remove.T
+        if plan.angle_column is not None:
+            synchronous = _synchronous(beta)
     if plan.angle_column is not None:
-        synchronous = _synchronous(beta)
-        hop_synchronous = np.stack([_synchronous(_regression(product[0], n)) for product in products])
+        hop_synchronous = np.stack([_synchronous(regression(product[0], n)) for product in products])
+    rest = np.ascontiguousarray(cleaned.transpose(1, 2, 0))
+    spectrum = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
+    speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     return WindowStatistics(
         states=plan.states,
         start_ns=hops[0].start_ns,
@@ -115,23 +171,35 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         n_samples=len(hops) * plan.hop,
         n_segments=segments.shape[0],
         lags_s=plan.lags_s[:n_lags],
-        correlation=(remove @ total @ remove.T) / (len(hops) * plan.hop),
+        correlation=correlation,
         hop_correlation=hop_correlation,
         spectrum=spectrum,
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,
-        speed_rad_s=sum(turned) / duration_s,
-        speed_range=(min(turned) / duration_s * len(hops), max(turned) / duration_s * len(hops)),
-        duration_s=duration_s,
+        relative_synchronous=relative_synchronous,
+        zero_angle_state=zero_angle_state,
+        speed_source=rotation.source,
+        speed_rad_s=speed_rad_s,
+        speed_range=speed_range,
+        hop_speed_rad_s=rotation.hop_speed_rad_s,
+        removed_by_hop=rotation.by_hop,
+        duration_s=len(hops) * plan.hop / plan.rate_hz,
         waveforms=tuple(hop.waveform for hop in hops),
         pair_powers=tuple(hop.pair_powers for hop in hops),
     )
 
 
-def _regression(zero_lag: FloatArray, n: int) -> FloatArray:
-    """β of x on the regressors, shape (n, n_regressors); of least norm where a stuck angle makes them dependent."""
-    return np.asarray(np.linalg.lstsq(zero_lag[n:, n:], zero_lag[n:, :n], rcond=None)[0].T, dtype=np.float64)
+def _speeds(rotation: Rotation, hops: tuple[HopMoments, ...], plan: Plan) -> tuple[float, tuple[float, float]]:
+    """Mean speed, and the slowest and fastest hop."""
+    if rotation.source == "phase reference":
+        duration_s, turned = len(hops) * plan.hop / plan.rate_hz, [hop.turned_rad for hop in hops]
+        slowest, fastest = (edge / duration_s * len(hops) for edge in (min(turned), max(turned)))
+        return sum(turned) / duration_s, (slowest, fastest)
+    if rotation.source == "unknown":
+        return np.nan, (np.nan, np.nan)
+    speeds = rotation.hop_speed_rad_s
+    return float(np.nanmean(speeds)), (float(np.nanmin(speeds)), float(np.nanmax(speeds)))
 
 
 def _synchronous(beta: FloatArray) -> ComplexArray:

@@ -1,1 +1,14 @@
 """Sensor faults told from machine faults: what each channel's samples and what pairs of channels say."""
+
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.finding import FaultKind, SensorFinding, implicated
+from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
+
+__all__ = [
+    "FaultKind",
+    "SensorFinding",
+    "SensorReference",
+    "implicated",
+    "learn_sensor_reference",
+    "sensor_findings",
+]

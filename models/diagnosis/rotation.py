@@ -1,0 +1,167 @@
+"""Finding the rotation in the vibration itself, where no phase reference is measured.
+
+The unbalance is a line that all channels share. In one hop its frequency hardly changes, so it is a sinusoid with a
+linear sweep, and the most likely frequency and sweep are those at which the channels together hold the most power over
+their own surroundings. Whether there is a line at all is decided over several hops: noise has its largest peak anywhere
+in the band, a shaft stays where it was.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import median_filter
+
+from models.signals.block import FloatArray
+
+__all__ = ["RotationLine", "followed_speeds", "rotation_line"]
+
+_ComplexArray = npt.NDArray[np.complex128]
+
+_MARGIN_HZ = 1.0
+_SURROUNDINGS_HZ = 3.0
+_SWEEP_PER_S = 0.005
+"""Fastest sweep looked for, as a part of the expected speed and second."""
+_PADDING = 4
+_REFINEMENTS = 5
+_NEIGHBOUR = 0.015
+"""Relative difference of speed between neighbouring hops that one shaft may have, its sweep taken into account."""
+_FOLLOWED_PART = 0.8
+_STRONG, _FEW_HOPS = 15.0, 6
+"""A stretch of a few hops needs lines that stand out by themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class RotationLine:
+    """The most likely line of one hop.
+
+    Attributes
+    ----------
+    speed_rad_s : float
+        Its frequency in the middle of the samples.
+    sweep_rad_s2 : float
+        How fast that changes.
+    strength : float
+        Its power over that of its surroundings, mean over the channels; about 1 where there is only noise, and some 3
+        to 8 at the largest peak of noise.
+    """
+
+    speed_rad_s: float
+    sweep_rad_s2: float
+    strength: float
+
+    def angle(self, t_s: FloatArray) -> FloatArray:
+        """Angle at times from the middle of the samples, from an unknown zero."""
+        return self.speed_rad_s * t_s + self.sweep_rad_s2 / 2 * t_s**2
+
+
+def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: float) -> RotationLine | None:
+    """Find the line in one hop.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples, n)
+        All samples of the hop and what it needs before it.
+    rate_hz : float
+    speed_rad_s, tolerance : float
+        Expected speed and how far it may be off, relative.
+
+    Returns
+    -------
+    RotationLine or None
+        None if no channel fluctuates or the range holds no frequency.
+    """
+    n_samples = x.shape[0]
+    duration_s, expected_hz = n_samples / rate_hz, speed_rad_s / (2 * np.pi)
+    reach_hz = tolerance * expected_hz
+    low = max(1, int(np.floor((expected_hz - reach_hz - _MARGIN_HZ) * duration_s)))
+    high = min(n_samples // 2 - 1, int(np.ceil((expected_hz + reach_hz + _MARGIN_HZ) * duration_s)))
+    if high - low < 8:
+        return None
+    spectrum = np.fft.rfft(x - x.mean(axis=0), axis=0)[low : high + 1]
+    power = np.median(np.abs(spectrum) ** 2, axis=0)
+    alive = power > 0
+    if not np.any(alive):
+        return None
+    count = high - low + 1
+    base_hz, base_rate_hz = low / duration_s, count / duration_s
+    baseband = np.fft.ifft(spectrum[:, alive] / np.sqrt(power[alive]), axis=0)
+    t_s = (np.arange(count) + 0.5) / base_rate_hz - duration_s / 2
+    # The first sample of the baseband stands at the first one of x, half a step before the middle of its own cell.
+    t_s -= 0.5 / base_rate_hz
+    grid_hz = base_hz + base_rate_hz * np.arange(_PADDING * count) / (_PADDING * count)
+    inside = np.abs(grid_hz - expected_hz) <= reach_hz
+    width = round(_SURROUNDINGS_HZ / (grid_hz[1] - grid_hz[0])) | 1
+    sweeps = _sweeps(expected_hz, duration_s)
+    best = (-np.inf, 0.0, 0.0)
+    for sweep in sweeps:
+        turned = baseband * np.exp(-1j * np.pi * sweep * t_s**2)[:, None]
+        seen = np.sum(np.abs(np.fft.fft(turned, _PADDING * count, axis=0)) ** 2, axis=1)
+        ratio = np.where(inside, seen / median_filter(seen, width, mode="nearest"), 0.0)
+        at = int(ratio.argmax())
+        if ratio[at] > best[0]:
+            best = (float(ratio[at]), float(grid_hz[at]), float(sweep))
+    strength, frequency_hz, sweep = best
+    step_hz, step_sweep = float(grid_hz[1] - grid_hz[0]), float(sweeps[1] - sweeps[0])
+    for _ in range(_REFINEMENTS):
+        frequency_hz, sweep = _climb(baseband, t_s, base_hz, frequency_hz, sweep, step_hz, step_sweep)
+        step_hz, step_sweep = step_hz / 2, step_sweep / 2
+    return RotationLine(2 * np.pi * frequency_hz, 2 * np.pi * sweep, strength)
+
+
+def _sweeps(expected_hz: float, duration_s: float) -> FloatArray:
+    """Sweeps to try, Hz/s: between two of them the phase at the ends is off by less than π/4."""
+    step = 2 / duration_s**2
+    count = int(np.ceil(_SWEEP_PER_S * expected_hz / step))
+    return np.asarray(step * np.arange(-max(1, count), max(1, count) + 1), dtype=np.float64)
+
+
+def _climb(
+    y: _ComplexArray, t_s: FloatArray, base_hz: float, at_hz: float, sweep: float, step_hz: float, step_sweep: float
+) -> tuple[float, float]:
+    """One step towards the largest power: the top of a parabola through three points, in frequency, then in sweep."""
+
+    def power(f: float, s: float) -> float:
+        turn = np.exp(-2j * np.pi * ((f - base_hz) * t_s + s / 2 * t_s**2))
+        return float(np.sum(np.abs(turn @ y) ** 2))
+
+    at_hz += _top([power(at_hz + k * step_hz, sweep) for k in (-1, 0, 1)]) * step_hz
+    sweep += _top([power(at_hz, sweep + k * step_sweep) for k in (-1, 0, 1)]) * step_sweep
+    return at_hz, sweep
+
+
+def _top(values: list[float]) -> float:
+    left, middle, right = values
+    bend = left - 2 * middle + right
+    if bend >= 0:
+        return float(np.sign(right - left))
+    return float(np.clip((left - right) / (2 * bend), -1.0, 1.0))
+
+
+def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray | None:
+    """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak was another one.
+
+    Parameters
+    ----------
+    lines : tuple of RotationLine or None
+        Of hops that follow each other, apart from gaps.
+    hop_s : float
+
+    Returns
+    -------
+    ndarray, shape (n_hops,), or None
+        None if no line can be followed.
+    """
+    speed = np.array([np.nan if line is None else line.speed_rad_s for line in lines])
+    sweep = np.array([np.nan if line is None else line.sweep_rad_s2 for line in lines])
+    strength = np.array([0.0 if line is None else line.strength for line in lines])
+    with np.errstate(invalid="ignore"):
+        if len(lines) < _FEW_HOPS:
+            near = np.abs(speed / np.median(speed) - 1) < _NEIGHBOUR * len(lines)
+            return speed if np.all(strength > _STRONG) and np.all(near) else None
+        expected = (sweep[1:] + sweep[:-1]) / 2 * hop_s
+        together = np.abs(np.diff(speed) - expected) < _NEIGHBOUR * speed[1:]
+    followed = np.append(together, False) | np.insert(together, 0, False)
+    if followed.mean() < _FOLLOWED_PART:
+        return None
+    return np.where(followed, speed, np.nan)

@@ -1,0 +1,67 @@
+"""All checks of the sensors on one window."""
+
+from collections.abc import Iterable
+
+from models.diagnosis.pairs import motion_pairs
+from models.diagnosis.sensors.disagreement import gain_and_delay
+from models.diagnosis.sensors.exchange import BROKEN, suspect_pairs, swapped
+from models.diagnosis.sensors.finding import Naming, SensorFinding, implicated
+from models.diagnosis.sensors.jump import gain_jump
+from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
+from models.diagnosis.sensors.level import clipped, offset, stuck
+from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.window import WindowStatistics
+from models.signals.channels import Channel
+
+__all__ = ["sensor_findings"]
+
+
+def sensor_findings(
+    window: WindowStatistics, reference: SensorReference | None = None, channels: Iterable[Channel] = ()
+) -> tuple[SensorFinding, ...]:
+    """Check the sensors of a window.
+
+    Parameters
+    ----------
+    window : WindowStatistics
+    reference : SensorReference, optional
+        What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
+        found.
+    channels : iterable of Channel
+        Those of the machine, for their names and units.
+
+    Returns
+    -------
+    tuple of SensorFinding
+        Empty if nothing was found. A channel that is stuck or clipped is not looked at further.
+    """
+    naming = Naming(channels)
+    findings = [*stuck(window, naming), *clipped(window, naming)]
+    findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
+    bad = implicated(findings)
+
+    def sound(*columns: int) -> bool:
+        return not {window.states[column] for column in columns} & bad
+
+    bands = {pair: banded(window, pair) for pair in motion_pairs(window.states) if sound(pair.first, pair.second)}
+    exchanged, explained = swapped(window, suspect_pairs(window.states, bands, reference), naming, reference)
+    findings += exchanged
+    readings: list[PairReading] = []
+    for pair, own in bands.items():
+        reading = None if pair in explained else read_pair(window, pair, own)
+        if reading is None:
+            continue
+        first, second = window.states[pair.first], window.states[pair.second]
+        known = None if reference is None else reference.pair(first, second)
+        if reading.shared >= BROKEN * (1.0 if known is None else known.shared):
+            readings.append(reading)
+            continue
+        text = (
+            f"{naming.name(second)} and {naming.name(first)} measure one motion but share only {reading.shared:.2f} of "
+            "it, expected nearly 1: noise, a loose sensor, or a wrong channel"
+        )
+        findings.append(SensorFinding((first, second), "incoherent", text, reading.shared))
+    bad = implicated(findings)
+    findings += gain_and_delay(window, readings, bands, naming, reference)
+    findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
+    return tuple(findings)

@@ -1,0 +1,250 @@
+"""Gain and delay of one of the two sensors of a motion, and which of the two it is."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.pairs import MotionPair
+from models.diagnosis.sensors.finding import FaultKind, Naming, SensorFinding
+from models.diagnosis.sensors.kinematics import Banded, PairReading, gain_course
+from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+__all__ = ["gain_and_delay"]
+
+MOST_ERRORS = 5.0
+"""Standard errors beyond which two sensors disagree."""
+LEAST_GAIN, LEAST_GAIN_CHANGE = 0.06, 0.015
+"""Gains that differ by less are calibration where there is no reference; with one, changes that are smaller."""
+LEAST_COURSE = 0.02
+"""Change of the gain within a window that is not reported."""
+LEAST_DELAY_S, LEAST_DELAY_CHANGE_S = 1e-4, 3e-5
+"""The same for delays. A delay of a quarter of a millisecond already reads as a quarter of a bearing's damping."""
+_ALIKE = 1 / 3
+"""Of a disagreement, the channel that accounts for it shows all but this part, and the other one less than it."""
+_SAME_SPEED = 0.01
+_SURE = 0.2
+"""Standard error of a channel's own change, as a part of the disagreement, up to which it may convict."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Departure:
+    """How a pair differs from what was expected of it."""
+
+    reading: PairReading
+    log_gain: float
+    gain_z: float
+    delay_s: float
+    delay_z: float
+    course: FloatArray
+    course_step: float
+    course_z: float
+    known: bool
+    reversed: bool
+
+
+def gain_and_delay(
+    window: WindowStatistics,
+    readings: list[PairReading],
+    bands: Mapping[MotionPair, Banded],
+    naming: Naming,
+    reference: SensorReference | None,
+) -> list[SensorFinding]:
+    """Findings on pairs that do see the same motion, but not at the same size or time."""
+    departures = {reading.pair: _departure(window, reading, bands[reading.pair], reference) for reading in readings}
+    rate_hz = window.n_samples / window.duration_s
+    findings: list[SensorFinding] = []
+    for departure in departures.values():
+        least_gain = LEAST_GAIN_CHANGE if departure.known else LEAST_GAIN
+        least_delay = LEAST_DELAY_CHANGE_S if departure.known else LEAST_DELAY_S
+        steady = departure.gain_z > MOST_ERRORS and abs(np.expm1(departure.log_gain)) > least_gain
+        moving = departure.course_z > MOST_ERRORS and abs(departure.course_step) > LEAST_COURSE
+        if steady or moving or departure.reversed:
+            findings.append(_gain(window, departure, departures, naming, reference, moving=moving and not steady))
+        if departure.delay_z > MOST_ERRORS and abs(departure.delay_s) > least_delay:
+            findings.append(_delay(window, departure, departures, naming, rate_hz))
+    return _once(findings)
+
+
+def _departure(
+    window: WindowStatistics, reading: PairReading, bands: Banded, reference: SensorReference | None
+) -> _Departure:
+    first, second = window.states[reading.pair.first], window.states[reading.pair.second]
+    known = None if reference is None else reference.pair(first, second)
+    gain, delay, polarity = reading.log_gain, reading.delay_s, 1
+    gain_error, delay_error = reading.log_gain_error, reading.delay_error_s
+    if known is not None:
+        gain, delay, polarity = gain - known.log_gain, delay - known.delay_s, known.polarity
+        gain_error = float(np.hypot(gain_error, known.log_gain_spread))
+        delay_error = float(np.hypot(delay_error, known.delay_spread_s))
+    course, error = gain_course(window, reading, bands)
+    step, z = _largest_part(course, error)
+    return _Departure(
+        reading, gain, abs(gain) / gain_error, delay, abs(delay) / delay_error, course, step, z,
+        known is not None, reading.polarity != polarity,
+    )  # fmt: skip
+
+
+def _largest_part(course: FloatArray, error: float) -> tuple[float, float]:
+    """Largest difference between the hops before and after a moment, and its size in standard errors."""
+    n = course.size
+    if n < 4:
+        return 0.0, 0.0
+    if n > 5:
+        error = max(error, 1.4826 * float(np.median(np.abs(np.diff(course)))) / np.sqrt(2))
+    best, most = 0.0, 0.0
+    for k in range(1, n):
+        change = float(course[k:].mean() - course[:k].mean())
+        z = abs(change) / (error * np.sqrt(1 / k + 1 / (n - k)))
+        if z > most:
+            best, most = change, z
+    return best, most
+
+
+def _gain(
+    window: WindowStatistics,
+    departure: _Departure,
+    departures: dict[MotionPair, _Departure],
+    naming: Naming,
+    reference: SensorReference | None,
+    *,
+    moving: bool,
+) -> SensorFinding:
+    pair = departure.reading.pair
+    first, second = window.states[pair.first], window.states[pair.second]
+    guilty = _by_chain(departure, departures, "gain", moving=moving)
+    if guilty is None and departure.course_z > MOST_ERRORS:
+        guilty = _by_course(window, departure)
+    if guilty is None and not moving:
+        guilty = _by_level(window, departure, reference)
+    size = departure.course_step if moving else float(np.expm1(departure.log_gain))
+    z = departure.course_z if moving else departure.gain_z
+    error = abs(size) / z if z > 0 else 0.0
+    expected = "as they were on the healthy machine" if departure.known else "the same motion, 0 % apart"
+    if departure.reversed:
+        text = f"{naming.name(second)} moves against {naming.name(first)}: one of them is reversed"
+        return SensorFinding((first, second), "gain", text, -2.0, z)
+    if guilty is not None:
+        state = window.states[guilty]
+        own = size if guilty == pair.second else float(1 / (1 + size) - 1)
+        change = f"changed by {own:+.1%} within the window" if moving else f"is off by {own:+.1%}"
+        other = second if state == first else first
+        text = (
+            f"{naming.name(state)}: its gain {change} (± {error:.1%}) against {naming.name(other)}, expected {expected}"
+        )
+        return SensorFinding((state,), "gain", text, own, z)
+    change = f"came apart by {size:+.1%} within the window" if moving else f"are {size:+.1%} apart"
+    text = (
+        f"{naming.name(second)} and {naming.name(first)} {change} (± {error:.1%}) in gain, expected {expected}; "
+        "which of them is wrong does not show"
+    )
+    return SensorFinding((first, second), "gain", text, size, z)
+
+
+def _delay(
+    window: WindowStatistics,
+    departure: _Departure,
+    departures: dict[MotionPair, _Departure],
+    naming: Naming,
+    rate_hz: float,
+) -> SensorFinding:
+    pair, delay = departure.reading.pair, departure.delay_s
+    guilty = _by_chain(departure, departures, "delay", moving=False)
+    if guilty is None:  # sensors come late, not early
+        guilty = pair.second if delay > 0 else pair.first
+    other = pair.first if guilty == pair.second else pair.second
+    state, late = window.states[guilty], abs(delay)
+    expected = "the delay it had on the healthy machine" if departure.known else "both at the same time"
+    text = (
+        f"{naming.name(state)}: comes {1e3 * late:.3g} ms ({late * rate_hz:.2g} samples, ± "
+        f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(window.states[other])}, expected {expected}"
+    )
+    return SensorFinding((state,), "delay", text, late, departure.delay_z)
+
+
+def _by_chain(
+    departure: _Departure, departures: dict[MotionPair, _Departure], kind: FaultKind, *, moving: bool
+) -> int | None:
+    """With three sensors of a motion, the two that still agree convict the third."""
+    pair = departure.reading.pair
+    for other, theirs in departures.items():
+        if other == pair or not {other.first, other.second} & {pair.first, pair.second}:
+            continue
+        (middle,) = {other.first, other.second} & {pair.first, pair.second}
+        mine, his = (_size(one, kind, moving=moving) for one in (departure, theirs))
+        if abs(his) < _ALIKE * abs(mine):
+            return pair.first if middle == pair.second else pair.second
+        if abs(his + mine) < _ALIKE * abs(mine):
+            return middle
+    return None
+
+
+def _size(departure: _Departure, kind: FaultKind, *, moving: bool) -> float:
+    if kind == "delay":
+        return departure.delay_s
+    return departure.course_step if moving else departure.log_gain
+
+
+def _by_level(window: WindowStatistics, departure: _Departure, reference: SensorReference | None) -> int | None:
+    """The one whose rotation departs from its healthy amplitude by just the disagreement, while the other's stays."""
+    vectors = window.rotation_vectors
+    if vectors is None or reference is None or reference.speed_rad_s is None:
+        return None
+    if abs(float(np.mean(window.hop_speed_rad_s)) / reference.speed_rad_s - 1) > _SAME_SPEED:
+        return None
+    changes, errors = [], []
+    for column in (departure.reading.pair.first, departure.reading.pair.second):
+        known, sizes = reference.channel(window.states[column]), np.abs(vectors[:, column])
+        seen = float(sizes.mean())
+        if known is None or not known.rotation or known.rotation_spread is None or not seen > 0:
+            return None
+        changes.append(float(np.log(seen / known.rotation)))
+        then = known.rotation_spread / np.sqrt(reference.n_hops)
+        errors.append(float(np.hypot(sizes.std() / seen / np.sqrt(sizes.size), then)))
+    if max(errors) > _SURE * abs(departure.log_gain):
+        return None
+    return _one_of(departure, changes, departure.log_gain)
+
+
+def _by_course(window: WindowStatistics, departure: _Departure) -> int | None:
+    """The one whose own level went along with the gain from hop to hop: of its rotation, or against other places'."""
+    pair, course = departure.reading.pair, departure.course - departure.course.mean()
+    power = float(course @ course)
+    if not power > 0:
+        return None
+    columns = [pair.first, pair.second]
+    tiny = np.finfo(float).tiny
+    rms = np.log(np.maximum(window.hop_waveform.rms[:, : len(window.states)], tiny))
+    own = window.states[pair.first].partition("_")[0]
+    others = [column for column, name in enumerate(window.states) if name.partition("_")[0] != own]
+    levels = [rms[:, columns] - (rms[:, others].mean(axis=1, keepdims=True) if others else 0.0)]
+    vectors = window.rotation_vectors
+    if vectors is not None and not window.removed_by_hop:  # at another speed the amplitude is another one
+        levels.append(np.log(np.maximum(np.abs(vectors[:, columns]), tiny)))
+    best, least = None, _SURE
+    for level in levels:
+        slopes = course @ level / power
+        left = level - level.mean(axis=0) - np.outer(course, slopes)
+        error = float(np.sqrt((left**2).sum(axis=0).min() / max(1, course.size - 2) / power))
+        if error < least:
+            best, least = [float(slope) for slope in slopes], error
+    return None if best is None else _one_of(departure, best, 1.0)
+
+
+def _one_of(departure: _Departure, changes: list[float], size: float) -> int | None:
+    first, second = changes
+    if abs(first) < _ALIKE * abs(size) and abs(second - size) < _ALIKE * abs(size):
+        return departure.reading.pair.second
+    if abs(second) < _ALIKE * abs(size) and abs(first + size) < _ALIKE * abs(size):
+        return departure.reading.pair.first
+    return None
+
+
+def _once(findings: list[SensorFinding]) -> list[SensorFinding]:
+    """The same fault of the same channel once, as its clearest pair shows it."""
+    best: dict[tuple[tuple[str, ...], str], SensorFinding] = {}
+    for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
+        best.setdefault((finding.states, finding.kind), finding)
+    return list(best.values())

@@ -1,0 +1,286 @@
+"""Gain and delay between two sensors of one motion: v = jωx, whatever the machine does.
+
+Sensor noise makes |S_xv| / S_xx too small and S_vv / |S_xv| too large. What the other places of the machine have in
+common with the motion is free of both noises, so it serves as the instrument: h = S_wv / S_wx. Where there is no other
+place, the two biased ratios bracket the gain. The rotation-synchronous vectors add a line with little noise on it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.pairs import MotionPair, motion_pairs, pair_bands
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+__all__ = ["LONGEST_DELAY_S", "Banded", "PairReading", "banded", "gain_course", "read_pair", "same", "shared"]
+
+LONGEST_DELAY_S = 0.02
+"""Longest delay that is looked for."""
+
+_DELAY_STEP_S = 1e-4
+_AS_GOOD = 0.98
+"""A shorter delay that fits this well is preferred: a narrow band repeats itself after a period."""
+_LINE_FITS = 5.0
+"""Standard errors within which the rotation must agree with the rest of the motion, or it is not counted (runout)."""
+_RUNOUT = 0.03
+"""Logarithm of the gain by which the rotation must differ besides."""
+_HANN_LOSS = 0.95
+"""Part of the data's information that is left in half-overlapping Hann segments."""
+_FLOOR = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class PairReading:
+    """What two sensors of one motion say of each other.
+
+    Attributes
+    ----------
+    pair : MotionPair
+    log_gain, log_gain_error : float
+        Logarithm of the second's gain over the first's, and its standard error.
+    polarity : int
+        -1 where one of them is reversed.
+    delay_s, delay_error_s : float
+        By how much the second comes later.
+    shared : float
+        How much of the motion they share after gain and delay, 0 to 1, over the whole band.
+    """
+
+    pair: MotionPair
+    log_gain: float
+    log_gain_error: float
+    polarity: int
+    delay_s: float
+    delay_error_s: float
+    shared: float
+
+
+@dataclass(frozen=True, slots=True)
+class Banded:
+    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v.
+
+    Attributes
+    ----------
+    spectra : ndarray, shape (n_bands, 2 + n_others, 2 + n_others)
+        ``spectra[b, i, j]`` = E{a_i a_j*}, without the rotation.
+    total : ndarray, shape (n_bands, 2, 2)
+        The same of z and v with the rotation.
+    w : ndarray, shape (n_bands,)
+        Angular frequency around which each band's power lies.
+    averages : ndarray, shape (n_bands,)
+        Effectively independent samples.
+    """
+
+    spectra: ComplexArray
+    total: ComplexArray
+    w: FloatArray
+    averages: FloatArray
+
+
+def banded(window: WindowStatistics, pair: MotionPair) -> Banded:
+    """Average the window's spectra over bands, with the first channel turned into what the second measures."""
+    w = 2 * np.pi * window.frequencies_hz
+    columns = [pair.first, pair.second, *_others(window.states, pair)]
+    edges = pair_bands(w.size)
+    counts = np.diff(np.append(edges, w.size))
+    spectra = window.spectrum[:, np.array(columns)[:, None], columns]
+    turn = (1j * w) ** pair.order
+    spectra[:, 0] *= turn[:, None]
+    spectra[:, :, 0] *= turn.conj()[:, None]
+    power = spectra[:, 1, 1].real + _FLOOR * spectra[:, 1, 1].real.max() + np.finfo(float).tiny
+    centre = np.add.reduceat(power * w, edges) / np.add.reduceat(power, edges)
+    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
+    averages = np.maximum(counts * step_hz * window.duration_s * _HANN_LOSS, 1.0)
+    spectra = np.asarray(np.add.reduceat(spectra, edges) / counts[:, None, None], dtype=np.complex128)
+    total = spectra[:, :2, :2].copy()
+    rotation = _rotation(window, pair)
+    if rotation is not None:
+        speed, vectors = rotation
+        near = int(np.searchsorted(w[edges], speed, side="right")) - 1
+        if near >= 0 and speed <= w[-1]:
+            line = vectors.T @ vectors.conj() / len(vectors)
+            total[near] += line / (4 * counts[near] * step_hz)
+    return Banded(spectra, total, centre, averages)
+
+
+def _rotation(window: WindowStatistics, pair: MotionPair) -> tuple[float, ComplexArray] | None:
+    """Mean speed, and the rotation's z and v in every hop where it is known, shape (n_hops, 2)."""
+    vectors = window.rotation_vectors
+    if vectors is None:
+        return None
+    W = window.hop_speed_rad_s
+    known = np.isfinite(W)
+    z = vectors[:, pair.first] * (1j * W) ** pair.order
+    both = np.stack([z, vectors[:, pair.second]], axis=1)[known]
+    return float(np.mean(W[known])), both
+
+
+def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
+    """One column of every other place."""
+    own = states[pair.first].partition("_")[0]
+    first: dict[str, int] = {}
+    for column, name in enumerate(states):
+        first.setdefault(name.partition("_")[0], column)
+    return [column for place, column in first.items() if place != own]
+
+
+def shared(bands: Banded) -> float:
+    """How much of the motion two sensors share at the best gain, polarity and delay, rotation included, 0 to 1."""
+    z, v, cross = _even(bands)
+    if not (z > 0 and v > 0):
+        return 0.0
+    return float(min(1.0, abs(_turned(bands.w, cross)[1]) / np.sqrt(z * v)))
+
+
+def same(bands: Banded) -> float:
+    """How much of the motion two sensors show alike: same time, same size, same sense; 1 if all, below 0 if opposed."""
+    z, v, cross = _even(bands)
+    return float(2 * cross.sum().real / (z + v)) if z > 0 and v > 0 else 0.0
+
+
+def _even(bands: Banded) -> tuple[float, float, ComplexArray]:
+    """Powers halfway between displacement and velocity: neither's noise is blown up at one end of the band."""
+    z, v = bands.total[:, 0, 0].real / bands.w, bands.total[:, 1, 1].real / bands.w
+    return float(z.sum()), float(v.sum()), np.asarray(bands.total[:, 1, 0] / bands.w, dtype=np.complex128)
+
+
+def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
+    """Delay that brings the cross-powers into line, and their sum then; it is negative where one is reversed."""
+    reach = round(LONGEST_DELAY_S / _DELAY_STEP_S)
+    delays = _DELAY_STEP_S * np.arange(-reach, reach + 1)
+    sums = np.real(np.exp(1j * np.outer(delays, w)) @ cross)
+    good = np.flatnonzero(np.abs(sums) >= _AS_GOOD * np.abs(sums).max())
+    best = int(good[np.argmin(np.abs(delays[good]))])
+    # Climb from there: the first one that is as good lies on the slope of its peak.
+    while 0 < best < delays.size - 1 and np.abs(sums[best - 1 : best + 2]).argmax() != 1:
+        best += int(np.abs(sums[best - 1 : best + 2]).argmax()) - 1
+    return float(delays[best]), float(sums[best])
+
+
+def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None = None) -> PairReading | None:
+    """Compare two sensors of one motion.
+
+    Parameters
+    ----------
+    window : WindowStatistics
+    pair : MotionPair
+    bands : Banded, optional
+        What `banded` has made of them.
+
+    Returns
+    -------
+    PairReading or None
+        None if one of them shows no fluctuation.
+    """
+    bands = banded(window, pair) if bands is None else bands
+    z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
+    if not (np.all(z > 0) and np.all(v > 0)):
+        return None
+    incoherent = np.maximum(1 - np.abs(bands.spectra[:, 1, 0]) ** 2 / (z * v), _FLOOR)
+    h, variance, bias = _transfer(bands, incoherent)
+    level, _, cross = _even(bands)
+    delay_s, total = _turned(bands.w, cross)
+    start = _Start(
+        1 if total >= 0 else -1,
+        float(np.log(max(abs(total) / level, _FLOOR))),
+        delay_s,
+    )
+    alone = _fitted(pair, start, bands.w, h, variance, bias)
+    rotation = _rotation(window, pair)
+    line = None if rotation is None else _line(rotation, window, bands, incoherent)
+    if line is None:
+        return replace(alone, shared=shared(bands))
+    speed, ratio, spread = line
+    found = _fitted(
+        pair, start, np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0)
+    )
+    runout = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
+    if runout and alone.log_gain_error < _RUNOUT:
+        found = alone
+    return replace(found, shared=shared(bands))
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    polarity: int
+    log_gain: float
+    delay_s: float
+
+
+def _fitted(
+    pair: MotionPair, start: _Start, w: FloatArray, h: ComplexArray, variance: FloatArray, bias: FloatArray
+) -> PairReading:
+    """Gain and delay that fit the transfer of all bands best, from a first guess."""
+    log_gain, delay_s, weight = start.log_gain, start.delay_s, 1 / variance
+    moment = float(weight @ w**2)
+    y = h
+    for _ in range(4):
+        y = h * start.polarity * np.exp(-log_gain + 1j * w * delay_s) - 1
+        log_gain += float(np.log1p(np.clip(weight @ y.real / weight.sum(), -0.5, 1.0)))
+        delay_s -= float(np.clip(weight @ (w * y.imag) / moment, -1e-3, 1e-3))
+    freedom = max(1, y.size - 1)
+    scatter_gain = max(1.0, float(weight @ y.real**2) * 2 / freedom)
+    scatter_delay = max(1.0, float(weight @ y.imag**2) * 2 / freedom)
+    gain_error = float(np.sqrt(scatter_gain / (2 * weight.sum())) + weight @ bias / weight.sum())
+    return PairReading(
+        pair, log_gain, gain_error, start.polarity, delay_s, float(np.sqrt(scatter_delay / (2 * moment))), 0.0
+    )
+
+
+def _line(
+    rotation: tuple[float, ComplexArray], window: WindowStatistics, bands: Banded, incoherent: FloatArray
+) -> tuple[float, complex, float] | None:
+    """Speed, transfer and its relative variance at the rotation, where the vectors hold little but sensor noise."""
+    speed, vectors = rotation
+    power = float(np.sum(np.abs(vectors[:, 0]) ** 2))
+    if not (power > 0 and np.isfinite(power)):
+        return None
+    ratio = complex(np.sum(vectors[:, 0].conj() * vectors[:, 1]) / power)
+    near = int(np.argmin(np.abs(bands.w - speed)))
+    noise = incoherent[near] * bands.spectra[near, 0, 0].real
+    return speed, ratio, float(4 * noise * len(vectors) / (window.duration_s * power))
+
+
+def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    """Transfer from z to v in each band, its relative variance, and how far noise may have biased it."""
+    S = bands.spectra
+    z, v, cross = S[:, 0, 0].real, S[:, 1, 1].real, S[:, 1, 0]
+    bracketed = np.sqrt(v / z) * cross / np.maximum(np.abs(cross), _FLOOR * np.sqrt(z * v))
+    half = -0.5 * np.log(1 - np.minimum(incoherent, 1 - 1e-6))
+    variance = incoherent / np.maximum(1 - incoherent, 1e-6) / bands.averages
+    if S.shape[1] == 2:
+        return bracketed, variance, half
+    scale = 1 / np.sqrt(np.maximum(np.einsum("bii->bi", S).real, np.finfo(float).tiny))
+    unit = S * scale[:, :, None] * scale[:, None, :]
+    others = unit[:, 2:, 2:] + 1e-9 * np.eye(S.shape[1] - 2)
+    a = np.linalg.solve(others, unit[:, 2:, :1])[:, :, 0]  # how the other places say z moves, z = aᴴ w
+    seen = np.einsum("bi,bi->b", a.conj(), unit[:, 2:, 0]).real
+    own = np.einsum("bi,bi->b", a.conj(), unit[:, 2:, 1])
+    overfit = (S.shape[1] - 2) / bands.averages  # of pure noise, the others would explain as much
+    explained = np.clip((seen - overfit) / (1 - np.minimum(overfit, 0.9)), 1e-6, 1.0)
+    h = (own.conj() / np.maximum(seen, _FLOOR)) * scale[:, 0] / scale[:, 1]
+    left = np.minimum(half * overfit / np.maximum(seen, _FLOOR), half)
+    return h, variance / explained, left
+
+
+def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, float]:
+    """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of one hop.
+
+    Returns
+    -------
+    course : ndarray, shape (n_hops,)
+    error : float
+    """
+    number = motion_pairs(window.states).index(reading.pair)
+    z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
+    incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)
+    variance = incoherent / np.maximum(1 - incoherent, 1e-6) / (bands.averages / len(window.pair_powers))
+    aligned = reading.polarity * np.exp(1j * bands.w * reading.delay_s)
+    powers = np.stack([hop[number] for hop in window.pair_powers])
+    ratio = np.real(aligned * powers[:, :, 1]) / np.maximum(powers[:, :, 0].real, np.finfo(float).tiny)
+    # Each band about its own mean: what noise takes from the ratio is the same in all hops.
+    course = ratio / np.median(ratio, axis=0) - 1
+    weight = 1 / variance
+    return np.asarray(course @ weight / weight.sum(), dtype=np.float64), float(np.sqrt(1 / (2 * weight.sum())))

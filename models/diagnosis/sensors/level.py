@@ -1,0 +1,165 @@
+"""What single channels say: standing still, cut off, or at another level than before."""
+
+import numpy as np
+
+from models.diagnosis.sensors.finding import Naming, SensorFinding
+from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+__all__ = ["clipped", "offset", "stuck"]
+
+STILL_S = 0.25
+"""Longest time for which equal samples are put down to quantisation."""
+FLAT_PART = 0.005
+"""Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there."""
+STEP_SPREADS = 8.0
+"""Healthy standard deviations of a hop's mean that a step of it must exceed."""
+STEP_PART = 0.3
+"""Part of the channel's rms that it must exceed besides."""
+DRIFT_PART = 3.0
+"""A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel."""
+MOVED_PART = 3.0
+"""The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages."""
+_TOGETHER = 0.3
+"""Where another displacement moves by at least this part of a displacement's step, the shaft has moved."""
+
+
+def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
+    """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn."""
+    hops, findings = window.hop_waveform, []
+    rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
+    limit = max(3, round(STILL_S * rate_hz))
+    for column, state in enumerate((*window.states, "theta")[: hops.mean.shape[1]]):
+        runs, rms, step = hops.longest_run[:, column], hops.rms[:, column], hops.step[:, column]
+        name, coarse = naming.name(state), rms < step
+        whole = int(np.sum(runs[runs >= hops.n_samples]))
+        longest_s = max(whole, int(runs.max())) / rate_hz
+        if state == "theta":
+            if runs.max() >= limit:
+                text = f"{name}: the shaft angle stood still for {longest_s:.3g} s; it must turn or be left out"
+                findings.append(SensorFinding((state,), "stuck", text, longest_s))
+        elif np.any(coarse):
+            quiet_s = float(coarse.sum()) * hops.n_samples / rate_hz
+            text = (
+                f"{name}: shows nothing but its own steps of {naming.value(state, float(step[coarse].max()))} for "
+                f"{quiet_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
+            )
+            findings.append(SensorFinding((state,), "stuck", text, quiet_s))
+        elif runs.max() >= limit:
+            level = float(hops.mean[int(runs.argmax()), column])
+            text = (
+                f"{name}: repeated the value {naming.value(state, level)} for {longest_s:.3g} s, "
+                f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
+            )
+            findings.append(SensorFinding((state,), "stuck", text, longest_s))
+    return findings
+
+
+def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
+    """Channels whose tops are flat: more samples exactly at a hop's extreme than even a quantised sine would leave."""
+    hops, findings = window.hop_waveform, []
+    n = len(window.states)
+    swing = (hops.maximum[:, :n] - hops.minimum[:, :n]) / 2
+    step = np.where(np.isnan(hops.step[:, :n]), 0.0, hops.step[:, :n])
+    sine = np.sqrt(2 * step / np.where(swing > 0, swing, np.inf)) / np.pi
+    allowed = FLAT_PART + 1.5 * sine
+    for column, state in enumerate(window.states):
+        sides: dict[str, tuple[float, float]] = {}
+        for side, counts, levels in (
+            ("upper", hops.at_maximum, hops.maximum),
+            ("lower", hops.at_minimum, hops.minimum),
+        ):
+            part = counts[:, column] / hops.n_samples
+            over = (part > allowed[:, column]) & (hops.longest_run[:, column] < hops.n_samples)
+            if np.any(over):
+                sides[side] = (float(part[over].mean()), float(np.median(levels[over, column])))
+        if sides:
+            flat = sum(share for share, _ in sides.values())
+            where = " and ".join(f"{naming.value(state, level)} ({side})" for side, (_, level) in sides.items())
+            text = (
+                f"{naming.name(state)}: cut off at {where}, {flat:.1%} of the samples stand exactly there, "
+                f"expected less than {float(allowed[:, column].max()):.1%}: the measuring range is too small"
+            )
+            findings.append(SensorFinding((state,), "clipped", text, flat))
+    return findings
+
+
+def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFinding]:
+    """Channels whose mean steps or runs away within the window, or stands elsewhere than in the reference."""
+    means = window.hop_waveform.mean[:, : len(window.states)]
+    rms, spread = _scale(window), _spread(window)
+    steps, drifts = _largest_step(means), means[-1] - means[0]
+    moved = np.full(len(window.states), np.nan)
+    floor = np.zeros(len(window.states))
+    if reference is not None:
+        for column, state in enumerate(window.states):
+            known = reference.channel(state)
+            if known is not None:
+                moved[column] = means[:, column].mean() - known.mean
+                floor[column] = max(STEP_SPREADS * max(known.mean_spread, spread[column]), MOVED_PART * known.rms)
+    findings = []
+    for column, state in enumerate(window.states):
+        name, own = naming.name(state), float(rms[column])
+        if not own > 0:  # stuck, and reported as that
+            continue
+        z = float(abs(steps[column]) / spread[column]) if spread[column] > 0 else np.inf
+        if z > STEP_SPREADS and abs(steps[column]) > STEP_PART * own and not _shaft(window.states, column, steps):
+            value = float(steps[column])
+            text = (
+                f"{name}: the mean jumped by {naming.value(state, value)} within the window ({abs(value) / own:.3g} "
+                f"times the channel's rms), expected a steady one: connector, supply or gap"
+            )
+            findings.append(SensorFinding((state,), "offset", text, value, z))
+        elif abs(drifts[column]) > max(DRIFT_PART * own, STEP_SPREADS * spread[column]) and not _shaft(
+            window.states, column, drifts
+        ):
+            value = float(drifts[column])
+            text = (
+                f"{name}: the mean drifted by {naming.value(state, value)} within the window, allowed are "
+                f"{DRIFT_PART:g} times the channel's rms ({naming.value(state, DRIFT_PART * own)})"
+            )
+            findings.append(SensorFinding((state,), "offset", text, value, abs(value) / float(spread[column])))
+        elif abs(moved[column]) > floor[column] and not _shaft(window.states, column, moved):
+            value = float(moved[column])
+            text = (
+                f"{name}: the mean stands {naming.value(state, value)} from where it was on the healthy machine, "
+                f"expected within {naming.value(state, float(floor[column]))}"
+            )
+            findings.append(SensorFinding((state,), "offset", text, value))
+    return findings
+
+
+def _scale(window: WindowStatistics) -> FloatArray:
+    """The channels' rms, as it is in the middle of the hops: a step within one hop must not become the yardstick."""
+    return np.asarray(np.median(window.hop_waveform.rms[:, : len(window.states)], axis=0), dtype=np.float64)
+
+
+def _spread(window: WindowStatistics) -> FloatArray:
+    """Standard deviation of a hop's mean: from hop to hop (robust), and at least what the lowest frequencies expect."""
+    hops = window.hop_waveform
+    n, count = len(window.states), len(window.waveforms)
+    means = hops.mean[:, :n]
+    between = np.zeros(n)
+    if count > 3:
+        steps = np.diff(means, axis=0)
+        between = 1.4826 * np.median(np.abs(steps - np.median(steps, axis=0)), axis=0) / np.sqrt(2)
+    lowest = np.median(np.einsum("fii->fi", window.spectrum[:10]).real, axis=0)
+    return np.asarray(np.maximum(between, np.sqrt(lowest * count / window.duration_s)), dtype=np.float64)
+
+
+def _largest_step(means: FloatArray) -> FloatArray:
+    """Largest change of the mean across one hop beyond its usual drift; across, because a step may fall into a hop."""
+    if means.shape[0] < 4:
+        return np.asarray(means[-1] - means[0], dtype=np.float64)
+    across = means[2:] - means[:-2]
+    across = across - np.median(across, axis=0)
+    return np.asarray(across[np.abs(across).argmax(axis=0), np.arange(means.shape[1])], dtype=np.float64)
+
+
+def _shaft(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
+    """Whether a displacement's level changed together with another one's."""
+    places = [i for i, name in enumerate(states) if "_" not in name and name in ("y1", "y2", "z1", "z2")]
+    if column not in places:
+        return False
+    return any(abs(changes[i]) > _TOGETHER * abs(changes[column]) for i in places if i != column)
