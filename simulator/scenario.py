@@ -19,6 +19,7 @@ from models.signals.channels import Channel, Quantity
 
 __all__ = [
     "ANOMALIES",
+    "LONGEST_DELAY_S",
     "SENSOR_FAULTS_WITH_VALUE",
     "ChannelSettings",
     "Event",
@@ -37,13 +38,16 @@ _STRICT = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 _SHIPPED = Path(__file__).parent / "scenarios"
 _FAULT = re.compile(r"(?P<parameter>\w+)=(?P<change>[-+.\deE]+)@(?P<at_s>[.\deE]+)")
 
-SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "clip", "none"]
+SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "clip", "delay", "swapped", "none"]
 
-SENSOR_FAULTS_WITH_VALUE = ("offset", "gain", "noise_relative", "clip")
+SENSOR_FAULTS_WITH_VALUE = ("offset", "gain", "noise_relative", "clip", "delay")
 """Kinds of sensor fault that have a value."""
 
 ANOMALIES: Mapping[str, float] = MappingProxyType({"crack": 0.8, "rub": 10.0, "added_mass": 10.0})
 """What can go wrong that no diagnosed parameter describes, and the largest size of it."""
+
+LONGEST_DELAY_S = 1.0
+"""Most by which a sensor can be late."""
 
 _WITH_RAMP = ("offset", "gain", "noise_relative")
 
@@ -131,7 +135,9 @@ class Event(BaseModel):
         open crack; stiffness of the contact over the shaft's 3EI/L³; relative increase of the disc's mass. 0 is none.
     sensor, sensor_fault, value_SI
         Channel name, kind of fault ("none" ends all faults of the channel), and its value: in the SI unit of the
-        channel for offset and clip, a plain ratio for gain and noise_relative.
+        channel for offset and clip, a plain ratio for gain and noise_relative, seconds for delay.
+    swapped_with : str
+        The other channel of a swap, of the same quantity and unit.
     """
 
     model_config = _STRICT
@@ -151,6 +157,7 @@ class Event(BaseModel):
     sensor: str | None = None
     sensor_fault: SensorFault | None = None
     value_SI: float | None = None
+    swapped_with: str | None = None
 
     @model_validator(mode="after")
     def _one_change(self) -> Self:
@@ -158,7 +165,7 @@ class Event(BaseModel):
             "parameter": ("relative_change",),
             "speed_rpm": (),
             "source": ("cutoff_hz", "force_rms_N", "direction"),
-            "sensor": ("sensor_fault", "value_SI"),
+            "sensor": ("sensor_fault", "value_SI", "swapped_with"),
             "excitation_level": (),
             "anomaly": ("size",),
         }
@@ -214,6 +221,15 @@ class Event(BaseModel):
         if (self.sensor_fault in SENSOR_FAULTS_WITH_VALUE) != (self.value_SI is not None):
             need = "needs" if self.sensor_fault in SENSOR_FAULTS_WITH_VALUE else "has no"
             raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} value_SI")
+        if (self.sensor_fault == "swapped") != (self.swapped_with is not None):
+            need = "needs" if self.sensor_fault == "swapped" else "has no"
+            raise ValueError(f"sensor_fault {self.sensor_fault!r} {need} swapped_with")
+        if self.swapped_with == self.sensor:
+            raise ValueError(f"swapped_with is {self.swapped_with!r}, expected another channel than {self.sensor!r}")
+        if self.sensor_fault == "delay" and not 0 <= (self.value_SI or 0.0) <= LONGEST_DELAY_S:
+            raise ValueError(
+                f"value_SI of sensor_fault 'delay' is {self.value_SI}, expected 0 to {LONGEST_DELAY_S:g} s"
+            )
         if self.sensor_fault in ("noise_relative", "clip") and (self.value_SI or 0.0) < 0:
             raise ValueError(f"value_SI of sensor_fault {self.sensor_fault!r} is {self.value_SI}, expected 0 or more")
         if self.ramp_s > 0 and self.sensor_fault not in _WITH_RAMP:
@@ -254,21 +270,38 @@ class Scenario(BaseModel):
         return self
 
     def check_channels(self, machine: Machine) -> None:
-        """Check that every channel the scenario names is one of the machine's.
+        """Check that every channel the scenario names is one of the machine's, and that swaps are possible.
 
         Raises
         ------
         MachineFileError
-            Naming the scenario, the field, the unknown channel, and the channels the machine has.
+            Naming the scenario, the field, the unknown channel, and the channels the machine has; or two channels that
+            cannot be swapped because they measure different quantities or in different units.
         """
         known = [channel.name for channel in machine.sensors]
         named = [(f"sensors.channels.{name}", name) for name in self.sensors.channels]
         named += [(f"events.{n}.sensor", e.sensor) for n, e in enumerate(self.events) if e.sensor is not None]
+        named += [
+            (f"events.{n}.swapped_with", e.swapped_with)
+            for n, e in enumerate(self.events)
+            if e.swapped_with is not None
+        ]
         for field, name in named:
             if name not in known:
                 raise MachineFileError(
                     f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
                     f"({', '.join(known)})"
+                )
+
+        of = {channel.name: channel for channel in machine.sensors}
+        for number, event in enumerate(self.events):
+            if event.sensor is None or event.swapped_with is None:
+                continue
+            one, other = of[event.sensor], of[event.swapped_with]
+            if (one.quantity, one.unit) != (other.quantity, other.unit):
+                raise MachineFileError(
+                    f"scenario {self.name}: events.{number}.swapped_with: {other.name} is a {other.quantity} in "
+                    f"{other.unit}, expected a {one.quantity} in {one.unit} like {one.name}"
                 )
 
     def overridden(

@@ -14,7 +14,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, state_name
 from simulator.integrator import PlantSamples
 from simulator.scenario import Sensors, SensorSettings
-from simulator.timeline import SensorFaults
+from simulator.timeline import SWAPPED_WITH, SensorFaults
 
 __all__ = ["Sensor", "SensorBank"]
 
@@ -24,6 +24,8 @@ _NO_FAULT: SensorFaults = {}
 
 class Sensor:
     """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
+
+    A delay shifts the true value by whole samples, the nearest number; before the first sample it was what it is then.
 
     Parameters
     ----------
@@ -35,10 +37,18 @@ class Sensor:
     rng : numpy.random.Generator
         Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
         change without changing the noise.
+    longest_delay_s : float
+        Longest delay it will have.
     """
 
     def __init__(
-        self, channel: Channel, settings: SensorSettings, rms_SI: float, rate_hz: float, rng: np.random.Generator
+        self,
+        channel: Channel,
+        settings: SensorSettings,
+        rms_SI: float,
+        rate_hz: float,
+        rng: np.random.Generator,
+        longest_delay_s: float = 0.0,
     ) -> None:
         self.channel = channel
         self._settings = settings
@@ -48,6 +58,8 @@ class Sensor:
         self._memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / rate_hz))
         self._noise: float | None = None
         self._held: float | None = None
+        self._rate_hz, self._reach = rate_hz, round(longest_delay_s * rate_hz)
+        self._past: FloatArray | None = None
 
     def noise(self, n_samples: int) -> FloatArray:
         """Draw the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
@@ -75,7 +87,7 @@ class Sensor:
         """
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
-        seen = value_SI + level * noise
+        seen = self._delayed(value_SI, round(_value(faults, "delay", 0.0) * self._rate_hz)) + level * noise
         seen = seen * settings.gain * _value(faults, "gain", 1.0) + settings.offset_SI + _value(faults, "offset", 0.0)
         if "clip" in faults:
             limit = _value(faults, "clip", np.inf)
@@ -88,6 +100,15 @@ class Sensor:
         if "dropout" in faults:
             return np.full_like(seen, np.nan)
         return np.asarray(seen / self.channel.to_si, dtype=np.float64)
+
+    def _delayed(self, value_SI: FloatArray, late: int) -> FloatArray:
+        """Values some samples ago."""
+        if self._reach == 0:
+            return value_SI
+        past = np.full(self._reach, value_SI[0]) if self._past is None else self._past
+        known = np.concatenate([past, value_SI])
+        self._past = known[-self._reach :]
+        return known[self._reach - late : known.size - late]
 
 
 class SensorBank:
@@ -116,7 +137,14 @@ class SensorBank:
         self._dtype = np.dtype(machine.dtype)
         self._faults = faults
         self._sensors = [
-            Sensor(channel, sensors.settings(channel), _reference(channel, rms), machine.rate_hz, rng)
+            Sensor(
+                channel,
+                sensors.settings(channel),
+                _reference(channel, rms),
+                machine.rate_hz,
+                rng,
+                max((_value(kinds, "delay", 0.0) for _, kinds in faults.get(channel.name, ())), default=0.0),
+            )
             for channel, rng in zip(machine.sensors, rngs, strict=True)
         ]
 
@@ -139,7 +167,18 @@ class SensorBank:
                 samples[begin:end, column] = sensor.measure(value[begin:end], noise[begin:end], faults)
             if angle:
                 samples[:, column] = _wrapped(samples[:, column])
+        self._swap(samples, first)
         return samples
+
+    def _swap(self, samples: npt.NDArray[np.floating], first: int) -> None:
+        """Exchange columns whose channels are swapped."""
+        column = {sensor.channel.name: number for number, sensor in enumerate(self._sensors)}
+        for name, own in column.items():
+            for begin, end, faults in self._stretches(name, first, len(samples)):
+                for kind in faults:
+                    if kind.startswith(SWAPPED_WITH):
+                        other = column[kind.removeprefix(SWAPPED_WITH)]
+                        samples[begin:end, [own, other]] = samples[begin:end, [other, own]]
 
     def faults_at(self, sample: int) -> dict[str, SensorFaults]:
         """Active faults by channel name at a sample; channels without any are left out."""

@@ -17,7 +17,7 @@ from models.machine import Machine
 from models.physics.parameters import PARAMETERS
 from simulator.scenario import ANOMALIES, SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Rub, Scenario, SensorFault
 
-__all__ = ["RAMP_STEP_S", "Condition", "SensorFaults", "Timeline", "compile_timeline"]
+__all__ = ["RAMP_STEP_S", "SWAPPED_WITH", "Condition", "SensorFaults", "Timeline", "compile_timeline"]
 
 RAMP_STEP_S = 0.1
 """Length of the steps a ramp is made of."""
@@ -25,7 +25,10 @@ RAMP_STEP_S = 0.1
 _TRUTH_STEP_S = 1.0
 
 SensorFaults = Mapping[str, float | None]
-"""Active faults of one sensor: kind to value, None where the kind has no value."""
+"""Active faults of one sensor: kind to value, None where the kind has no value; a swap is "swapped with NAME"."""
+
+SWAPPED_WITH = "swapped with "
+"""How the kind of a swap begins."""
 
 _Target = tuple[str, ...]
 _Values = tuple[float, ...]
@@ -202,13 +205,14 @@ def _between(begin: _Values, end: _Values, part: float) -> _Values:
 def _sensor_faults(events: list[Event], noise_relative: float, rate_hz: float) -> tuple[tuple[int, SensorFaults], ...]:
     """Active faults of one sensor by sample number; a kind that is not active has no values."""
     neutral: dict[_Target, _Values] = {("offset",): (0.0,), ("gain",): (1.0,), ("noise_relative",): (noise_relative,)}
-    kinds = tuple(kind for kind in get_args(SensorFault) if kind != "none")
+    kinds = {kind for kind in get_args(SensorFault) if kind not in ("none", "swapped")}
+    kinds |= {_kind(event) for event in events if event.sensor_fault == "swapped"}
     changes: list[tuple[Event, _Target, _Values]] = []
     for event in events:
         if event.sensor_fault == "none":
-            changes += [(event, (kind,), ()) for kind in kinds]
+            changes += [(event, (kind,), ()) for kind in sorted(kinds)]
         else:
-            changes.append((event, (str(event.sensor_fault),), (event.value_SI or 0.0,)))
+            changes.append((event, (_kind(event),), (event.value_SI or 0.0,)))
     steps = _steps(neutral, changes, rate_hz)
     states: list[tuple[int, SensorFaults]] = []
     active: dict[str, float | None] = {}
@@ -219,6 +223,10 @@ def _sensor_faults(events: list[Event], noise_relative: float, rate_hz: float) -
                 active[kind] = value[0] if kind in SENSOR_FAULTS_WITH_VALUE else None
         states.append((sample, dict(active)))
     return tuple(states)
+
+
+def _kind(event: Event) -> str:
+    return str(event.sensor_fault) if event.swapped_with is None else f"{SWAPPED_WITH}{event.swapped_with}"
 
 
 def _truth_times(events: list[Event], rate_hz: float) -> tuple[tuple[int, tuple[str, ...]], ...]:

@@ -193,3 +193,35 @@ def test_a_shaft_angle_with_errors_wraps() -> None:
     assert np.all((samples >= 0) & (samples < 2 * np.pi))
     error = np.angle(np.exp(1j * (samples - theta + 0.5)))
     assert error.std() == pytest.approx(0.01 * 2 * np.pi, rel=5 / np.sqrt(2 * 10_000))
+
+
+@pytest.mark.parametrize("pieces", [(60,), (7, 1, 30, 22)])
+def test_a_delay_shifts_by_whole_samples_whatever_the_pieces(pieces: tuple[int, ...]) -> None:
+    channel = DISPLACEMENT.model_dump()
+    faults: dict[str, list[tuple[int, SensorFaults]]] = {"XE": [(20, {"delay": 0.0051}), (50, {})]}  # 10.2 samples
+    bank, plant, first, seen = _bank(_machine(channel), Sensors(), faults), _plant(60), 0, []
+    for count in pieces:
+        part = slice(first, first + count)
+        seen.append(bank.measure(PlantSamples(plant.states[part], plant.theta_rad[part]), first)[:, 0])
+        first += count
+    true = plant.states[:, 0] * 1e6
+    expected = np.concatenate([true[:20], true[10:40], true[50:]])
+    np.testing.assert_allclose(np.concatenate(seen), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_delay_from_the_start_repeats_the_first_value() -> None:
+    faults: dict[str, list[tuple[int, SensorFaults]]] = {"XE": [(0, {"delay": 0.001})]}
+    plant = _plant(6)
+    seen = _bank(_machine(DISPLACEMENT.model_dump()), Sensors(), faults).measure(plant, 0)[:, 0]
+    np.testing.assert_allclose(seen, plant.states[[0, 0, 0, 1, 2, 3], 0] * 1e6, rtol=1e-12, atol=1e-12)
+
+
+def test_swapped_channels_exchange_places_with_their_errors() -> None:
+    channel = DISPLACEMENT.model_dump()
+    machine = _machine(channel, {**channel, "name": "ZE", "direction": "z"})
+    sensors = Sensors(noise_relative=0.1, channels={"ZE": ChannelSettings(gain=3.0)})
+    straight = _bank(machine, sensors).measure(_plant(), 0)
+    crossed = _bank(machine, sensors, {"XE": [(20, {"swapped with ZE": None}), (40, {})]}).measure(_plant(), 0)
+    np.testing.assert_array_equal(crossed[20:40], straight[20:40, ::-1])
+    np.testing.assert_array_equal(crossed[:20], straight[:20])
+    np.testing.assert_array_equal(crossed[40:], straight[40:])

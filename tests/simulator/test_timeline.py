@@ -1,7 +1,9 @@
 """Events as conditions by sample number."""
 
 import pytest
+from pydantic import ValidationError
 
+from models.errors import MachineFileError
 from models.machine import Machine, load_machine
 from simulator.scenario import Event, NamedSource, Scenario
 from simulator.timeline import Condition, Timeline, compile_timeline
@@ -146,3 +148,39 @@ def test_level_and_anomalies_ramp_and_end(machine: Machine) -> None:
     assert dict(middle.anomalies) == {"crack": 0.3}
     assert (_at(timeline, 2000 * 30).excitation_level, dict(_at(timeline, 2000 * 30).anomalies)) == (2.0, {})
     assert ("excitation_level",) in [names for _, names in timeline.truth]
+
+
+def test_delay_and_swap_begin_and_end(machine: Machine) -> None:
+    timeline = _compiled(
+        machine,
+        Event(at_s=1.0, sensor="y1", sensor_fault="delay", value_SI=0.002),
+        Event(at_s=2.0, sensor="y1", sensor_fault="swapped", swapped_with="z1"),
+        Event(at_s=3.0, sensor="y1", sensor_fault="none"),
+    )
+    assert timeline.sensor_faults == {
+        "y1": ((2000, {"delay": 0.002}), (4000, {"delay": 0.002, "swapped with z1": None}), (6000, {}))
+    }
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"sensor_fault": "swapped"}, "'swapped' needs swapped_with"),
+        ({"sensor_fault": "stuck", "swapped_with": "z1"}, "'stuck' has no swapped_with"),
+        ({"sensor_fault": "swapped", "swapped_with": "y1"}, "expected another channel than 'y1'"),
+        ({"sensor_fault": "delay", "value_SI": -0.1}, "-0.1, expected 0 to 1 s"),
+        ({"sensor_fault": "delay"}, "'delay' needs value_SI"),
+        ({"sensor_fault": "delay", "value_SI": 0.1, "ramp_s": 1.0}, "cannot ramp"),
+    ],
+)
+def test_delays_and_swaps_that_cannot_be_are_refused(fields: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        Event.model_validate({"at_s": 1.0, "sensor": "y1", **fields})
+
+
+@pytest.mark.parametrize(("other", "message"), [("y1_dot", "is a velocity in mm/s, expected"), ("q", "not a channel")])
+def test_only_channels_of_one_kind_can_be_swapped(machine: Machine, other: str, message: str) -> None:
+    event = Event(at_s=1.0, sensor="y1", sensor_fault="swapped", swapped_with=other)
+    scenario = Scenario(machine="lab", seed=1, duration_s=100.0, events=(event,))
+    with pytest.raises(MachineFileError, match=message):
+        scenario.check_channels(machine)
