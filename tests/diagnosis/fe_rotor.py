@@ -146,10 +146,15 @@ def simulate(
     x = np.zeros((count + warm, len(COLUMNS)))
     # a force that is held over samples jumps at each of them: the acceleration there is the mean of both sides
     x[:, len(STATES) :] = (force + np.vstack([force[:1], force[:-1]])) / 2 @ B[rates].T
-    for root, drive, shape in zip(values, b, output.T, strict=True):
-        if root.imag >= 0:
-            state = lfilter([0, 1.0], [1, -root], force @ drive)
-            x += (1 if root.imag == 0 else 2) * np.real(state[:, None] * shape)
+    upper = np.flatnonzero(values.imag >= 0)
+    motion = np.empty((2 * upper.size, count + warm))
+    shapes = np.empty((2 * upper.size, len(COLUMNS)))
+    for place, mode in enumerate(upper):
+        state = lfilter([0, 1.0], [1, -values[mode]], force @ b[mode])
+        pair = 1 if values[mode].imag == 0 else 2
+        motion[2 * place : 2 * place + 2] = state.real, state.imag
+        shapes[2 * place : 2 * place + 2] = pair * output[:, mode].real, -pair * output[:, mode].imag
+    x += motion.T @ shapes
     x = x[warm:]
     W = rotor.speed_rad_s
     pull = np.zeros(n, dtype=complex)
@@ -165,8 +170,10 @@ def simulate(
     return np.column_stack([x, np.mod(theta, 2 * np.pi)])
 
 
-def plan(hops: int = 12, hop_s: float = 5.0, states: tuple[str, ...] = STATES) -> Plan:
-    """A plan as a machine file would give it, of the given columns."""
+def plan(
+    hops: int = 12, hop_s: float = 5.0, states: tuple[str, ...] = STATES, speed_rad_s: float | None = None
+) -> Plan:
+    """A plan as a machine file would give it, of the given columns; with a speed to look for there is no angle."""
     lags: npt.NDArray[np.intp] = np.arange(0, round(0.125 * RATE_HZ) + 1, round(0.001 * RATE_HZ))
     segment = round(hop_s * RATE_HZ)
     return Plan(
@@ -174,7 +181,8 @@ def plan(hops: int = 12, hop_s: float = 5.0, states: tuple[str, ...] = STATES) -
         states=states,
         columns=np.array([COLUMNS.index(name) for name in states]),
         scales=np.ones(len(states)),
-        angle_column=len(COLUMNS),
+        angle_column=len(COLUMNS) if speed_rad_s is None else None,
+        speed_rad_s=speed_rad_s,
         hop=segment,
         preamble=max(int(lags[-1]), segment // 2),
         segment=segment,

@@ -84,7 +84,7 @@ def test_what_cannot_be_read_says_why() -> None:
     (window,) = recorded(ROTOR, OTHER, 3)
     diagnosis = monitor().diagnose(replace(window, synchronous=None))
     reasons = {reading.name: reading.reason for reading in diagnosis.parameters}
-    assert reasons["e"] == "no phase reference"
+    assert reasons["e"] == "no phase reference, and no speed found in the vibration"
     assert not reasons["k_by"]
     keep = [i for i, name in enumerate(window.states) if name != "y2_dot"]
     partial = replace(

@@ -235,14 +235,17 @@ class BaselineDiagnostician:
     def _rotations(self, coordinates: tuple[str, ...], window: WindowStatistics) -> tuple[Rotation, Rotation]:
         now = rotation_of(window, coordinates)
         if not self._baseline.rotations:
-            raise EstimationError("the baseline has no phase reference")
+            raise EstimationError("the baseline has no phase reference and no speed found in the vibration")
         if now is None:
-            raise EstimationError("no phase reference")
+            raise EstimationError("no phase reference, and no speed found in the vibration")
         healthy = min(self._baseline.rotations, key=lambda one: abs(now.speed_rad_s / one.speed_rad_s - 1))
         if abs(now.speed_rad_s / healthy.speed_rad_s - 1) > SPEED_TOLERANCE:
             learned = ", ".join(f"{one.speed_rad_s * _RPM:.0f}" for one in self._baseline.rotations)
             raise EstimationError(f"speed {now.speed_rad_s * _RPM:.0f} rpm, the baseline was learned at {learned} rpm")
-        return healthy.of(coordinates), now
+        healthy = healthy.of(coordinates)
+        if healthy.absolute and now.absolute:
+            return healthy, now
+        return healthy.turned(healthy.largest), now.turned(healthy.largest)
 
 
 def _bordered(matrix: FloatArray, border: FloatArray, corner: float) -> FloatArray:

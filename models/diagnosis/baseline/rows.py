@@ -17,7 +17,7 @@ from models.physics.parameters import PARAMETERS
 
 __all__ = ["ROWS", "Own", "Row", "Term", "evaluable_rows", "parameters_of"]
 
-_NO_PHASE = "no phase reference"
+_NO_PHASE = "no phase reference, and no speed to look for in the vibration"
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +175,7 @@ def evaluable_rows(
     states : sequence of str
         Measured state variables and accelerations.
     has_phase_reference : bool
+        Or a speed that the vibration's own line is looked for at.
     rows : sequence of Row
 
     Returns

@@ -54,6 +54,7 @@ class RotationRecord(BaseModel):
     vectors: _Vector
     covariance: _Matrix
     speed_rad_s: _Number
+    absolute: bool = True
 
     @model_validator(mode="after")
     def _square(self) -> Self:
@@ -154,7 +155,7 @@ class BaselineRecord(BaseModel):
             reasons=self.reasons,
             covariance=_array(self.covariance),
             rotations=tuple(
-                Rotation(one.coordinates, _array(one.vectors), _array(one.covariance), one.speed_rad_s)
+                Rotation(one.coordinates, _array(one.vectors), _array(one.covariance), one.speed_rad_s, one.absolute)
                 for one in self.rotations
             ),
             duration_s=self.duration_s,
@@ -229,6 +230,7 @@ def _rotation(one: Rotation) -> RotationRecord:
         vectors=tuple(one.vectors.tolist()),
         covariance=_rows(one.covariance),
         speed_rad_s=float(one.speed_rad_s),
+        absolute=one.absolute,
     )
 
 

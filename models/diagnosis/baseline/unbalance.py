@@ -47,19 +47,38 @@ class Rotation:
     covariance : ndarray, shape (2 n, 2 n)
         From the stochastic part near the speed.
     speed_rad_s : float
+    absolute : bool
+        Whether angles are those to the phase reference; otherwise only angles between coordinates hold.
     """
 
     coordinates: tuple[str, ...]
     vectors: FloatArray
     covariance: FloatArray
     speed_rad_s: float
+    absolute: bool = True
 
     def of(self, coordinates: tuple[str, ...]) -> "Rotation":
         """The same of some of the coordinates."""
         n = len(self.coordinates)
         keep = [self.coordinates.index(name) for name in coordinates]
         keep = [*keep, *(n + number for number in keep)]
-        return Rotation(coordinates, self.vectors[keep], self.covariance[np.ix_(keep, keep)], self.speed_rad_s)
+        covariance = self.covariance[np.ix_(keep, keep)]
+        return Rotation(coordinates, self.vectors[keep], covariance, self.speed_rad_s, self.absolute)
+
+    @property
+    def largest(self) -> str:
+        """Coordinate of the largest displacement."""
+        n = len(self.coordinates)
+        return self.coordinates[int(np.argmax(np.hypot(self.vectors[:n], self.vectors[n:])))]
+
+    def turned(self, coordinate: str) -> "Rotation":
+        """The same from the angle at which a coordinate is largest."""
+        n, at = len(self.coordinates), self.coordinates.index(coordinate)
+        angle = np.arctan2(self.vectors[n + at], self.vectors[at])
+        c, s = np.cos(angle) * np.eye(n), np.sin(angle) * np.eye(n)
+        turn = np.block([[c, s], [-s, c]])
+        covariance = turn @ self.covariance @ turn.T
+        return Rotation(self.coordinates, turn @ self.vectors, covariance, self.speed_rad_s, absolute=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,16 +121,20 @@ class SynchronousState:
 
 
 def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Rotation | None:
-    """Synchronous vectors of a window with their covariance; None without a phase reference or a coordinate."""
+    """Synchronous vectors of a window with their covariance; None without a speed or a coordinate.
+
+    Where the speed was estimated from the vibration, angles to the shaft are not known.
+    """
     orders = [lowest(name, window.states) for name in coordinates]
-    if window.synchronous is None or not coordinates or not np.isfinite(window.speed_rad_s):
+    measured = _synchronous(window)
+    if measured is None or not coordinates or not np.isfinite(window.speed_rad_s):
         return None
     known = [order for order in orders if order is not None]
     if len(known) < len(orders) or window.speed_rad_s == 0:
         return None
     columns = [window.states.index(state_of(name, order)) for name, order in zip(coordinates, known, strict=True)]
     to_displacement = (1j * window.speed_rad_s) ** -np.array(known, dtype=np.float64)
-    q = window.synchronous[columns] * to_displacement
+    q = measured[columns] * to_displacement
     step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
     distance = np.abs(np.round((window.frequencies_hz - window.speed_rad_s / (2 * np.pi)) / step_hz))
     # the regression has emptied the bin of the line itself
@@ -122,11 +145,23 @@ def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Rotat
     density = density * np.outer(to_displacement, to_displacement.conj())
     # q = a - jb with the phase of cos θ: the density of q is that of the transform
     covariance = np.block([[density.real, -density.imag], [density.imag, density.real]])
-    return Rotation(coordinates, np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s)
+    absolute = window.synchronous is not None
+    return Rotation(coordinates, np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s, absolute)
+
+
+def _synchronous(window: WindowStatistics) -> ComplexArray | None:
+    """Synchronous part of the states; its angles are relative where the speed is estimated."""
+    if window.synchronous is not None or window.relative_synchronous is None:
+        return window.synchronous
+    seen = window.relative_synchronous[np.any(window.relative_synchronous != 0, axis=1)]
+    return np.asarray(seen.mean(axis=0), dtype=np.complex128) if seen.size else None
 
 
 def rotations_by_speed(found: Sequence[Rotation]) -> tuple[Rotation, ...]:
     """One rotation for each distinct speed, slowest first: the mean of those within 3 % of the slowest among them."""
+    if not all(one.absolute for one in found):
+        reference = found[0].largest
+        found = [one.turned(reference) for one in found]
     left = sorted(found, key=lambda one: one.speed_rad_s)
     groups: list[list[Rotation]] = []
     for one in left:
@@ -140,6 +175,7 @@ def rotations_by_speed(found: Sequence[Rotation]) -> tuple[Rotation, ...]:
             vectors=np.mean([one.vectors for one in near], axis=0),
             covariance=np.sum([one.covariance for one in near], axis=0) / len(near) ** 2,
             speed_rad_s=float(np.mean([one.speed_rad_s for one in near])),
+            absolute=near[0].absolute,
         )
         for near in groups
     )
