@@ -53,6 +53,8 @@ def _introduction(summary: UnknownSummary) -> tuple[str, ...]:
         f"{summary.healthy_windows} healthy windows of 60 s with one source of random direction, one cutoff (40 to",
         "160 Hz) and one level. Every window read later has a cutoff at least a quarter off the commissioned one, and",
         "level, noise and direction of its own; one source and independent sources in turn.",
+        "Only the bearing that stiffens with its displacement stays within a tenth of the commissioned level, because",
+        "at another one it has another stiffness.",
         f"{summary.windows} windows of 60 s per true change, {percent(summary.rate, 0)} false alarms declared per",
         f"window, seed {summary.seed}. *Located* means that exactly the changed parameter is named. Intervals are",
         "Clopper–Pearson's at 95 % and take windows as independent; those of one commissioning share its error, so the",

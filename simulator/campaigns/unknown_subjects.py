@@ -33,6 +33,9 @@ _COMMISSIONED_CUTOFFS_HZ = (40.0, 160.0)
 _OTHER_CUTOFF = math.log(1.25)
 _SPEED_TOLERANCE = 0.01
 _SETTLING_S = 0.1
+_ALIKE = (1.35, 1.65)
+"""Level of a rotor with cubic stiffness, within a tenth of the commissioned one: at another level its stiffness is
+another one, which is no fault and no error of reading."""
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 
 
@@ -146,6 +149,8 @@ class _Beam:
         cutoff_hz = _other_cutoff(SceneRange().cutoff_hz, commissioned, rng)
         layout = SourceLayout.ONE_SOURCE if which.layout is Layout.ONE_SOURCE else SourceLayout.INDEPENDENT
         limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
+        if not self.rotor.linear:
+            limits = replace(limits, stochastic_to_1x=_ALIKE)
         condition = drawn_condition(self.rotor, layout, limits, which.changes, rng)
         sizes = plan(self.rotor, WindowSizes())
         duration_s = (sizes.preamble + sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
