@@ -17,6 +17,7 @@ _COLOURS = {
     "limited": "bold yellow",
     "refused": "bold red",
 }
+_WIDE = 100
 
 
 def print_report(report: CommissioningReport, console: Console | None = None) -> None:
@@ -33,7 +34,7 @@ def print_report(report: CommissioningReport, console: Console | None = None) ->
     verdict.highlight_words([VERDICT_TEXT[report.verdict]], style=_COLOURS[report.verdict])
     console.print(verdict)
     console.print(Text(f"knowledge level {report.level.value}: {report.level_text}"))
-    console.print(_checks(report))
+    console.print(_checks(report, narrow=console.width < _WIDE))
     if report.parameters:
         console.print(_parameters(report))
         for sentence in budget_sentences(report):
@@ -43,10 +44,10 @@ def print_report(report: CommissioningReport, console: Console | None = None) ->
         console.print(Padding(Text(f"{number}. {step}"), (0, 0, 0, 2)))
 
 
-def _checks(report: CommissioningReport) -> Table:
+def _checks(report: CommissioningReport, *, narrow: bool) -> Table:
     table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
     table.add_column(no_wrap=True)
-    table.add_column(max_width=20)
+    table.add_column(max_width=20 if narrow else None)
     table.add_column(ratio=1)
     for check in report.checks:
         table.add_row(Text(check.verdict, style=_COLOURS[check.verdict]), Text(check.name), Text(check.text))

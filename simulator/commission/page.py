@@ -16,7 +16,7 @@ from models.commissioning.report import CommissioningReport
 from models.errors import RecordingError
 from models.machine import MachineFile
 from simulator.commission.pictures import pictures_of
-from simulator.commission.recording_plots import Portrait, portrait
+from simulator.commission.recording_plots import Portrait, ordered, portrait
 from simulator.commission.units import (
     channel_text,
     channel_unit,
@@ -42,7 +42,7 @@ _EQUATIONS = {
     KnowledgeLevel.FULL: _KNOWN,
     KnowledgeLevel.PARTIAL: _KNOWN,
     KnowledgeLevel.NONE: "Nothing of the rotor is known, so parameters are read through sums of the equations of "
-    "motion that hold only measured quantities. Their coefficients were learned from the recordings.",
+    "motion that hold only measured quantities. Their coefficients are learned from the recordings.",
 }
 
 
@@ -152,7 +152,8 @@ def _levels(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
     if report.conditions is None:
         return ()
     found = []
-    for state, edges in report.conditions.rms.items():
+    for state in ordered(report.conditions.rms):
+        edges = report.conditions.rms[state]
         unit, scale = channel_unit(state)
         low, high = (significant(scale * edge, 3) for edge in edges)
         found.append((channel_text(state), f"{low if low == high else f'{low} to {high}'} {unit}"))
@@ -160,7 +161,7 @@ def _levels(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
 
 
 def _row(recording: HealthyRecording, seen: Portrait | None) -> _Row:
-    gaps = f"{recording.gaps}, {significant(recording.missing_s, 3)} s missing" if recording.gaps else "none"
+    gaps = f"{recording.gaps}, {duration(recording.missing_s)} missing" if recording.gaps else "none"
     refused = ", ".join(f"{count} {reason}" for reason, count in recording.refused) or "none"
     start = speed = "–"
     if seen is not None:

@@ -1,6 +1,6 @@
 """Pictures of the healthy recordings themselves: spectra of every channel, speed and level over time."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +14,13 @@ from models.signals.block import FloatArray
 from simulator.commission.svg import BAND, COLOURS, GREY, INK, WIDTH_IN
 from simulator.commission.units import channel_text, channel_unit
 
-__all__ = ["Portrait", "draw_levels", "draw_spectra", "portrait"]
+__all__ = ["Portrait", "draw_levels", "draw_spectra", "ordered", "portrait"]
 
 _PANEL_IN = 1.6
 _STYLES = ("-", "--", ":")
 _BEYOND_BAND = 0.04
+_NEAR, _LINE = 0.04, 0.003
+"""Of the width of the picture: speeds that share a mark, and a mark that is drawn as a line."""
 _PLACES = ("y1", "z1", "y2", "z2", "psi", "phi")
 _ORDERS = ("", "_dot", "_ddot")
 _RPM = 30 / np.pi
@@ -92,7 +94,7 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
     )
 
 
-def _ordered(states: Sequence[str]) -> list[str]:
+def ordered(states: Iterable[str]) -> list[str]:
     """Bearing before disc, displacement before velocity, the two planes side by side."""
     return sorted(states, key=_rank)
 
@@ -111,7 +113,7 @@ def draw_spectra(portraits: Sequence[Portrait]) -> Figure:
     portraits : sequence of Portrait
         At least one.
     """
-    states = _ordered(portraits[0].statistics.states)
+    states = ordered(portraits[0].statistics.states)
     columns = min(2, len(states))
     rows = -(-len(states) // columns)
     figure = Figure(figsize=(WIDTH_IN, 0.6 + _PANEL_IN * rows), layout="constrained")
@@ -144,7 +146,7 @@ def _spectrum(axes: Axes, state: str, portraits: Sequence[Portrait]) -> None:
             if line.state == state:
                 axes.annotate(
                     f"{line.frequency_hz:.1f} Hz", (line.frequency_hz, 1), xycoords=("data", "axes fraction"),
-                    xytext=(0, -2), textcoords="offset points", ha="center", va="top", fontsize=8, color=COLOURS[1],
+                    xytext=(3, -11), textcoords="offset points", ha="left", va="top", fontsize=8, color=COLOURS[1],
                 )  # fmt: skip
     axes.set_xlim(0, float(frequencies[-1]) * (1 + _BEYOND_BAND))
     axes.set_title(channel_text(state))
@@ -161,19 +163,24 @@ def _line(number: int) -> dict[str, str | float]:
 
 
 def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float) -> None:
-    speeds = sorted({round(one.speed_hz, 1) for one in portraits if np.isfinite(one.speed_hz)})
-    apart = 0.03 * highest_hz
-    labelled = -np.inf
+    """Once and twice the speed: a line, or a stripe for speeds that are near each other."""
+    speeds = sorted(one.speed_hz for one in portraits if np.isfinite(one.speed_hz))
+    groups: list[list[float]] = []
     for speed in speeds:
-        for order in (1, 2):
-            if order * speed > highest_hz:
-                continue
-            axes.axvline(order * speed, color=GREY, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
-            if (order == 1 and speed - labelled < apart) or (order == 2 and len(speeds) > 1):
-                continue
-            labelled = speed if order == 1 else labelled
+        if groups and speed - groups[-1][-1] < _NEAR * highest_hz:
+            groups[-1].append(speed)
+        else:
+            groups.append([speed])
+    for low, high in ((order * group[0], order * group[-1]) for group in groups for order in (1, 2)):
+        if high - low < _LINE * highest_hz:
+            axes.axvline((low + high) / 2, color=GREY, linewidth=0.8, linestyle=(0, (1, 1.5)), zorder=1)
+        else:
+            axes.axvspan(low, high, facecolor=GREY, alpha=0.3, edgecolor="none", zorder=1)
+    labels = [(order, order * group[-1]) for group in groups for order in ((1, 2) if len(groups) == 1 else (1,))]
+    for order, at_hz in labels:
+        if at_hz < highest_hz:
             axes.annotate(
-                f"{order}×", (order * speed, 1), xycoords=("data", "axes fraction"), xytext=(2, -1),
+                f"{order}×", (at_hz, 1), xycoords=("data", "axes fraction"), xytext=(2, -1),
                 textcoords="offset points", ha="left", va="top", fontsize=8, color=INK,
             )  # fmt: skip
 
@@ -190,7 +197,7 @@ def draw_levels(portraits: Sequence[Portrait]) -> Figure:
     heights = [1.0, 1.8] if speeds_known else [1.8]
     figure = Figure(figsize=(WIDTH_IN, 0.7 + 1.4 * sum(heights)), layout="constrained")
     panels = figure.subplots(len(heights), 1, squeeze=False, sharex=True, height_ratios=heights)[:, 0]
-    states = _ordered(portraits[0].statistics.states)
+    states = ordered(portraits[0].statistics.states)
     columns = [portraits[0].statistics.states.index(state) for state in states]
     reference = np.median(np.concatenate([one.levels for one in portraits]), axis=0)
     total_s = sum(float(one.time_s[-1]) for one in portraits)
@@ -204,8 +211,8 @@ def draw_levels(portraits: Sequence[Portrait]) -> Figure:
             for axes in panels:
                 axes.axvline((start_s - space_s / 2) / unit_s, color=GREY, linewidth=0.7, linestyle=":")
         panels[0].annotate(
-            str(one.number), (float(x[0] + x[-1]) / 2, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
-            textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
+            str(one.number) if len(portraits) > 1 else "", (float(x[0] + x[-1]) / 2, 1.0),
+            xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
         )  # fmt: skip
         if speeds_known:
             rpm = _RPM * one.statistics.hop_speed_rad_s
@@ -216,7 +223,7 @@ def draw_levels(portraits: Sequence[Portrait]) -> Figure:
         start_s += float(one.time_s[-1]) + half_s + space_s
     if speeds_known:
         panels[0].set_ylabel("speed, rpm")
-        _not_too_narrow(panels[0])
+        panels[0].set_ylim(*_speed_limits(portraits))
     panels[-1].set_ylabel("level (rms) over its median")
     panels[-1].set_yscale("log", base=2)
     panels[-1].set_ylim(*_level_limits(portraits, reference))
@@ -247,12 +254,13 @@ def _channel_line(state: str) -> dict[str, str | float]:
     }
 
 
-def _not_too_narrow(axes: Axes) -> None:
-    """At least a per cent of the speed from bottom to top: a steady speed must look steady."""
-    low, high = axes.get_ylim()
-    middle = (low + high) / 2
-    reach = max((high - low) / 2, 0.01 * abs(middle))
-    axes.set_ylim(middle - reach, middle + reach)
+def _speed_limits(portraits: Sequence[Portrait]) -> tuple[float, float]:
+    """At least two per cent of the speed from bottom to top: a steady speed must look steady."""
+    rpm = _RPM * np.concatenate([one.statistics.hop_speed_rad_s for one in portraits])
+    low, high = float(np.nanmin(rpm)), float(np.nanmax(rpm))
+    middle, reach = (low + high) / 2, (high - low) / 2
+    reach = max(1.2 * reach, 0.01 * abs(middle), 0.1)
+    return middle - reach, middle + reach
 
 
 def _level_limits(portraits: Sequence[Portrait], reference: FloatArray) -> tuple[float, float]:

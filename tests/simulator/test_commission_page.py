@@ -1,0 +1,436 @@
+"""The report of a commissioning: what people read says what was found, for real recordings at every level."""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+from io import StringIO
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from models.commissioning.commission import Commissioning
+from models.commissioning.healthy import HealthyRecording
+from models.commissioning.report import CommissioningReport, ParameterSummary
+from models.errors import RecordingError
+from models.machine import MachineFile
+from simulator.commission.console import print_report
+from simulator.commission.page import HTML, JSON, write_report
+from simulator.commission.units import channel_text, duration, parameter_value, percent
+from simulator.commission.verdict import budget_sentences, dominant, headline, next_steps, smallest_change
+from tests.commissioning.material import (
+    LAB,
+    NOTHING,
+    PARTIAL,
+    commissioned,
+    healthy,
+    recording,
+    samples_of,
+    stream,
+    with_samples,
+)
+
+VOID = {"meta", "br", "link", "img", "hr", "input"}
+MEASURES = (
+    "healthy_spread",
+    "window_error",
+    "commissioning_error",
+    "detectable_loss",
+    "detectable_gain",
+    "window_s_for_wished",
+    "healthy_s_for_wished",
+)
+RUDE = '<script>alert("1")</script> & co.mcap'
+
+Case = tuple[Commissioning, tuple[HealthyRecording, ...], MachineFile]
+
+
+class Page(HTMLParser):
+    """Elements and texts of a page; a page whose elements do not close in order is an error."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.elements: list[tuple[str, dict[str, str]]] = []
+        self.texts: list[str] = []
+        self.rows: dict[str, list[tuple[float, str]]] = {}
+        self._open: list[tuple[str, dict[str, str]]] = []
+        self.feed(text)
+        self.close()
+        assert not self._open, f"never closed: {self._open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = {name: value or "" for name, value in attrs}
+        self.elements.append((tag, found))
+        if tag not in VOID:
+            self._open.append((tag, found))
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        opened, _ = self._open.pop()
+        assert opened == tag, f"<{opened}> is closed by </{tag}>"
+
+    def handle_data(self, data: str) -> None:
+        tags = [tag for tag, _ in self._open]
+        if tags and tags[-1] == "data":
+            row = next(attrs["id"] for tag, attrs in reversed(self._open) if tag == "tr")
+            self.rows.setdefault(row, []).append((float(self._open[-1][1]["value"]), data))
+        if "style" not in tags:
+            self.texts.append(data)
+
+    @property
+    def text(self) -> str:
+        """What a reader sees, white space apart."""
+        return " ".join(" ".join(self.texts).split())
+
+
+def disturbed() -> HealthyRecording:
+    """The rotor kit on a floor that another machine shakes at 41.4 Hz."""
+    blocks = stream(130.0, 61)
+    samples = samples_of(blocks)
+    turned = 2 * np.pi * 41.4 * np.arange(len(samples)) / LAB.rate_hz
+    for column, channel in enumerate(LAB.sensors):
+        if channel.quantity == "displacement":
+            samples[:, column] += 60.0 * np.sin(turned)  # µm
+        elif channel.quantity == "velocity":
+            samples[:, column] += 60.0e-3 * 2 * np.pi * 41.4 * np.cos(turned)  # mm/s
+    return recording(NOTHING, with_samples(blocks, samples), RUDE)
+
+
+def interrupted() -> HealthyRecording:
+    return recording(NOTHING, [block for number, block in enumerate(stream(130.0, 62)) if number != 700])
+
+
+def without_reference() -> tuple[MachineFile, HealthyRecording]:
+    """Displacements alone, no shaft angle."""
+    keep = [n for n, state in enumerate(LAB.descriptor.states) if state in ("y1", "z1", "y2", "z2")]
+    machine = NOTHING.model_copy(update={"sensors": tuple(NOTHING.sensors[n] for n in keep)})
+    blocks = [
+        replace(block, samples=np.asarray(block.samples[:, keep], dtype=np.float32)) for block in stream(130.0, 63)
+    ]
+    return machine, recording(machine, blocks)
+
+
+@cache
+def case(name: str) -> Case:
+    machine: MachineFile
+    recordings: tuple[HealthyRecording, ...]
+    if name == "full":
+        machine, recordings = LAB, (healthy(LAB, 130.0, 64),)
+    elif name == "partial":
+        machine, recordings = PARTIAL, (healthy(PARTIAL, 70.0, 65, "monday.mcap"), healthy(PARTIAL, 70.0, 66, RUDE))
+    elif name == "none":
+        machine, recordings = NOTHING, (healthy(NOTHING, 130.0, 67), healthy(NOTHING, 130.0, 68, RUDE))
+    elif name == "too short":
+        machine, recordings = NOTHING, (healthy(NOTHING, 30.0, 69),)
+    elif name == "no hop":
+        machine, recordings = NOTHING, (healthy(NOTHING, 3.0, 70),)
+    elif name == "second excitation":
+        machine, recordings = NOTHING, (disturbed(),)
+    elif name == "gap":
+        machine, recordings = NOTHING, (interrupted(),)
+    else:
+        machine, one = without_reference()
+        recordings = (one,)
+    return commissioned(machine, *recordings), recordings, machine
+
+
+LEVELS = ("full", "partial", "none")
+REFUSED = ("too short", "no hop", "second excitation")
+CASES = (*LEVELS, *REFUSED, "gap", "no phase reference")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("reports")
+
+
+def written(folder: Path, name: str) -> tuple[str, CommissioningReport]:
+    """Text of the page of a case and what its JSON holds."""
+    place = folder / name.replace(" ", "-")
+    if not (place / HTML).exists():
+        made, recordings, machine = case(name)
+        assert write_report(place, made.report, recordings, machine=machine, commissioned=made.commissioned) == (
+            place / HTML
+        )
+    report = CommissioningReport.model_validate_json((place / JSON).read_text(encoding="utf-8"))
+    return (place / HTML).read_text(encoding="utf-8"), report
+
+
+def section(text: str, name: str) -> str:
+    """What is seen of one section."""
+    found = re.search(rf'<section id="{name}">(.*?)</section>', text, re.DOTALL)
+    assert found is not None
+    return Page(found[1]).text
+
+
+def squeezed(text: str) -> str:
+    return " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_page_is_whole_and_needs_nothing_else(folder: Path, name: str) -> None:
+    text, _ = written(folder, name)
+    page = Page(text)
+    assert text.startswith("<!doctype html>")
+    assert not {tag for tag, _ in page.elements} & {"script", "link", "img", "iframe", "object", "base", "form"}
+    assert not re.search(r"https?:|//[a-z]|@import|url\((?!#)", text)
+    for _, attributes in page.elements:
+        assert not any(attribute.startswith("on") for attribute in attributes)
+        assert attributes.get("href", "#").startswith("#")
+        assert "src" not in attributes
+    names = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(names) == len(set(names))
+    asked = re.findall(r'href="#([^"]+)"|url\(#([^)]+)\)', text)
+    assert {one or other for one, other in asked} <= set(names)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_json_beside_the_page_is_the_report(folder: Path, name: str) -> None:
+    _, report = written(folder, name)
+    assert report == case(name)[0].report
+    assert json.loads((folder / name.replace(" ", "-") / JSON).read_text(encoding="utf-8"))["verdict"] == report.verdict
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_verdict_checks_and_equations_are_all_there(folder: Path, name: str) -> None:
+    text, report = written(folder, name)
+    verdict, checks = section(text, "verdict"), section(text, "checks")
+    assert squeezed(headline(report)) in verdict
+    assert report.level.value in verdict
+    for step in next_steps(report):
+        assert squeezed(step) in verdict
+    assert text.count('<tr class="check">') == len(report.checks) > 0
+    for check in report.checks:
+        assert squeezed(f"{check.name} {check.verdict} {check.text} {check.advice or 'nothing'}") in checks
+    equations = section(text, "equations")
+    assert len(report.equations) > 6
+    for row in report.equations:
+        told = "yes" if row.used else f"no: {row.reason}"
+        assert squeezed(f"{row.number} {row.title} {', '.join(row.parameters)} {told}") in equations
+
+
+@pytest.mark.parametrize("name", [*LEVELS, "gap", "no phase reference"])
+def test_figures_of_the_table_are_those_of_the_report(folder: Path, name: str) -> None:
+    text, report = written(folder, name)
+    rows = Page(text).rows
+    assert len(report.parameters) == 6
+    seen = section(text, "parameters")
+    for one in report.parameters:
+        assert f"{one.text} {one.name}" in seen
+        if not one.evaluable:
+            assert f"not readable: {one.reason}" in seen
+            assert f"parameter-{one.name}" not in rows
+            continue
+        expected = [value for field in MEASURES if (value := getattr(one, field)) is not None]
+        if one.identified is not None:
+            expected.insert(0, one.identified)
+        assert [value for value, _ in rows[f"parameter-{one.name}"]] == expected
+        words = [shown for _, shown in rows[f"parameter-{one.name}"]]
+        assert words == list(_words(one))
+
+
+def _words(one: ParameterSummary) -> Iterator[str]:
+    if one.identified is not None:
+        yield parameter_value(one.name, one.identified)
+    for error in (one.healthy_spread, one.window_error, one.commissioning_error):
+        if error is not None:
+            yield percent(error)
+    yield from smallest_change(one)
+    for seconds in (one.window_s_for_wished, one.healthy_s_for_wished):
+        if seconds is not None:
+            yield duration(seconds)
+
+
+def test_what_a_reader_is_told_at_each_level(folder: Path) -> None:
+    full, partial, none = (section(written(folder, name)[0], "parameters") for name in LEVELS)
+    assert "taken as exact" in full
+    assert "identified" not in full
+    for told in (partial, none):
+        assert "It is part of every later interval: longer windows do not remove it, more healthy data do." in told
+    report = written(folder, "partial")[1]
+    k_by = next(one for one in report.parameters if one.name == "k_by")
+    assert k_by.identified == pytest.approx(5e4, rel=0.02)
+    assert re.search(r"horizontal k_by (49|50|51)\.\d kN/m", partial)
+    assert "identified" not in none
+    assert "EI not readable: cannot be read without the machine's parameters" in none
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_refusal_says_why_and_what_to_record_instead(folder: Path, name: str) -> None:
+    text, report = written(folder, name)
+    assert report.verdict == "refused"
+    verdict = section(text, "verdict")
+    assert "demo/lab is not commissioned: " in verdict
+    advice = [check.advice for check in report.checks if check.verdict == "refused"]
+    assert advice
+    assert all(f"{one[0].upper()}{one[1:]}." in verdict for one in advice)
+    assert "Nothing was stored" in section(text, "identity")
+    assert 'class="verdict refused"' in text
+    assert "commissioned range" not in text
+    assert "--machine FILE@FOLDER" not in text
+
+
+def test_nothing_of_a_recordings_name_reaches_the_page_as_markup(folder: Path) -> None:
+    for name in ("partial", "none", "second excitation"):
+        text, _ = written(folder, name)
+        assert "<script" not in text
+        assert RUDE in section(text, "recordings")
+    assert f"{RUDE}: a steady line at 41.40 Hz" in section(written(folder, "second excitation")[0], "checks")
+
+
+def test_a_description_is_escaped(tmp_path: Path) -> None:
+    made, recordings, machine = case("too short")
+    rude = machine.model_copy(update={"description": "</p><script>alert(1)</script> pump & motor"})
+    text = write_report(tmp_path, made.report, recordings, machine=rude).read_text(encoding="utf-8")
+    assert "<script" not in text
+    assert "</p><script>alert(1)</script> pump & motor" in Page(text).text
+
+
+def pictures(text: str) -> dict[str, str]:
+    found = re.findall(r"<figure>\s*<h3>(.*?)</h3>\s*(<svg.*?</svg>)\s*<figcaption>(.*?)</figcaption>", text, re.DOTALL)
+    assert all(Page(svg).elements[0][1]["aria-label"] == title for title, svg, _ in found)
+    return {title: Page(caption).text for title, _, caption in found}
+
+
+def test_pictures(folder: Path) -> None:
+    everything = [
+        "Healthy readings",
+        "What limits each reading",
+        "Spectra of the recordings",
+        "Speed and level over time",
+    ]
+    for name in (*LEVELS, "gap"):
+        assert list(pictures(written(folder, name)[0])) == everything
+    for name in ("too short", "second excitation"):
+        assert list(pictures(written(folder, name)[0])) == everything[2:]
+    assert pictures(written(folder, "no hop")[0]) == {}
+    spectra = {
+        name: pictures(written(folder, name)[0])["Spectra of the recordings"] for name in CASES if name != "no hop"
+    }
+    assert "Shaded: the band that is used, 3 to 150 Hz. Dotted: the rotation at 22.0 Hz" in spectra["none"]
+    assert "speed is not known" in spectra["no phase reference"]
+    assert "A frequency in red is a steady line" in spectra["second excitation"]
+    assert "in red" not in spectra["none"]
+    levels = {name: pictures(written(folder, name)[0])["Speed and level over time"] for name in ("gap", "full", "none")}
+    assert "broken where data are missing" in levels["gap"]
+    assert "broken" not in levels["full"]
+    assert "number on top" in levels["none"]
+
+
+def test_pictures_take_the_colours_of_the_page(folder: Path) -> None:
+    text, _ = written(folder, "partial")
+    for drawing in re.findall(r"<svg.*?</svg>", text, re.DOTALL):
+        assert "var(--ink)" in drawing
+        assert "var(--c0)" in drawing
+        assert not re.search(r"(?:fill|stroke): (?:#0{6}|#f{6}|black|white)\b", drawing)
+
+
+def test_recordings_and_conditions(folder: Path) -> None:
+    text, report = written(folder, "none")
+    seen = section(text, "recordings")
+    assert "1 healthy.mcap 000000000000 2026-01-01 00:00:02 2.1 min none none 1320 rpm" in seen
+    assert "Outside these conditions nothing is evaluated" in seen
+    assert "speed 1320 rpm" in seen
+    assert report.conditions is not None
+    low, high = report.conditions.rms["y2_dot"]
+    found = re.search(r"disc, horizontal, velocity ([\d.]+) to ([\d.]+) mm/s rms", seen)
+    assert found is not None
+    assert [float(edge) for edge in found.groups()] == pytest.approx([1e3 * low, 1e3 * high], rel=6e-3)
+    assert "1, 0.1 s missing" in section(written(folder, "gap")[0], "recordings")
+    assert "speed not known: it is not watched" in section(written(folder, "no phase reference")[0], "recordings")
+
+
+def test_a_page_says_what_it_replaces(tmp_path: Path) -> None:
+    made, recordings, machine = case("none")
+    assert made.commissioned is not None
+    before = made.commissioned
+    after = before.model_copy(update={"version": 2, "replaces": before.identity, "why": "bearing exchanged < today"})
+    report = made.report.model_copy(update={"version": 2, "identity": after.identity})
+    text = write_report(tmp_path, report, recordings, machine=machine, commissioned=after).read_text(encoding="utf-8")
+    told = section(text, "identity")
+    assert f"Version 2 of the commissioning of demo/lab, identity {after.identity} ." in told
+    assert f"It replaces {before.identity} , because: bearing exchanged < today." in told
+    first = write_report(tmp_path, made.report, recordings, commissioned=before).read_text(encoding="utf-8")
+    assert "It replaces nothing." in section(first, "identity")
+
+
+def test_the_same_report_makes_the_same_page(tmp_path: Path, folder: Path) -> None:
+    made, recordings, machine = case("none")
+    again = write_report(tmp_path, made.report, recordings, machine=machine, commissioned=made.commissioned)
+    assert again.read_text(encoding="utf-8") == written(folder, "none")[0]
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    made, recordings, _ = case("no hop")
+    (tmp_path / "taken").write_text("", encoding="utf-8")
+    with pytest.raises(RecordingError, match=r"taken: the report cannot be written"):
+        write_report(tmp_path / "taken", made.report, recordings)
+
+
+def test_which_error_is_said_to_be_the_larger() -> None:
+    one = next(each for each in case("partial")[0].report.parameters if each.name == "k_by")
+    own = one.window_error
+    assert own is not None
+    for shared, which in ((0.0, "window"), (own / 1.3, "window"), (own, "both alike"), (1.3 * own, "commissioning")):
+        assert dominant(one.model_copy(update={"commissioning_error": shared})) == which
+    assert not dominant(one.model_copy(update={"commissioning_error": None}))
+
+
+def test_changes_that_cannot_be_found_are_said_to_be_so() -> None:
+    one = next(each for each in case("partial")[0].report.parameters if each.name == "c_by")
+    poor = one.model_copy(update={"detectable_loss": -1.0, "detectable_gain": 27.0, "window_s_for_wished": 4000.0})
+    assert smallest_change(poor) == ("not even all of it", "more than 10-fold")
+    report = case("partial")[0].report.model_copy(update={"parameters": (poor,)})
+    told = " ".join(budget_sentences(report))
+    assert "For c_by the wished change would take a window of more than 60 min, the longest there is" in told
+    assert "as things are" not in told
+    sharp = one.model_copy(update={"detectable_loss": -0.05, "detectable_gain": 0.052, "wished": 0.1})
+    told = " ".join(budget_sentences(report.model_copy(update={"parameters": (sharp,)})))
+    assert "The wished change of 10% of c_by is found as things are." in told
+
+
+def printed(report: CommissioningReport, width: int = 80) -> str:
+    console = Console(file=StringIO(), width=width, highlight=False)
+    print_report(report, console)
+    file = console.file
+    assert isinstance(file, StringIO)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_terminal_says_the_same_in_80_columns(name: str) -> None:
+    report = case(name)[0].report
+    text = printed(report)
+    assert max(len(line.rstrip("\n")) for line in text.splitlines()) <= 80
+    assert "…" not in text
+    seen = squeezed(text)
+    assert squeezed(headline(report)) in seen
+    for step in next_steps(report):
+        assert step.split()[0] in seen
+    wide = squeezed(printed(report, 400))
+    for check in report.checks:
+        assert squeezed(f"{check.verdict} {check.name} {check.text}") in wide
+    for one in report.parameters:
+        if one.evaluable:
+            assert one.window_error is not None
+            assert re.search(rf"^{one.name} .*{percent(one.window_error)} ", text, re.MULTILINE)
+        else:
+            assert re.search(rf"^{one.name} +not readable", text, re.MULTILINE)
+
+
+def test_square_brackets_are_no_markup_of_the_terminal() -> None:
+    report = case("too short")[0].report
+    check = report.checks[0].model_copy(update={"text": "[red]all[/red] of it [/]"})
+    assert "[red]all[/red] of it [/]" in printed(report.model_copy(update={"checks": (check,)}))
+
+
+def test_every_channel_has_words() -> None:
+    for state in ("y1", "z2_ddot", "psi", "phi_dot", "theta"):
+        assert channel_text(state) != state
+    assert channel_text("x9") == "x9"
