@@ -258,6 +258,32 @@ def delay(
 
 
 @app.command()
+def sensors(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Directory for the records and the section.")],
+    machine: Annotated[
+        list[str] | None, typer.Option("--machine", "-m", help="Shipped machine; all of them if left out.")
+    ] = None,
+    windows: Annotated[int, typer.Option(min=2, help="Windows per machine, level and fault.")] = 100,
+    seed: SeedOption = _SEED + 200,
+    processes: ProcessesOption = _CORES,
+    page: Annotated[
+        Path | None, typer.Option("--page", help="Page of results (Markdown) whose section is to be replaced.")
+    ] = None,
+) -> None:
+    """Put one sensor at fault on a healthy machine, again and again, and count what is said of it.
+
+    Gain, drifting gain, offset, stuck, clipped, late and swapped channels, on machines that were commissioned without
+    their parameters and with all of them: named, called a matter of data health, or taken for a fault of the machine.
+
+    Example: rotortrain sensors --machine lab --out sensors
+    """
+    with _running():
+        from simulator.campaigns.sensor_command import break_sensors  # noqa: PLC0415  # start-up stays free of numpy and torch
+
+        break_sensors(machine or (), out, windows=windows, seed=seed, processes=processes, page=page)
+
+
+@app.command()
 def commission(
     machine: Annotated[
         str,

@@ -36,9 +36,17 @@ def unknown_section(summary: UnknownSummary) -> str:
 
 
 def placed(page: str, section: str) -> str:
-    """The page with this section in the place of the one it has, or at its end."""
-    before, begin, rest = page.partition(BEGIN)
-    _, end, after = rest.partition(END)
+    """The page with this section in the place of the one it has, or at its end.
+
+    Parameters
+    ----------
+    page : str
+    section : str
+        Its first and last line are the marks between which it stands.
+    """
+    first, *_, last = section.rstrip().splitlines()
+    before, begin, rest = page.partition(first)
+    _, end, after = rest.partition(last)
     if not begin or not end:
         return page.rstrip() + "\n\n" + section
     return before + section.rstrip() + after
