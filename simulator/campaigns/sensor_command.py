@@ -73,8 +73,8 @@ def _section(plan: SensorPlan, cells: Sequence[SensorCell]) -> str:
             f"machine was commissioned on {plan.healthy} windows of one condition. *Named*: the fault and the channel.",
             "*Data health*: something is found wrong with a sensor, and nothing is said of the machine. *Claimed*: a",
             "bearing, unbalance or shaft fault is named without reserve instead, at",
-            f"{percent(plan.rate, 0)} false alarms declared per window. {plan.windows} independent windows per cell, seed",
-            f"{plan.seed}; Clopper–Pearson intervals at 95 %.",
+            f"{percent(plan.rate, 0)} false alarms declared per window. {plan.windows} independent windows per cell,",
+            f"seed {plan.seed}; Clopper–Pearson intervals at 95 %.",
         ),
         "",
     ]
