@@ -68,7 +68,7 @@ def _parameters(report: CommissioningReport) -> Table:
         table.add_column("identified", justify="right")
     for head in ("window", "commissioning"):
         table.add_column(head, justify="right", no_wrap=True)
-    table.add_column("larger")
+    table.add_column("dominant")
     for head in ("loss", "gain"):
         table.add_column(head, justify="right")
     for one in report.parameters:

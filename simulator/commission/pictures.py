@@ -65,8 +65,8 @@ def pictures_of(
             "budget",
             "What limits each reading",
             lambda: draw_budget(report),
-            "Errors add as squares, so the larger of the two is nearly all of the sum. Where the upright mark lies "
-            "left of the dashed one, the wished change is found by one window with 95% probability.",
+            "Errors add as squares: one that is more than twice the other is nearly all of the sum. Where the upright "
+            "mark lies left of the dashed one, the wished change is found by one window with 95% probability.",
         ),
     ]
     if portraits:
@@ -84,14 +84,16 @@ def _spectra_caption(portraits: Sequence[Portrait]) -> str:
     speeds = [one.speed_hz for one in portraits if np.isfinite(one.speed_hz)]
     if speeds:
         low, high = f"{min(speeds):.1f}", f"{max(speeds):.1f}"
-        text += f"Dotted: the rotation at {low if low == high else f'{low} to {high}'} Hz and its double"
+        text += f"Grey: the rotation at {low if low == high else f'{low} to {high}'} Hz and its double"
         if any(one.statistics.speed_source == "estimated" for one in portraits):
             text += " (there is no phase reference: the speed is estimated from the vibration)"
         text += ". The rotation is taken out before anything is learned."
     else:
         text += "The speed is not known, so the rotation is neither marked nor taken out."
     if any(one.lines for one in portraits):
-        text += " A frequency in red is a steady line that does not belong to the rotation, at the channel where it is "
+        text += (
+            " A frequency in orange is a steady line that does not belong to the rotation, at the channel where it is "
+        )
         text += "strongest."
     return text
 

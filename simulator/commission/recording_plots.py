@@ -210,10 +210,11 @@ def draw_levels(portraits: Sequence[Portrait]) -> Figure:
         if start_s:
             for axes in panels:
                 axes.axvline((start_s - space_s / 2) / unit_s, color=GREY, linewidth=0.7, linestyle=":")
-        panels[0].annotate(
-            str(one.number) if len(portraits) > 1 else "", (float(x[0] + x[-1]) / 2, 1.0),
-            xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
-        )  # fmt: skip
+        if len(portraits) > 1:
+            panels[0].annotate(
+                str(one.number), (float(x[0] + x[-1]) / 2, 1.0), xycoords=("data", "axes fraction"), xytext=(0, 2),
+                textcoords="offset points", ha="center", va="bottom", fontsize=8, color=INK,
+            )  # fmt: skip
         if speeds_known:
             rpm = _RPM * one.statistics.hop_speed_rad_s
             panels[0].plot(*_pieces(x, rpm, one.broken), color=INK, marker=".", markersize=3)

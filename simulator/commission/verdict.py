@@ -6,7 +6,8 @@ from simulator.commission.units import change, duration, listed, percent
 __all__ = ["VERDICT_TEXT", "budget_sentences", "dominant", "headline", "next_steps", "smallest_change"]
 
 VERDICT_TEXT = {"commissioned": "commissioned", "limited": "commissioned with limits", "refused": "not commissioned"}
-_ALIKE = 1.25
+_ALIKE = 2.0
+"""Errors add as squares: beside one twice as large, the other makes a tenth of the total."""
 _MOST_OF_A_LOSS = 0.99
 _MANY_TIMES = 10.0
 _LONGEST_WINDOW_S = 3600.0
@@ -14,13 +15,13 @@ _LONGEST_WINDOW_S = 3600.0
 
 
 def dominant(parameter: ParameterSummary) -> str:
-    """Which error is the larger: ``commissioning``, ``window``, ``both alike``; empty where there is none."""
+    """Which error is nearly all of the total: ``commissioning``, ``window``, or ``both``; empty where there is none."""
     own, shared = parameter.window_error, parameter.commissioning_error
     if own is None or shared is None:
         return ""
     if shared > _ALIKE * own:
         return "commissioning"
-    return "window" if own > _ALIKE * shared else "both alike"
+    return "window" if own > _ALIKE * shared else "both"
 
 
 def smallest_change(parameter: ParameterSummary) -> tuple[str, str]:
@@ -96,7 +97,7 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
         for which, text in (
             ("commissioning", "The commissioning dominates the error of {}: record more healthy data."),
             ("window", "One window dominates the error of {}: a longer window helps, more healthy data little."),
-            ("both alike", "Window and commissioning weigh alike for {}: both must be longer."),
+            ("both", "Window and commissioning both count for {}: longer windows help, and so do more healthy data."),
         ):
             names = [one.name for one in read if dominant(one) == which]
             if names:

@@ -313,10 +313,10 @@ def test_pictures(folder: Path) -> None:
     spectra = {
         name: pictures(written(folder, name)[0])["Spectra of the recordings"] for name in CASES if name != "no hop"
     }
-    assert "Shaded: the band that is used, 3 to 150 Hz. Dotted: the rotation at 22.0 Hz" in spectra["none"]
+    assert "Shaded: the band that is used, 3 to 150 Hz. Grey: the rotation at 22.0 Hz" in spectra["none"]
     assert "speed is not known" in spectra["no phase reference"]
-    assert "A frequency in red is a steady line" in spectra["second excitation"]
-    assert "in red" not in spectra["none"]
+    assert "A frequency in orange is a steady line" in spectra["second excitation"]
+    assert "in orange" not in spectra["none"]
     levels = {name: pictures(written(folder, name)[0])["Speed and level over time"] for name in ("gap", "full", "none")}
     assert "broken where data are missing" in levels["gap"]
     assert "broken" not in levels["full"]
@@ -373,11 +373,17 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         write_report(tmp_path / "taken", made.report, recordings)
 
 
-def test_which_error_is_said_to_be_the_larger() -> None:
+def test_which_error_is_said_to_dominate() -> None:
     one = next(each for each in case("partial")[0].report.parameters if each.name == "k_by")
     own = one.window_error
     assert own is not None
-    for shared, which in ((0.0, "window"), (own / 1.3, "window"), (own, "both alike"), (1.3 * own, "commissioning")):
+    for shared, which in (
+        (0.0, "window"),
+        (own / 2.1, "window"),
+        (own, "both"),
+        (1.9 * own, "both"),
+        (2.1 * own, "commissioning"),
+    ):
         assert dominant(one.model_copy(update={"commissioning_error": shared})) == which
     assert not dominant(one.model_copy(update={"commissioning_error": None}))
 
