@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import median_filter
+from scipy.stats import theilslopes
 
 from models.signals.block import FloatArray
 
@@ -24,8 +25,13 @@ _SWEEP_PER_S = 0.005
 """Fastest sweep looked for, as a part of the expected speed and second."""
 _PADDING = 4
 _REFINEMENTS = 5
-_NEIGHBOUR = 0.015
-"""Relative difference of speed between neighbouring hops that one shaft may have, its sweep taken into account."""
+_NEIGHBOUR = 0.004
+"""Relative difference of speed between neighbouring hops that one shaft may have, its sweep taken into account: a
+lightly damped resonance looks like a line, but its peak wanders by its width."""
+_RESOLVED = 0.25
+"""Part of a hop's frequency resolution below which no difference is believed."""
+_COURSE = 0.03
+"""Relative distance from the straight course through most of the hops, beyond which a peak is another one."""
 _FOLLOWED_PART = 0.8
 _STRONG, _FEW_HOPS = 15.0, 6
 """A stretch of a few hops needs lines that stand out by themselves."""
@@ -160,8 +166,12 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
             near = np.abs(speed / np.median(speed) - 1) < _NEIGHBOUR * len(lines)
             return speed if np.all(strength > _STRONG) and np.all(near) else None
         expected = (sweep[1:] + sweep[:-1]) / 2 * hop_s
-        together = np.abs(np.diff(speed) - expected) < _NEIGHBOUR * speed[1:]
+        together = np.abs(np.diff(speed) - expected) < np.maximum(_NEIGHBOUR * speed[1:], _RESOLVED * 2 * np.pi / hop_s)
     followed = np.append(together, False) | np.insert(together, 0, False)
+    if followed.sum() > 1:
+        number = np.flatnonzero(followed)
+        slope, start = theilslopes(speed[followed], number)[:2]
+        followed[number] = np.abs(speed[followed] / (start + slope * number) - 1) < _COURSE
     if followed.mean() < _FOLLOWED_PART:
         return None
     return np.where(followed, speed, np.nan)

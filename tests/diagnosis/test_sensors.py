@@ -1,5 +1,6 @@
 """Each fault of a sensor is found, named where it can be, and healthy sensors are left alone."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -236,3 +237,35 @@ def test_nothing_to_learn_from_says_so() -> None:
     samples[:, column("y1")] = 0.0
     with pytest.raises(EstimationError, match="no fluctuation in y1"):
         learn_sensor_reference(windows_of(plan_of("lab"), samples))
+
+
+def displacements_only() -> tuple[Plan, list[int]]:
+    plan = plan_of("lab")
+    keep = [i for i, state in enumerate(plan.states) if not state.endswith("_dot")]
+    columns, scales = plan.columns[keep], plan.scales[keep]
+    return replace(plan, states=tuple(plan.states[i] for i in keep), columns=columns, scales=scales), [*keep, -1]
+
+
+def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() -> None:
+    """Found where the 1x part stands out enough, and never put down to another channel."""
+    plan, columns = displacements_only()
+    found: list[float] = []
+    for seed in range(21, 29):
+        samples = recorded("lab", seed)[:, columns].copy()
+        (healthy,) = windows_of(plan, samples)
+        assert sensor_findings(healthy) == ()
+        samples[70_000:, 1] *= 0.7
+        (window,) = windows_of(plan, samples)
+        findings = sensor_findings(window)
+        assert implicated(findings) <= {plan.states[1]}
+        found += [finding.value for finding in findings]
+    assert len(found) >= 2
+    np.testing.assert_allclose(found, -0.3, atol=0.1)
+
+
+def test_a_machine_that_moves_more_is_no_sensors_fault() -> None:
+    plan, columns = displacements_only()
+    samples = recorded("lab", 23)[:, columns].copy()
+    samples[70_000:, :4] *= 1.5
+    (window,) = windows_of(plan, samples)
+    assert sensor_findings(window) == ()

@@ -8,11 +8,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import Plan, hop_moments, plan_for
 from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform, waveform_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import load_machine
 from models.signals.block import FloatArray
+from simulator.scenario import Event, NamedSource, Scenario, Sensors
+from simulator.stream import blocks
 
 RATE = 200.0
 
@@ -261,3 +264,108 @@ def test_pairs_of_a_motion_and_its_rate_keep_their_powers() -> None:
     assert gain.real == pytest.approx(-0.8 / (1 + 1 / 48), rel=1e-3)
     assert abs(gain.imag) < 1e-3
     assert len(statistics.pair_powers) == 4
+
+
+LAB = load_machine("lab")
+
+
+def run_of_lab(seed: int, change: float = 0.0, *, unbalanced: bool = True) -> FloatArray:
+    """A window of four independent sources while the speed changes by a part of the nominal one, through its middle."""
+    rpm = LAB.operation.speed_rpm
+    events = [Event(at_s=0.0, speed_rpm=rpm * (1 - change / 2))]
+    if change:
+        events.append(Event(at_s=1.0, ramp_s=61.0, speed_rpm=rpm * (1 + change / 2)))
+    if not unbalanced:
+        events.append(Event(at_s=0.0, parameter="e", relative_change=-0.9999))
+    rotor = LAB.rotor
+    force_N = rotor.m2_kg * rotor.e_m * LAB.operation.speed_rad_s**2 * 0.5
+    sources = tuple(
+        NamedSource.model_validate(
+            {"name": str(i), "cutoff_hz": 90.0, "direction": tuple(np.eye(6)[i]), "force_rms_N": force_N}
+        )
+        for i in (0, 1, 3, 4)
+    )
+    sensors = Sensors(noise_relative=0.02, noise_corner_hz=300.0)
+    scenario = Scenario(
+        machine="lab", seed=seed, duration_s=63.0, sources=sources, sensors=sensors, events=tuple(events)
+    )
+    plan = plan_for(LAB)
+    return np.concatenate([plan.to_si(block.samples) for block, _ in blocks(scenario, LAB, 1.0)])
+
+
+def without_angle(plan: Plan) -> Plan:
+    return replace(plan, angle_column=None)
+
+
+@pytest.mark.parametrize("measured", [True, False], ids=["phase reference", "estimated speed"])
+def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank(measured: bool) -> None:
+    """15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""
+    plan = plan_for(LAB, lagged=False)
+    plan = plan if measured else without_angle(plan)
+    z, misfit = [], []
+    for seed in (40, 41):
+        samples = run_of_lab(seed, 0.15)
+        (window,) = feed(SlidingWindow(plan), samples if measured else samples[:, :-1])
+        assert window.removed_by_hop
+        assert window.speed_source == ("phase reference" if measured else "estimated")
+        assert window.speed_range[1] / window.speed_range[0] > 1.12
+        diagnosis = LikelihoodFit(LAB).diagnose(window)
+        z.append([reading.z for reading in diagnosis.parameters[:4]])
+        misfit.append(diagnosis.misfit_z)
+    assert np.all(np.abs(np.mean(np.array(z, dtype=float), axis=0)) < 3 / np.sqrt(2)), z
+    assert np.all(np.array(misfit, dtype=float) < 4), misfit
+
+
+def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples, plan = run_of_lab(40, 0.15), plan_for(LAB, lagged=False)
+    monkeypatch.setattr("models.diagnosis.synchronous.STEADY", 1.0)
+    (window,) = feed(SlidingWindow(plan), samples)
+    assert not window.removed_by_hop
+    misfit = LikelihoodFit(LAB).diagnose(window).misfit_z
+    assert misfit is not None
+    assert misfit > 4
+
+
+@pytest.mark.parametrize("change", [0.0, 0.1])
+def test_the_speed_is_found_without_a_phase_reference(change: float) -> None:
+    samples, plan = run_of_lab(50, change), plan_for(LAB, lagged=False)
+    (known,) = feed(SlidingWindow(plan), samples)
+    (found,) = feed(SlidingWindow(without_angle(plan)), samples[:, :-1])
+    assert (found.speed_source, found.phase_reference, known.phase_reference) == ("estimated", False, True)
+    np.testing.assert_allclose(found.hop_speed_rad_s, known.hop_speed_rad_s, rtol=2e-3)
+    assert found.synchronous is None
+    assert found.relative_synchronous is not None
+    assert known.hop_synchronous is not None
+    zero = found.states.index(found.zero_angle_state)
+    turned = known.hop_synchronous * np.exp(-1j * np.angle(known.hop_synchronous[:, [zero]]))
+    error = np.abs(found.relative_synchronous - turned) / np.abs(turned).mean(axis=0)
+    assert np.median(error) < 0.05
+
+
+def test_without_a_line_there_is_no_speed_and_nothing_is_taken_out() -> None:
+    samples, plan = run_of_lab(51, unbalanced=False)[:, :-1], without_angle(plan_for(LAB, lagged=False))
+    (window,) = feed(SlidingWindow(plan), samples)
+    assert window.speed_source == "unknown"
+    assert np.isnan(window.speed_rad_s)
+    assert np.all(np.isnan(window.hop_speed_rad_s))
+    assert window.rotation_vectors is None
+    (plain,) = feed(SlidingWindow(replace(plan, speed_rad_s=None)), samples)
+    np.testing.assert_allclose(window.spectrum, plain.spectrum, rtol=1e-9, atol=1e-12 * abs(plain.spectrum).max())
+
+
+@settings(max_examples=8, deadline=None)
+@given(cuts=st.lists(st.integers(1, 2449), max_size=20), angle=st.booleans())
+def test_hop_by_hop_any_splitting_gives_identical_statistics(cuts: list[int], angle: bool) -> None:
+    t = np.arange(2450) / RATE
+    theta = 2 * np.pi * (9.0 * t + 0.015 * t**2)
+    samples = np.column_stack([signal(2450, 8, angle=False), np.mod(theta, 2 * np.pi)])
+    samples[:, :2] += 20 * np.outer(np.cos(theta), [1.0, 2.0])
+    plan = replace(small_plan(angle=angle, hops=6), hop=300, speed_rad_s=2 * np.pi * 10, speed_tolerance=0.3)
+    samples = samples if angle else samples[:, :2]
+    whole, window, split = feed(SlidingWindow(plan), samples), SlidingWindow(plan), []
+    for begin, end in pairwise([0, *sorted(set(cuts)), 2450]):
+        split += feed(window, samples[begin:end], begin)
+    assert len(split) == len(whole) == 3
+    assert all(one.removed_by_hop for one in whole)
+    for a, b in zip(split, whole, strict=True):
+        assert_identical(a, b)
