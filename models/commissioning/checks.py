@@ -65,11 +65,14 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
         refused.update(dict(one.refused))
     gaps, missing_s = sum(one.gaps for one in recordings), sum(one.missing_s for one in recordings)
     window = machine.window
-    lost = f"{gaps} gaps of {missing_s:.3g} s in all" if gaps else "no gaps"
+    lost = (
+        "no gaps" if not gaps else f"one gap of {missing_s:.3g} s" if gaps == 1 else f"{gaps} gaps of {missing_s:.3g} s"
+    )
     if refused:
         last = next(one.last_refusal for one in reversed(recordings) if one.last_refusal)
         lost += f", {sum(refused.values())} blocks refused (the latest: {last})"
-    found = f"{used_s:.4g} s of usable data in {len(recordings)} recordings; {lost}"
+    files = "one recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
+    found = f"{used_s:.4g} s of usable data in {files}; {lost}"
     wanted_s = _FEW_WINDOWS * window.length_s
     advice = f"record at least {wanted_s:g} s without interruption, in one or several files"
     if hops < _FEWEST_HOPS:
@@ -154,6 +157,11 @@ def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
         "a neighbouring machine, a gear or a supply line drives the rotor besides: the relations are for noise and "
         "unbalance; record while the other machine stands, or let the line fall outside the band"
     )
+    if not any(one.plan.angle_column is not None for one in recordings):
+        advice = (
+            "without a phase reference this may be the rotation itself: give speed_rpm in [operation], or measure the "
+            f"shaft angle; if it is not, {advice}"
+        )
     dominant = any(line.share > _DOMINANT_LINE for _, line in loud)
     return Check(name=name, verdict="refused" if dominant else "limited", text=text, advice=advice)
 

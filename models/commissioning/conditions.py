@@ -8,13 +8,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.diagnosis.window import WindowStatistics
 
-__all__ = ["OperatingRange"]
+__all__ = ["LEVEL_MARGIN", "SPEED_MARGIN", "OperatingRange"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 _RPM = 30 / np.pi
-_SPEED_MARGIN = 0.05
+SPEED_MARGIN = 0.05
 """The relations hold no speed; a bearing's film and the unbalance response do."""
-_LEVEL_MARGIN = 10.0
+LEVEL_MARGIN = 10.0
 """Random vibration this many times below or above what was seen is another regime: a stopped drive, a mounting come
 loose, a bearing lifted through its clearance."""
 _Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -57,17 +57,17 @@ class OperatingRange(BaseModel):
         if self.speed_rpm is not None and np.isfinite(window.speed_rad_s):
             low, high = self.speed_rpm
             rpm = window.speed_rad_s * _RPM
-            if not low * (1 - _SPEED_MARGIN) <= rpm <= high * (1 + _SPEED_MARGIN):
+            if not low * (1 - SPEED_MARGIN) <= rpm <= high * (1 + SPEED_MARGIN):
                 seen = f"{low:.0f} rpm" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} rpm"
-                return f"speed is {rpm:.0f} rpm, commissioned is {seen} ± {_SPEED_MARGIN:.0%}"
+                return f"speed is {rpm:.0f} rpm, commissioned is {seen} ± {SPEED_MARGIN:.0%}"
         for name, value in zip(window.states, _rms(window).tolist(), strict=True):
             if name not in self.rms:
                 continue
             low, high = self.rms[name]
-            if not low / _LEVEL_MARGIN <= value <= high * _LEVEL_MARGIN:
+            if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
                 return (
                     f"random vibration of {name} is {value:.3g} rms (SI), commissioned is {low:.3g} to {high:.3g}, and "
-                    f"up to {_LEVEL_MARGIN:g} times less or more"
+                    f"up to {LEVEL_MARGIN:g} times less or more"
                 )
         return ""
 

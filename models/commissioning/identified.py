@@ -175,15 +175,15 @@ def _first_e(windows: Sequence[WindowStatistics]) -> float:
 
 
 def _from_forces(m2_kg: float, windows: Sequence[WindowStatistics]) -> dict[str, float]:
-    """Stiffness and damping from the relation between bearing and disc: its terms are c/k and m2/k."""
+    """Stiffness and damping from the relation between bearing and disc: its coefficients are -c/k and -m2/k."""
     try:
         baseline = learn_baseline(windows)
     except EstimationError:
         return {}
     found = {}
     for axis, relation in zip("yz", baseline.relations, strict=True):
-        if relation is not None and relation.coefficients[1] > 0:
-            k = m2_kg / float(relation.coefficients[1])
+        if relation is not None and relation.coefficients[1] < 0:
+            k = -m2_kg / float(relation.coefficients[1])
             found[f"k_b{axis}_N_per_m"] = k
             found[f"c_b{axis}_N_s_per_m"] = -float(relation.coefficients[0]) * k
     return found

@@ -68,6 +68,7 @@ def commission_machine(
         If machine file, recordings or directory cannot be used.
     """
     machine = load_machine_file(name)
+    _check_names(healthy)
     replaces = _before(out, machine, why)
     with labelled_bars() as progress:
         recordings = []
@@ -77,7 +78,7 @@ def commission_machine(
         entries = [_entry(path, one) for path, one in zip(healthy, recordings, strict=True) if one.hops]
         made = commission(machine, recordings, entries, wished=wished, replaces=replaces, why=why, progress=progress)
     _write(out, made, replaces)
-    page = write_report(out, made.report, recordings)
+    page = write_report(out, made.report, recordings, machine=machine, commissioned=made.commissioned)
     print_report(made.report)
     if made.commissioned is not None and made.machine is not None and networks:
         train_for(made.machine, out, n_windows, n_draws, seed, processes)
@@ -85,6 +86,14 @@ def commission_machine(
     if made.commissioned is not None:
         typer.echo(f"bundle: {out}   (rotorwatch replay REC --offline --machine {name}@{out})")
     return made.commissioned is not None
+
+
+def _check_names(paths: Sequence[Path]) -> None:
+    """Recordings are told apart by their file names, in the report and in the bundle."""
+    names = [path.name for path in paths]
+    for path in paths:
+        if names.count(path.name) > 1:
+            raise MachineFileError(f"--healthy {path}: two recordings are called {path.name}, expected different names")
 
 
 def _before(out: Path, machine: MachineFile, why: str) -> Commissioned | None:

@@ -41,7 +41,7 @@ def refused(made: Commissioning) -> bool:
 def test_too_short() -> None:
     made = made_of(stream(30.0, 51))
     assert refused(made)
-    assert verdict_of(made, "enough data")[1].startswith("too short: 25 s of usable data")
+    assert verdict_of(made, "enough data")[1].startswith("too short: 25 s of usable data in one recording")
     assert "record at least 360 s without interruption" in made.report.summary
 
 
@@ -58,7 +58,7 @@ def test_a_few_gaps_are_told_and_cost_their_hops() -> None:
     kept = [block for number, block in enumerate(stream(HEALTHY_S, 52)) if number != 700]
     made = made_of(kept)
     assert not refused(made)
-    assert "1 gaps of 0.1 s" in verdict_of(made, "enough data")[1]
+    assert "one gap of 0.1 s" in verdict_of(made, "enough data")[1]
 
 
 def test_clipped() -> None:
