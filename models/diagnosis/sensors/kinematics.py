@@ -19,7 +19,7 @@ __all__ = ["LONGEST_DELAY_S", "Banded", "PairReading", "banded", "gain_course", 
 LONGEST_DELAY_S = 0.02
 """Longest delay that is looked for."""
 
-_DELAY_STEP_S = 1e-4
+_DELAY_STEP_S = 2.5e-4
 _AS_GOOD = 0.98
 """A shorter delay that fits this well is preferred: a narrow band repeats itself after a period."""
 _LINE_FITS = 5.0
