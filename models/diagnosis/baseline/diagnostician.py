@@ -9,6 +9,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import norm
 
+from models.diagnosis.baseline.excitation import one_source
 from models.diagnosis.baseline.gain import gain_suspicion
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import (
@@ -101,6 +102,7 @@ class BaselineDiagnostician:
         }
         self._names = tuple(own.parameter for row in self._rows for own in row.own)
         self._parameters = parameters_of(rows)
+        self._one_source = {own.parameter: own.one_source for row in rows for own in row.own}
         self._coefficients = np.zeros(self._slices[-1].stop)
         for at, relation in zip(self._slices, baseline.relations, strict=True):
             if relation is not None:
@@ -136,6 +138,9 @@ class BaselineDiagnostician:
                 values = np.append(values, e.value)
                 total = _bordered(total, e.covariance, e.variance)
                 common = _bordered(common, e.common_covariance, e.common_variance)
+        if one_source(window):
+            wider = np.array([self._one_source[name] for name in names[: values.size]])
+            total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
         errors = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
@@ -236,6 +241,12 @@ class BaselineDiagnostician:
         now = rotation_of(window, coordinates)
         if not self._baseline.rotations:
             raise EstimationError("the baseline has no phase reference and no speed found in the vibration")
+        slowest, fastest = (speed * _RPM for speed in window.speed_range)
+        if now is None and fastest > slowest * (1 + SPEED_TOLERANCE):
+            raise EstimationError(
+                f"the speed varies from {slowest:.0f} to {fastest:.0f} rpm within the window, at most "
+                f"{SPEED_TOLERANCE:.0%} is compared"
+            )
         if now is None:
             raise EstimationError("no phase reference, and no speed found in the vibration")
         healthy = min(self._baseline.rotations, key=lambda one: abs(now.speed_rad_s / one.speed_rad_s - 1))

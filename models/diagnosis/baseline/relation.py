@@ -7,12 +7,13 @@ is taken out of the normal equations (k-class estimator, k the smallest root and
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.linalg import eigh
 
 from models.diagnosis.baseline.excitation import lag_beyond_memory
-from models.diagnosis.baseline.flatness import stretching
+from models.diagnosis.baseline.flatness import relation_criterion, stretching
 from models.diagnosis.baseline.lag_moments import LAG_FROM_S, LagMoments, RowWindow, inverse
 from models.diagnosis.baseline.rows import Row
 from models.errors import EstimationError
@@ -89,7 +90,8 @@ class RowChange:
     change : ndarray, shape (n_own,)
         Relative change of the row's own parameters.
     projection : ndarray, shape (n_own, n_moments)
-        From the window's moments to the change.
+        From the window's moments to the change, stretched to what the window objects to (`flatness`), and
+        wider where more is left over than chance leaves.
     sensitivity : ndarray, shape (n_own, n_coefficients)
         Of the change to the relation's coefficients.
     moments : LagMoments
@@ -233,7 +235,7 @@ def learn_row(row: Row, parts: Sequence[LagMoments], *, widened: bool = True) ->
     misfit = chosen.chi2 / chosen.degrees_of_freedom
     stretch = np.sqrt(max(1.0, misfit)) * np.eye(b.size)
     if widened:
-        stretch = stretch @ stretching(parts, b, covariance, prior)
+        stretch = stretch @ stretching(partial(relation_criterion, parts, prior), b, covariance)
     first = parts[0].of
     relation = Relation(
         row=row.name,
@@ -331,13 +333,23 @@ def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
         raise EstimationError(f"{row.title}: the bearing hardly moves in this window")
     projection = covariance @ Z[:, 1:].T @ W
     left = Z[:, 0] - Z[:, 1:] @ d
+
+    def criterion(trial: FloatArray) -> float:
+        force = signatures @ np.concatenate([[1.0], -trial])
+        weight, kept = inverse(moments.covariance(force) * widening + uncertain)
+        rest = Z[:, 0] - Z[:, 1:] @ trial
+        return float(rest @ weight @ rest) - kept
+
+    chi2, freedom = float(left @ W @ left), max(1, rank - d.size)
+    # What is left beyond chance was not expected by any of these errors: it is in the change as well.
+    beyond = chi2 / freedom if chi2 > freedom + _FITS * np.sqrt(2 * freedom) else 1.0
     return RowChange(
         change=d,
-        projection=projection,
+        projection=np.sqrt(beyond) * stretching(criterion, d, covariance) @ projection,
         sensitivity=-projection @ X,
         moments=moments,
         combination=combination,
         widening=widening,
-        chi2=float(left @ W @ left),
-        degrees_of_freedom=max(1, rank - d.size),
+        chi2=chi2,
+        degrees_of_freedom=freedom,
     )

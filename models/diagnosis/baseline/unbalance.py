@@ -121,13 +121,16 @@ class SynchronousState:
 
 
 def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Rotation | None:
-    """Synchronous vectors of a window with their covariance; None without a speed or a coordinate.
+    """Synchronous vectors of a window with their covariance; None without a coordinate or a steady speed.
 
     Where the speed was estimated from the vibration, angles to the shaft are not known.
     """
     orders = [lowest(name, window.states) for name in coordinates]
     measured = _synchronous(window)
     if measured is None or not coordinates or not np.isfinite(window.speed_rad_s):
+        return None
+    slowest, fastest = window.speed_range
+    if fastest - slowest > SPEED_TOLERANCE * window.speed_rad_s:
         return None
     known = [order for order in orders if order is not None]
     if len(known) < len(orders) or window.speed_rad_s == 0:

@@ -20,7 +20,7 @@ from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Workspace
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
-from models.diagnosis.likelihood.unbalance import estimate_unbalance
+from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
@@ -159,9 +159,7 @@ class LikelihoodFit:
         change, spread = ratio - 1, structural * np.outer(ratio, ratio)
         names: tuple[str, ...] = STRUCTURAL
         if window.synchronous is not None:
-            e = estimate_unbalance(
-                self._machine, model, point, structural, window.synchronous, speed, window.duration_s
-            )
+            e = self._unbalance(window, model, point, structural, speed)
             names, change = (*names, "e"), np.append(change, e.change)
             cross = (e.covariance * ratio)[:, None]
             spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
@@ -170,6 +168,18 @@ class LikelihoodFit:
             for name, value, error in zip(names, change, np.sqrt(np.diag(spread)), strict=True)
         )
         return Diagnosis(self.by, readings, covariance=np.asarray(spread, dtype=np.float64))
+
+    def _unbalance(
+        self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
+    ) -> Unbalance:
+        """Change of e; hop by hop where the speed varies."""
+        known = (self._machine, model, point, structural)
+        if window.removed_by_hop and window.hop_synchronous is not None:
+            hop_s = window.duration_s / window.hop_speed_rad_s.size
+            return estimate_unbalance_by_hop(*known, window.hop_synchronous, window.hop_speed_rad_s, hop_s)
+        if window.synchronous is None:
+            raise EstimationError(f"{self._machine.name}: no phase reference")
+        return estimate_unbalance(*known, window.synchronous, speed, window.duration_s)
 
     def _followed_or_searched(
         self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float

@@ -11,7 +11,7 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
-__all__ = ["Unbalance", "estimate_unbalance"]
+__all__ = ["Unbalance", "estimate_unbalance", "estimate_unbalance_by_hop"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +89,50 @@ def estimate_unbalance(
     if not precision > 0:
         raise EstimationError(f"{machine.name}: the spectrum at the speed of rotation is not determined")
     return Unbalance(float(weight @ q2) / precision - 1, 1 / precision, -(weight @ J) / precision @ covariance)
+
+
+def estimate_unbalance_by_hop(
+    machine: Machine,
+    model: SpectralModel,
+    point: ModelPoint,
+    covariance: FloatArray,
+    hop_synchronous: ComplexArray,
+    hop_speed_rad_s: FloatArray,
+    hop_s: float,
+) -> Unbalance:
+    """Estimate e where the speed varies: every hop at its own speed, with its own vector.
+
+    The hops' own errors are independent; that of the structural parameters is one for all.
+
+    Parameters
+    ----------
+    machine, model, point, covariance
+        As for `estimate_unbalance`.
+    hop_synchronous : ndarray of complex, shape (n_hops, n_states)
+    hop_speed_rad_s : ndarray, shape (n_hops,)
+    hop_s : float
+        Length of a hop, s.
+
+    Raises
+    ------
+    EstimationError
+        If a vector says nothing about e.
+    """
+    hops = [
+        estimate_unbalance(machine, model, point, covariance, vectors, float(speed), hop_s)
+        for vectors, speed in zip(hop_synchronous, hop_speed_rad_s, strict=True)
+    ]
+    precision = np.linalg.inv(covariance)
+    shared = np.array([hop.covariance for hop in hops])
+    own = np.array([hop.variance for hop in hops]) - np.einsum("hi,ij,hj->h", shared, precision, shared)
+    weight = 1 / np.maximum(own, np.finfo(float).tiny)
+    weight /= weight.sum()
+    together = weight @ shared
+    return Unbalance(
+        float(weight @ np.array([hop.change for hop in hops])),
+        float(weight**2 @ own + together @ precision @ together),
+        together,
+    )
 
 
 def _around_rotation(
