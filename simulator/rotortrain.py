@@ -364,7 +364,10 @@ def unknown(
     commissionings: Annotated[
         int, typer.Option(min=1, help="How often a machine is commissioned from scratch; they share the windows.")
     ] = 5,
-    healthy: Annotated[int, typer.Option(min=1, help="Healthy windows of a commissioning.")] = 6,
+    healthy: Annotated[int, typer.Option(min=1, help="Healthy windows of each condition of a commissioning.")] = 6,
+    conditions: Annotated[
+        int, typer.Option(min=1, max=10, help="Healthy recordings of a commissioning, each in a condition of its own.")
+    ] = 1,
     seed: SeedOption = _SEED,
     processes: ProcessesOption = _CORES,
     page: Annotated[
@@ -388,6 +391,7 @@ def unknown(
             windows=windows,
             commissionings=commissionings,
             healthy=healthy,
+            conditions=conditions,
             seed=seed,
             processes=processes,
             page=page,

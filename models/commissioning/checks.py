@@ -6,11 +6,9 @@ from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
-from scipy.stats import norm
 
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.lines import foreign_lines
-from models.diagnosis.baseline.consistency import LeftOut
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.isolation import isolate_window
@@ -23,6 +21,7 @@ __all__ = [
     "Check",
     "check_agreement",
     "check_data",
+    "check_determined",
     "check_halves",
     "check_lines",
     "check_recordings",
@@ -166,7 +165,7 @@ def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
     return Check(name=name, verdict="refused" if dominant else "limited", text=text, advice=advice)
 
 
-def check_recordings(consistency: Sequence[LeftOut], speeds_rad_s: Mapping[str, float]) -> Check | None:
+def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, float]) -> Check | None:
     """Whether the recordings tell of one machine, each read against what the others teach; None for a single one.
 
     Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
@@ -174,29 +173,17 @@ def check_recordings(consistency: Sequence[LeftOut], speeds_rad_s: Mapping[str, 
 
     Parameters
     ----------
-    consistency : sequence of LeftOut
+    differences : sequence of str
+        Sentences on recordings that differ from the others.
     speeds_rad_s : mapping of str to float
         Mean speed of each recording.
     """
     name = "recordings agree"
     if len(speeds_rad_s) < 2:
         return None
-    readings = [(abs(a.z), a, one.condition) for one in consistency for a in one.agreements]
-    if not readings:
-        text = "the recordings cannot be compared: none teaches enough without the others"
-        return Check(
-            name=name, verdict="limited", text=text, advice="record at least two full windows of each condition"
-        )
-    worst, agreement, recording = max(readings, key=lambda each: each[0])
-    limit = float(norm.isf(_RATE / (2 * len(readings))))
-    if worst <= limit:
-        return Check(
-            name=name, verdict="passed", text=f"one relation holds in all: at most {worst:.1f} standard errors"
-        )
-    text = (
-        f"{PARAMETER_TEXT[agreement.parameter]} of {recording} differs from the other recordings by "
-        f"{agreement.change:+.1%}, {worst:.1f} standard errors"
-    )
+    if not differences:
+        return Check(name=name, verdict="passed", text=f"one relation holds in all {len(speeds_rad_s)} recordings")
+    text = "; ".join(differences)
     speeds = sorted(speeds_rad_s.values())
     if speeds[-1] <= speeds[0] * (1 + SAME_SPEED) or not np.all(np.isfinite(speeds)):
         return Check(
@@ -212,6 +199,21 @@ def check_recordings(consistency: Sequence[LeftOut], speeds_rad_s: Mapping[str, 
         text=f"{text}; a baseline is kept for each speed, and nothing is said between the speeds",
         advice="record at more speeds between these if the machine runs there",
     )
+
+
+def check_determined(reasons: Sequence[str]) -> Check:
+    """Whether the recordings determine every relation that the sensors allow.
+
+    Parameters
+    ----------
+    reasons : sequence of str
+        Why there is none, with what to record instead.
+    """
+    name = "relations determined"
+    if not reasons:
+        return Check(name=name, verdict="passed", text="the recordings determine every relation these sensors allow")
+    advice = "measure what is missing, or record a second condition: another speed, another load, a louder machine"
+    return Check(name=name, verdict="limited", text="; ".join(dict.fromkeys(reasons)), advice=advice)
 
 
 def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:

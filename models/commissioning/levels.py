@@ -1,19 +1,27 @@
 """What each level of knowledge makes of healthy windows."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
 
-from models.commissioning.checks import SAME_SPEED, Check, check_agreement, check_halves, check_recordings
+from models.commissioning.checks import (
+    SAME_SPEED,
+    Check,
+    check_agreement,
+    check_determined,
+    check_halves,
+    check_recordings,
+)
 from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord
 from models.commissioning.conditions import OperatingRange
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel
+from models.diagnosis.baseline.determination import disagreements, undetermined
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import Baseline, learn_baseline
 from models.diagnosis.baseline.rows import evaluable_rows
@@ -26,7 +34,7 @@ from models.diagnosis.window import WindowStatistics, window_statistics
 from models.errors import EstimationError
 from models.machine import Machine, MachineFile
 
-__all__ = ["LEVELS", "Learned", "Piece", "Progress", "Read", "pieces_of"]
+__all__ = ["LEVELS", "Learned", "Piece", "Progress", "Read", "learned_baseline", "pieces_of"]
 
 Read = tuple[str, int, Diagnosis]
 """Recording, end of the window, and what was read in it."""
@@ -136,7 +144,7 @@ def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> 
         return _without_equations(shape, no_shape)
     groups = [list(pieces)]
     baselines = [_baseline(groups[0])]
-    agreement = check_recordings(baselines[0].consistency, _speeds(pieces))
+    agreement = check_recordings(disagreements(baselines[0]), _speeds(pieces))
     if agreement is not None and agreement.verdict == "limited":
         groups = _by_speed(pieces)
         baselines = [_baseline(group) for group in groups]
@@ -149,8 +157,9 @@ def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> 
             progress("learning the relations", len(read), len(pieces))
         compared += _halves(group)
     halves = check_halves([each for _, _, each in compared])
+    determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
     return Learned(
-        (halves,) if agreement is None else (agreement, halves),
+        (determined_, halves) if agreement is None else (determined_, agreement, halves),
         tuple(read),
         tuple(compared),
         baselines=tuple(
@@ -163,8 +172,32 @@ def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> 
     )
 
 
+def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
+    """What healthy windows teach, without the rows that they do not determine well enough.
+
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        They do not overlap.
+    conditions : sequence of str
+        What each belongs to, for example its recording.
+
+    Raises
+    ------
+    EstimationError
+        If they determine none.
+    """
+    baseline = learn_baseline(windows, conditions)
+    weak = undetermined(baseline)
+    relations = tuple(None if why else one for one, why in zip(baseline.relations, weak, strict=True))
+    reasons = tuple(why or reason for why, reason in zip(weak, baseline.reasons, strict=True))
+    if all(relation is None for relation in relations):
+        raise EstimationError("; ".join(dict.fromkeys(reasons)))
+    return replace(baseline, relations=relations, reasons=reasons)
+
+
 def _baseline(pieces: Sequence[Piece]) -> Baseline:
-    return learn_baseline([piece.window for piece in pieces], [piece.recording for piece in pieces])
+    return learned_baseline([piece.window for piece in pieces], [piece.recording for piece in pieces])
 
 
 def _speeds(pieces: Sequence[Piece]) -> dict[str, float]:

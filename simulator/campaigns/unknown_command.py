@@ -27,6 +27,7 @@ def watch_unknown(
     windows: int,
     commissionings: int,
     healthy: int,
+    conditions: int,
     seed: int,
     processes: int,
     page: Path | None = None,
@@ -49,8 +50,8 @@ def watch_unknown(
     asked = tuple(KnowledgeLevel(name) for name in dict.fromkeys(levels)) or (KnowledgeLevel.NONE,)
     if page is not None and not page.is_file():
         raise MachineFileError(f"--page {page}: no such page")
-    plan = UnknownPlan(chosen, asked, seed, windows, commissionings, healthy)
-    kept = out / f"{seed}-{healthy}-{_RECORDS}"
+    plan = UnknownPlan(chosen, asked, seed, windows, commissionings, healthy, conditions)
+    kept = out / f"{seed}-{healthy}x{conditions}-{_RECORDS}"
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         with labelled_bars(remaining=True) as progress:

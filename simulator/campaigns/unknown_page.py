@@ -20,9 +20,12 @@ _OTHER = 0.01
 
 def unknown_section(summary: UnknownSummary) -> str:
     """Markdown between its two marks."""
+    several = summary.conditions > 1
+    heading = f", commissioned in {summary.conditions} conditions" if several else ""
+    begin, end = (mark.replace("parameters", f"parameters{heading}", 1) for mark in (BEGIN, END))
     lines = [
-        BEGIN,
-        "## Machines without parameters",
+        begin,
+        f"## Machines without parameters{heading}",
         "",
         *paragraph(*_introduction(summary)),
         "",
@@ -32,7 +35,7 @@ def unknown_section(summary: UnknownSummary) -> str:
     for level, name in summary.pairs:
         if level is KnowledgeLevel.NONE:
             lines += _details(summary, name)
-    return "\n".join([*lines, *_command(summary), END]) + "\n"
+    return "\n".join([*lines, *_command(summary), end]) + "\n"
 
 
 def placed(page: str, section: str) -> str:
@@ -59,7 +62,8 @@ def _introduction(summary: UnknownSummary) -> tuple[str, ...]:
         "are another model class than the monitor's own, and the shipped machines with their parameters kept secret.",
         f"Every machine is commissioned {summary.commissionings} times from scratch, each time on",
         f"{summary.healthy_windows} healthy windows of 60 s with one source of random direction, one cutoff (40 to",
-        "160 Hz) and one level. Every window read later has a cutoff at least a quarter off the commissioned one, and",
+        f"160 Hz) and one level{_several(summary)}.",
+        "Every window read later has a cutoff at least a quarter off the (first) commissioned one, and",
         "level, noise and direction of its own; one source and independent sources in turn.",
         "Only the bearing that stiffens with its displacement stays within a tenth of the commissioned level, because",
         "at another one it has another stiffness.",
@@ -69,6 +73,10 @@ def _introduction(summary: UnknownSummary) -> tuple[str, ...]:
         "least of the commissionings stands beside. A stiffness is read relative to all that holds the bearing, a",
         "shaft that is held elsewhere included: *covered* for a changed one counts that as an error.",
     )
+
+
+def _several(summary: UnknownSummary) -> str:
+    return f", and as many of each of {summary.conditions - 1} more such conditions" if summary.conditions > 1 else ""
 
 
 def _machines(summary: UnknownSummary) -> list[str]:
@@ -180,7 +188,8 @@ def _command(summary: UnknownSummary) -> list[str]:
     return [
         "```sh",
         f"rotortrain unknown {machines} --windows {summary.windows} --commissionings {summary.commissionings} "
-        f"--healthy {summary.healthy_windows} --seed {summary.seed} --out unknown --page docs/results.md",
+        f"--healthy {summary.healthy_windows} --conditions {summary.conditions} --seed {summary.seed} "
+        "--out unknown --page docs/results.md",
         "```",
         "",
     ]

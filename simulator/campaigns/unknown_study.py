@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel
+from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import learn_baseline
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis, Diagnostician
 from models.diagnosis.verdict.determined import determined, with_shared_error
@@ -41,6 +41,9 @@ CELLS: tuple[dict[str, float], ...] = (
 )
 """True changes; the first cell is healthy."""
 
+_APART = 1000
+"""Between the numbers of a commissioning's conditions: more than there are commissionings."""
+
 
 @dataclass(frozen=True, slots=True)
 class UnknownPlan:
@@ -57,7 +60,9 @@ class UnknownPlan:
         Of each cell and machine, spread evenly over the commissionings.
     commissionings : int
     healthy : int
-        Windows of a commissioning.
+        Windows of each condition of a commissioning.
+    conditions : int
+        Healthy recordings of a commissioning, each with a source, cutoff and level of its own.
     rate : float
         Declared false alarms per window.
     """
@@ -68,6 +73,7 @@ class UnknownPlan:
     windows: int
     commissionings: int = 5
     healthy: int = 6
+    conditions: int = 1
     rate: float = 0.01
 
     def pairs(self) -> Iterator[tuple[KnowledgeLevel, str]]:
@@ -138,7 +144,12 @@ class _Compared:
         return read if self.shared is None else with_shared_error(read, self.shared)
 
 
-def commissioned(level: KnowledgeLevel, machine: MachineFile, windows: Sequence[WindowStatistics]) -> Diagnostician:
+def commissioned(
+    level: KnowledgeLevel,
+    machine: MachineFile,
+    windows: Sequence[WindowStatistics],
+    conditions: Sequence[str] | None = None,
+) -> Diagnostician:
     """Commission on healthy windows with what the machine file tells; the one place where that is decided.
 
     Raises
@@ -147,7 +158,7 @@ def commissioned(level: KnowledgeLevel, machine: MachineFile, windows: Sequence[
         If the windows do not suffice.
     """
     if level is KnowledgeLevel.NONE:
-        return BaselineDiagnostician(learn_baseline(windows))
+        return BaselineDiagnostician(learned_baseline(windows, conditions or [""] * len(windows)))
     if isinstance(machine, Machine):
         return _Compared(machine, None)
     identified = identify(machine, windows)
@@ -223,14 +234,19 @@ def read_unknown(path: Path) -> Iterator[UnknownRecord]:
 
 @lru_cache(maxsize=2)
 def _commissioned(
-    level: KnowledgeLevel, machine: str, seed: int, commissioning: int, healthy: int
+    level: KnowledgeLevel, machine: str, seed: int, commissioning: int, healthy: int, conditions: int
 ) -> Diagnostician | str:
     subject = subject_named(machine)
     file = subject.file(level)
     if file is None:
         raise AssertionError("the plan leaves such machines out")
     try:
-        return commissioned(level, file, subject.healthy(seed, commissioning, healthy))
+        found = [
+            (window, f"recording {number + 1}")
+            for number in range(conditions)
+            for window in subject.healthy(seed, commissioning + _APART * number, healthy)
+        ]
+        return commissioned(level, file, [window for window, _ in found], [name for _, name in found])
     except EstimationError as error:
         return str(error)
 
@@ -239,7 +255,7 @@ def _read(
     plan: UnknownPlan, level: KnowledgeLevel, machine: str, task: tuple[int, int, tuple[int, ...]]
 ) -> list[UnknownRecord]:
     commissioning, cell, numbers = task
-    diagnostician = _commissioned(level, machine, plan.seed, commissioning, plan.healthy)
+    diagnostician = _commissioned(level, machine, plan.seed, commissioning, plan.healthy, plan.conditions)
     subject = subject_named(machine)
     records = []
     for number in numbers:

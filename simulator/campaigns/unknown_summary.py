@@ -92,6 +92,7 @@ class UnknownSummary(BaseModel):
     windows: int
     commissionings: int
     healthy_windows: int
+    conditions: int = 1
     rate: float
     cells: tuple[CellSummary, ...]
 
@@ -147,6 +148,7 @@ def summarize_unknown(
         windows=plan.windows,
         commissionings=plan.commissionings,
         healthy_windows=plan.healthy,
+        conditions=plan.conditions,
         rate=plan.rate,
         cells=tuple(cells),
     )

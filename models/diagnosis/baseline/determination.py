@@ -80,7 +80,7 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
             z = float(np.mean([each.z for each in readings]))
             if abs(z) > _BEYOND:
                 change = float(np.mean([each.change for each in readings]))
-                where = f"condition {condition}" if condition else "part of the recording"
+                where = condition or "part of the recording"
                 found.append(
                     f"{where}: {PARAMETER_TEXT.get(name, name)} reads {change:+.0%} against what the others teach "
                     f"({abs(z):.0f} standard errors)"
