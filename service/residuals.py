@@ -285,7 +285,7 @@ def _row_readings(deciding: Diagnosis, window: WindowStatistics) -> tuple[Equati
     """The learned rows, each with the readings of its own parameters or why there are none."""
     readings = {reading.name: reading for reading in deciding.parameters}
     found = []
-    for row, lacking in evaluable_rows(window.states, window.synchronous is not None):
+    for row, lacking in evaluable_rows(window.states, bool(np.isfinite(window.speed_rad_s))):
         own = tuple(readings[each.parameter] for each in row.own)
         reasons = dict.fromkeys(reading.reason for reading in own if reading.reason)
         reason = lacking or ("" if any(reading.change is not None for reading in own) else "; ".join(reasons))

@@ -174,7 +174,7 @@ def _report(
             "window_s": machine.window.length_s,
             "false_alarms_per_month": machine.alarms.false_alarms_per_month,
             "checks": tuple(checks),
-            "equations": _equations(machine, learned),
+            "equations": _equations(machine, learned, pieces),
             "parameters": parameters,
             "conditions": None if commissioned is None else commissioned.conditions,
             "notes": learned.notes,
@@ -193,10 +193,11 @@ def _summary(verdict: str, checks: Sequence[Check], evaluable: Sequence[str]) ->
     return read
 
 
-def _equations(machine: MachineFile, learned: Learned) -> tuple[EquationRow, ...]:
+def _equations(machine: MachineFile, learned: Learned, pieces: Sequence[Piece]) -> tuple[EquationRow, ...]:
     """The whole table: what is compared with theory where the rotor is known, and what is learned where it is not."""
     states = machine.descriptor.states
     known = learned.machine is not None
+    has_speed = "theta" in states or any(np.isfinite(piece.window.speed_rad_s) for piece in pieces)
     found = []
     for equation in EQUATIONS:
         lacking = missing(equation, states)
@@ -212,7 +213,7 @@ def _equations(machine: MachineFile, learned: Learned) -> tuple[EquationRow, ...
                 reason=reason,
             )
         )
-    for row, reason in evaluable_rows(states, "theta" in states):
+    for row, reason in evaluable_rows(states, has_speed):
         why = "the rotor is known: theory says more" if known and not reason else reason
         found.append(
             EquationRow(

@@ -138,7 +138,9 @@ def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> 
     except EstimationError as error:
         shape, no_shape = None, str(error)
     evaluable = [
-        row for row, reason in evaluable_rows(windows[0].states, windows[0].synchronous is not None) if not reason
+        row
+        for row, reason in evaluable_rows(windows[0].states, bool(np.isfinite(windows[0].speed_rad_s)))
+        if not reason
     ]
     if not evaluable:
         return _without_equations(shape, no_shape)
