@@ -300,7 +300,7 @@ def _verdict_text(verdict: SequentialVerdict) -> str:
     elif verdict.detected:
         text = "something has changed; too little data yet to say what"
     else:
-        text = "nothing has changed"
+        text = "nothing has changed" if verdict.current else "no parameter could be read"
     if isolation.outside:
         text += "; outside the model: something has changed that no parameter describes, or a sensor is at fault"
     return text

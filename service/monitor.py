@@ -343,7 +343,8 @@ def _calm_state(evaluation: Evaluation, *, outside: bool) -> HealthState:
     """What a machine without raised alarms is: healthy only if something was read that could have said otherwise."""
     if evaluation.deciding.evaluable:
         return HealthState.OUTSIDE_MODEL if outside else HealthState.HEALTHY
-    if evaluation.shapes and not any(shape.changed for shape in evaluation.shapes):
+    states = {shape.state for shape in evaluation.shapes}
+    if "not changed" in states and "changed" not in states:
         return HealthState.UNCHANGED
     return HealthState.NOT_EVALUABLE
 

@@ -45,15 +45,24 @@ def _machine(health: Health) -> str:
         f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span></h2>'
         f"{reason}{verdict}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
         f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>"
-        f"{_table(health, raised)}"
+        f"{_table(health, raised)}{_shapes(health)}"
     )
+
+
+def _shapes(health: Health) -> str:
+    """What is said channel by channel where no equation can be evaluated."""
+    if not health.shapes:
+        return ""
+    items = "".join(f"<li>{html.escape(shape.text)}" for shape in health.shapes)
+    return f"<p>Each channel beside its own healthy form; no part of the machine can be named:</p><ul>{items}</ul>"
 
 
 def _table(health: Health, raised: dict[str, Severity]) -> str:
     """Who reads what of each parameter, and what would have been noticed."""
     verdict = health.verdict
-    if verdict is None or not health.parameters:
+    if verdict is None or not any(one.relative_change is not None for one in health.parameters):
         return ""
+    by = next(one.by for one in health.parameters)
     readings = {parameter.name: parameter for parameter in (() if verdict.settled else verdict.current)}
     limits = {found.name: found for found in health.detectable}
     heads = "".join(f"<th>{html.escape(opinion.by)}" for opinion in health.opinions)
@@ -68,10 +77,11 @@ def _table(health: Health, raised: dict[str, Severity]) -> str:
             f"<tr{marked}><td>{html.escape(stated.text)} ({html.escape(stated.name)}){_reading(parameter, verdict)}"
             f'{others}<td class="number">{least}<td>{alarm}</tr>'
         )
+    beside = "; the others read the whole window beside it" if health.opinions else ""
     since = "" if verdict.settled else " While the window straddles a change, only the data since then are read."
     return (
         f"<table><tr><th>parameter<th>relative change<th>95 % interval{heads}<th>noticed from<th>alarm</tr>{rows}"
-        f'</table><p class="note">Decided on the likelihood; the others read the whole window beside it.{since} '
+        f'</table><p class="note">Decided on the {by}{beside}.{since} '
         "Noticed from: smallest loss and gain that one window shows with 95 % probability.</p>"
     )
 

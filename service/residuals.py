@@ -11,6 +11,7 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
+from scipy.special import ndtr
 
 from models.commissioning.commissioned import Commissioned, IdentifiedRecord
 from models.commissioning.installed import Installed
@@ -23,7 +24,9 @@ from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, EquationReading, ParameterReading
 from models.diagnosis.verdict.agreement import Agreement, agreements
+from models.diagnosis.verdict.calibration import month_thresholds
 from models.diagnosis.verdict.determined import determined, with_shared_error
+from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.window import WindowStatistics
 from models.errors import BundleError, EstimationError
 from models.machine import Machine, MachineFile
@@ -237,6 +240,9 @@ class BaselineEvaluator:
         self._conditions = commissioned.conditions
         self._shape = commissioned.shape
         self._length_s = machine.window.length_s
+        settings = SequentialSettings.for_machine(machine, short=False)
+        per_month = month_thresholds(settings.false_alarms_per_month, settings.hop_s, settings.window_hops, 1)
+        self._shape_rate = 2 * float(ndtr(-per_month.first))
         self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
 
     @property
@@ -267,7 +273,7 @@ class BaselineEvaluator:
             deciding = Diagnosis(
                 _SHAPE, tuple(ParameterReading(name, _SHAPE, reason=_TOO_FEW) for name in PARAMETERS), covariance=_EMPTY
             )
-        shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window)
+        shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
         return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
 
     def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:

@@ -15,6 +15,9 @@ __all__ = ["determined", "with_shared_error"]
 _VAGUE = 0.2
 """A larger standard error of a full window is no longer one: the reading says nothing."""
 
+_NO_PHASE = "no phase reference"
+_NO_ROTOR = "cannot be told without the rotor's own parameters"
+
 _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}
 """Plane in which a bearing parameter acts."""
 
@@ -68,7 +71,7 @@ def _stated(
     """The reading of one parameter, or why these sensors do not determine it."""
     plane = _PLANES.get(name)
     if reading is None:
-        return ParameterReading(name, by, reason="no phase reference")
+        return ParameterReading(name, by, reason=_NO_PHASE if name == "e" else _NO_ROTOR)
     if plane is not None and not any(state.startswith(plane) for state in states):
         return ParameterReading(name, by, reason=f"no displacement or velocity measured in {plane}")
     if reading.change is None or reading.standard_error is None:
