@@ -63,8 +63,9 @@ def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
         by_name = {reading["name"]: reading for reading in report["parameters"]}
         low, high = by_name["k_by"]["interval_95"]
         assert low < high < -0.05
-        for name in ("c_by", "k_bz", "c_bz", "e"):
-            assert abs(by_name[name]["z"]) < 3.5, name
+        assert abs(by_name["k_bz"]["z"]) < 3.5
+        for name in ("c_by", "c_bz", "e"):  # where they are read at all
+            assert abs(by_name[name]["z"] or 0.0) < 3.5, name
     (alarm,) = alarms(folder, "changed")
     assert (alarm["parameter"], alarm["kind"]) == ("k_by", "raised")
     assert alarm["text"] in PAGE
@@ -75,8 +76,8 @@ def test_what_the_commissioning_said_is_on_the_page(folder: Path) -> None:
     assert report["level"] == "none"
     assert report["verdict"] == "limited"
     loss = {one["name"]: one["detectable_loss"] for one in report["parameters"]}
+    assert loss["c_by"] is None
     assert f"{-loss['k_by']:.0%}".replace("%", " %") in PAGE
-    assert loss["c_by"] < -0.5
     assert (folder / "bundle" / "report.html").stat().st_size > 10_000
     assert (folder / "changed.png").stat().st_size > 10_000
     assert len((folder / "changed.csv").read_text(encoding="utf-8").splitlines()) > 10_000

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.lines import foreign_lines
+from models.diagnosis.baseline.excitation import one_source
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.isolation import isolate_window
@@ -26,6 +27,7 @@ __all__ = [
     "check_lines",
     "check_recordings",
     "check_sensors_of",
+    "check_sources",
     "check_steady",
 ]
 
@@ -156,12 +158,13 @@ def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
         "a neighbouring machine, a gear or a supply line drives the rotor besides: the relations are for noise and "
         "unbalance; record while the other machine stands, or let the line fall outside the band"
     )
-    if not any(one.plan.angle_column is not None for one in recordings):
+    unknown_speed = all(one.plan.angle_column is None and one.plan.speed_rad_s is None for one in recordings)
+    if unknown_speed:
         advice = (
             "without a phase reference this may be the rotation itself: give speed_rpm in [operation], or measure the "
             f"shaft angle; if it is not, {advice}"
         )
-    dominant = any(line.share > _DOMINANT_LINE for _, line in loud)
+    dominant = unknown_speed or any(line.share > _DOMINANT_LINE for _, line in loud)
     return Check(name=name, verdict="refused" if dominant else "limited", text=text, advice=advice)
 
 
@@ -198,6 +201,34 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
         verdict="limited",
         text=f"{text}; a baseline is kept for each speed, and nothing is said between the speeds",
         advice="record at more speeds between these if the machine runs there",
+    )
+
+
+def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
+    """Whether the recordings were excited in more than one way, at level none.
+
+    With one source every channel is a filtered copy of every other, and relations that differ by far fit the same
+    recording.
+
+    Parameters
+    ----------
+    windows : mapping of str to sequence of WindowStatistics
+        By recording.
+    """
+    name = "ways of excitation"
+    alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]
+    if len(alone) < len(windows):
+        return Check(name=name, verdict="passed", text="several independent forces move the machine")
+    if len(alone) > 1:
+        text = f"one source moves everything in each of {len(alone)} recordings; together they can tell more"
+        return Check(name=name, verdict="passed", text=text)
+    return Check(
+        name=name,
+        verdict="limited",
+        text="one source moves everything, in the only recording: what else holds the shaft cannot be told "
+        "for certain, and some later readings may be off by more than their intervals say",
+        advice="add a recording of another condition: another speed or load, or a day on which something else shakes "
+        "the machine",
     )
 
 

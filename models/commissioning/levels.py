@@ -15,6 +15,7 @@ from models.commissioning.checks import (
     check_determined,
     check_halves,
     check_recordings,
+    check_sources,
 )
 from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord
 from models.commissioning.conditions import OperatingRange
@@ -130,7 +131,7 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
     return Learned((check,), read, read, identified.machine, record)
 
 
-def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
     try:
         shape = learn_shape(windows)
@@ -155,13 +156,18 @@ def _learn_none(_: MachineFile, pieces: Sequence[Piece], progress: Progress) -> 
     for group, baseline in zip(groups, baselines, strict=True):
         diagnostician = BaselineDiagnostician(baseline)
         for piece in group:
-            read.append((piece.recording, piece.window.end_ns, diagnostician.diagnose(piece.window)))
+            stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window.length_s)
+            read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
         compared += _halves(group)
     halves = check_halves([each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
+    sources = check_sources(
+        {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}
+    )
+    checks = (determined_, sources, halves) if agreement is None else (determined_, sources, agreement, halves)
     return Learned(
-        (determined_, halves) if agreement is None else (determined_, agreement, halves),
+        checks,
         tuple(read),
         tuple(compared),
         baselines=tuple(

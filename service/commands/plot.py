@@ -55,7 +55,7 @@ def plot(
         typer.Option(
             "--machine",
             metavar="FILE[@BUNDLE]",
-            help="Trend, correlation: evaluate with this machine file, and after @ its trained networks. If left out, "
+            help="Trend, correlation: evaluate with this machine file, and after @ its bundle. If left out, "
             "the shipped machine with the recorded site and name; and a trend shows the recorded reports, if any.",
         ),
     ] = None,

@@ -89,7 +89,7 @@ def test_run_says_where_it_is_and_stops_cleanly(tmp_path: Path, number: signal.S
     ) as started:
         url = started.url()
         assert f"Zenoh listening on {address}" in started.output()
-        assert "machine demo/lab, trained networks " in started.output()
+        assert "machine demo/lab, bundle " in started.output()
         assert httpx.get(f"{url}/readyz", trust_env=False).json()["ready"]
         assert started.stop(number) == 0
         lines = [json.loads(line) for line in started.errors().splitlines()]

@@ -17,7 +17,7 @@ from models.commissioning.commission import Commissioning
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.report import CommissioningReport, ParameterSummary
 from models.errors import RecordingError
-from models.machine import MachineFile
+from models.machine import MachineFile, Operation
 from simulator.commission.console import print_report
 from simulator.commission.page import HTML, JSON, write_report
 from simulator.commission.units import channel_text, duration, parameter_value, percent
@@ -106,10 +106,11 @@ def interrupted() -> HealthyRecording:
     return recording(NOTHING, [block for number, block in enumerate(stream(130.0, 62)) if number != 700])
 
 
-def without_reference() -> tuple[MachineFile, HealthyRecording]:
+def without_reference(operation: Operation | None) -> tuple[MachineFile, HealthyRecording]:
     """Displacements alone, no shaft angle."""
     keep = [n for n, state in enumerate(LAB.descriptor.states) if state in ("y1", "z1", "y2", "z2")]
-    machine = NOTHING.model_copy(update={"sensors": tuple(NOTHING.sensors[n] for n in keep)})
+    sensors = tuple(NOTHING.sensors[n] for n in keep)
+    machine = NOTHING.model_copy(update={"sensors": sensors, "operation": operation})
     blocks = [
         replace(block, samples=np.asarray(block.samples[:, keep], dtype=np.float32)) for block in stream(130.0, 63)
     ]
@@ -135,13 +136,13 @@ def case(name: str) -> Case:
     elif name == "gap":
         machine, recordings = NOTHING, (interrupted(),)
     else:
-        machine, one = without_reference()
+        machine, one = without_reference(None if name == "no speed" else Operation(speed_rpm=1320.0))
         recordings = (one,)
     return commissioned(machine, *recordings), recordings, machine
 
 
 LEVELS = ("full", "partial", "none")
-REFUSED = ("too short", "no hop", "second excitation")
+REFUSED = ("too short", "no hop", "second excitation", "no speed")
 CASES = (*LEVELS, *REFUSED, "gap", "no phase reference")
 
 
@@ -307,14 +308,15 @@ def test_pictures(folder: Path) -> None:
     ]
     for name in (*LEVELS, "gap"):
         assert list(pictures(written(folder, name)[0])) == everything
-    for name in ("too short", "second excitation"):
+    for name in ("too short", "second excitation", "no speed"):
         assert list(pictures(written(folder, name)[0])) == everything[2:]
     assert pictures(written(folder, "no hop")[0]) == {}
     spectra = {
         name: pictures(written(folder, name)[0])["Spectra of the recordings"] for name in CASES if name != "no hop"
     }
     assert "Shaded: the band that is used, 3 to 150 Hz. Grey: the rotation at 22.0 Hz" in spectra["none"]
-    assert "speed is not known" in spectra["no phase reference"]
+    assert "speed is not known" in spectra["no speed"]
+    assert "Grey: the rotation at 22.0 Hz" in spectra["no phase reference"]
     assert "A frequency in orange is a steady line" in spectra["second excitation"]
     assert "in orange" not in spectra["none"]
     levels = {name: pictures(written(folder, name)[0])["Speed and level over time"] for name in ("gap", "full", "none")}
@@ -343,7 +345,7 @@ def test_recordings_and_conditions(folder: Path) -> None:
     assert found is not None
     assert [float(edge) for edge in found.groups()] == pytest.approx([1e3 * low, 1e3 * high], rel=6e-3)
     assert "1, 0.1 s missing" in section(written(folder, "gap")[0], "recordings")
-    assert "speed not known: it is not watched" in section(written(folder, "no phase reference")[0], "recordings")
+    assert "speed 1320 rpm" in section(written(folder, "no phase reference")[0], "recordings")
 
 
 def test_a_page_says_what_it_replaces(tmp_path: Path) -> None:

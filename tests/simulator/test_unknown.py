@@ -185,7 +185,16 @@ def test_the_command_writes_numbers_section_and_page(tmp_path: Path) -> None:
     page = tmp_path / "results.md"
     page.write_text("# Measured results\n", encoding="utf-8")
     watch_unknown(
-        ["overhung"], [], tmp_path / "out", windows=1, commissionings=1, healthy=3, conditions=1, seed=9, processes=1, page=page
+        ["overhung"],
+        [],
+        tmp_path / "out",
+        windows=1,
+        commissionings=1,
+        healthy=3,
+        conditions=1,
+        seed=9,
+        processes=1,
+        page=page,
     )
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"9-3x1-records.jsonl", "unknown.json", "unknown.md"}
     text = page.read_text(encoding="utf-8")

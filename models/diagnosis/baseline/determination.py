@@ -12,7 +12,7 @@ from models.physics.parameters import PARAMETER_TEXT
 __all__ = ["disagreements", "undetermined"]
 
 _FAR = 3.0  # spreads from what is expected
-_VAGUE = 0.2  # relative standard error beyond which a coefficient is not known
+_VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
 _BEYOND = 4.0  # standard errors between conditions
 _RECORD = "record a second condition: another speed, another load, or more broadband excitation at the bearing"
 
