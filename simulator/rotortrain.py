@@ -22,6 +22,7 @@ app = typer.Typer(
 
 _SEED = 20260101
 _CORES = os.cpu_count() or 1
+_WINDOWS, _DRAWS = 160, 150_000
 MachineOption = Annotated[
     str, typer.Option("--machine", "-m", help='Machine file (TOML), or a shipped machine: "lab", "heavy".')
 ]
@@ -30,6 +31,10 @@ BundleOption = Annotated[
     typer.Option("--bundle", "-b", help="Bundle directory or shipped bundle; the machine's name if left out."),
 ]
 ProcessesOption = Annotated[int, typer.Option(min=1, help="Worker processes.")]
+WindowsOption = Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")]
+DrawsOption = Annotated[
+    int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
+]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
 
 
@@ -37,10 +42,8 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers
 def train(
     machine: MachineOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle to write.")],
-    windows: Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")] = 160,
-    draws: Annotated[
-        int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
-    ] = 150_000,
+    windows: WindowsOption = _WINDOWS,
+    draws: DrawsOption = _DRAWS,
     seed: SeedOption = _SEED,
     processes: ProcessesOption = _CORES,
 ) -> None:
@@ -295,10 +298,16 @@ def commission(
             "--healthy",
             exists=True,
             dir_okay=False,
-            help="Recording of the healthy machine; may be given several times.",
+            help="Recording of the healthy machine; may be repeated, or followed by more.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", "-o", help="Directory of the bundle and the report.")],
+    more: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[REC]...", exists=True, dir_okay=False, help="Further healthy recordings: --healthy A.mcap B.mcap."
+        ),
+    ] = None,
     first: Annotated[
         float | None, typer.Option(min=1.0, metavar="SECONDS", help="Use only the first seconds of every recording.")
     ] = None,
@@ -310,10 +319,8 @@ def commission(
     networks: Annotated[
         bool, typer.Option(help="Train the networks, too, where the parameters are known (some ten minutes).")
     ] = True,
-    windows: Annotated[int, typer.Option(min=20, help="Simulated training windows per relation network.")] = 160,
-    draws: Annotated[
-        int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
-    ] = 150_000,
+    windows: WindowsOption = _WINDOWS,
+    draws: DrawsOption = _DRAWS,
     seed: SeedOption = _SEED,
     processes: ProcessesOption = _CORES,
 ) -> None:
@@ -332,7 +339,7 @@ def commission(
 
         made = commission_machine(
             machine,
-            healthy,
+            [*healthy, *(more or ())],
             out,
             first_s=first,
             wished=wish,

@@ -63,11 +63,6 @@ def watch_unknown(
         (out / _NUMBERS).write_text(summary.model_dump_json(indent=1) + "\n", encoding="utf-8")
         (out / _SECTION).write_text(section, encoding="utf-8")
     typer.echo(section)
-    known = [level.value for level in KnowledgeLevel]
-    for name in levels:
-        if name not in known:
-            raise MachineFileError(f"--level {name}: not among {', '.join(known)}")
-    asked = tuple(KnowledgeLevel(name) for name in dict.fromkeys(levels)) or (KnowledgeLevel.NONE,)
     if page is not None:
         with writing(page):
             page.write_text(placed(page.read_text(encoding="utf-8"), section), encoding="utf-8")

@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reason(folder: Path) -> None:
-    arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "--healthy", "friday.mcap", "--out", "kit")
+    arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "friday.mcap", "--out", "kit")
     found = run(folder, *arguments)
     assert found.returncode == 0, found.stderr
     assert "bundle: kit" in found.stdout
