@@ -35,7 +35,7 @@ from models.physics.parameters import PARAMETERS
 __all__ = ["Evaluation", "Opinion", "WindowEvaluator", "evaluator_for"]
 
 _SHAPE = "shape"
-_TOO_FEW = "too few sensors for any equation of this machine; see what is said of each channel"
+_NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))
 _STEADY = 0.15
 """Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
@@ -270,9 +270,8 @@ class BaselineEvaluator:
         if self._baselines:
             deciding = determined(self._baseline_for(window).diagnose(window), window, self._length_s)
         else:
-            deciding = Diagnosis(
-                _SHAPE, tuple(ParameterReading(name, _SHAPE, reason=_TOO_FEW) for name in PARAMETERS), covariance=_EMPTY
-            )
+            nothing = tuple(ParameterReading(name, _SHAPE, reason=_NO_EQUATION) for name in PARAMETERS)
+            deciding = Diagnosis(_SHAPE, nothing, covariance=_EMPTY)
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
         return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
 

@@ -232,19 +232,25 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     )
 
 
-def check_determined(reasons: Sequence[str]) -> Check:
+def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Check:
     """Whether the recordings determine every relation that the sensors allow.
 
     Parameters
     ----------
     reasons : sequence of str
         Why there is none, with what to record instead.
+    only_shapes : bool
+        There is none at all, and each channel is only compared with its own healthy form.
     """
     name = "relations determined"
     if not reasons:
         return Check(name=name, verdict="passed", text="the recordings determine every relation these sensors allow")
     advice = "measure what is missing, or record a second condition: another speed, another load, a louder machine"
-    return Check(name=name, verdict="limited", text="; ".join(dict.fromkeys(reasons)), advice=advice)
+    text = "; ".join(dict.fromkeys(reasons))
+    if only_shapes:
+        text += "; each channel will only be called changed or not changed, and no part of the machine will be named"
+        advice += "; a machine that is more than one bearing and one disc may stay beyond these relations"
+    return Check(name=name, verdict="limited", text=text, advice=advice)
 
 
 def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:

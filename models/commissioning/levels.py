@@ -145,6 +145,22 @@ def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
     ]
     if not evaluable:
         return _without_equations(shape, no_shape)
+    try:
+        return replace(_with_relations(machine, pieces, progress), shape=shape)
+    except EstimationError as error:
+        if shape is None:
+            raise
+        return Learned((check_determined([str(error)], only_shapes=True),), shape=shape)
+
+
+def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
+    """Learn the relations, in one baseline or in one for each speed.
+
+    Raises
+    ------
+    EstimationError
+        If there is none that the pieces determine.
+    """
     groups = [list(pieces)]
     baselines = [_baseline(groups[0])]
     agreement = check_recordings(disagreements(baselines[0]), _speeds(pieces))
@@ -176,7 +192,6 @@ def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
             )
             for group, baseline in zip(groups, baselines, strict=True)
         ),
-        shape=shape,
     )
 
 
