@@ -1,0 +1,76 @@
+"""Several healthy recordings: one baseline where they agree, one for each speed where the bearing depends on it."""
+
+from models.commissioning.commission import Commissioning
+from models.commissioning.installed import Installed
+from models.diagnosis.readings import ParameterReading
+from service.residuals import Evaluation, evaluator_for
+from simulator.scenario import Event
+from tests.commissioning.material import LAB, NOTHING, commissioned, recording, stream
+
+SLOW = LAB.operation.speed_rpm
+FAST = 1.15 * SLOW
+LENGTH_S = 190.0
+
+
+def made_of(*conditions: tuple[str, int, tuple[Event, ...]]) -> Commissioning:
+    """Commission on recordings: name, seed, and what makes them differ."""
+    recordings = [recording(NOTHING, stream(LENGTH_S, seed, *events), name) for name, seed, events in conditions]
+    return commissioned(NOTHING, *recordings)
+
+
+def at(speed_rpm: float) -> Event:
+    return Event(at_s=0.0, speed_rpm=speed_rpm)
+
+
+def evaluated(made: Commissioning, seed: int, *events: Event) -> Evaluation:
+    """A later window as the monitor evaluates it."""
+    (window,) = recording(NOTHING, stream(66.0, seed, *events)).windows()
+    return evaluator_for(Installed(NOTHING, None, made.commissioned)).evaluate(window, {})
+
+
+def reading(found: Evaluation, name: str) -> ParameterReading:
+    return next(one for one in found.deciding.parameters if one.name == name)
+
+
+def verdict_of(made: Commissioning) -> tuple[str, str]:
+    return next((one.verdict, one.text) for one in made.report.checks if one.name == "recordings agree")
+
+
+def test_two_speeds_of_one_machine_make_one_baseline() -> None:
+    made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST),)))
+    assert verdict_of(made)[0] == "passed"
+    assert made.commissioned is not None
+    (baseline,) = made.commissioned.baselines
+    assert baseline.conditions.speed_rpm is not None
+    low, high = baseline.conditions.speed_rpm
+    assert abs(low / SLOW - 1) < 0.001
+    assert abs(high / FAST - 1) < 0.001
+    between = evaluated(made, 93, at((SLOW + FAST) / 2))
+    assert all(abs(reading(between, name).z or 99.0) < 4 for name in ("k_by", "c_by", "k_bz", "c_bz"))
+    assert "the baseline was learned at" in reading(between, "e").reason
+    assert abs(reading(evaluated(made, 94, at(FAST)), "e").z or 99.0) < 4
+
+
+def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
+    stiffer = Event(at_s=0.0, parameter="k_by", relative_change=0.3)
+    made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST), stiffer)))
+    verdict, text = verdict_of(made)
+    assert verdict == "limited"
+    assert "bearing stiffness, horizontal" in text
+    assert "a baseline is kept for each speed" in text
+    assert made.commissioned is not None
+    assert len(made.commissioned.baselines) == 2
+    assert abs(reading(evaluated(made, 94, at(FAST), stiffer), "k_by").z or 99.0) < 4
+    assert abs(reading(evaluated(made, 95, at(SLOW)), "k_by").z or 99.0) < 4
+    lost = reading(evaluated(made, 96, at(FAST)), "k_by")  # the stiffness of the slow machine, at the high speed
+    assert lost.change is not None
+    assert abs(lost.change - (1 / 1.3 - 1)) < 0.05
+
+
+def test_recordings_that_differ_at_one_speed_are_refused() -> None:
+    softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
+    made = made_of(("monday.mcap", 91, ()), ("friday.mcap", 92, (softer,)))
+    assert made.commissioned is None
+    verdict, text = verdict_of(made)
+    assert verdict == "refused"
+    assert "at one speed" in text
