@@ -134,7 +134,7 @@ def parameter_summaries(
                 for reading in diagnosis.parameters
                 if reading.name == name and reading.reason
             )
-            reason = "; ".join(reasons) or "cannot be read without the machine's parameters"
+            reason = "; ".join(reasons) or "cannot be told without the rotor's own parameters"
             found.append(ParameterSummary(name=name, text=PARAMETER_TEXT[name], evaluable=False, reason=reason))
             continue
         own, shared = (float(np.median(part)) for part in zip(*known, strict=True))

@@ -259,7 +259,7 @@ def test_what_a_reader_is_told_at_each_level(folder: Path) -> None:
     assert k_by.identified == pytest.approx(5e4, rel=0.02)
     assert re.search(r"horizontal k_by (49|50|51)\.\d kN/m", partial)
     assert "identified" not in none
-    assert "EI not readable: cannot be read without the machine's parameters" in none
+    assert "EI not readable: cannot be told without the rotor's own parameters" in none
 
 
 @pytest.mark.parametrize("name", REFUSED)
