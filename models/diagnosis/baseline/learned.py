@@ -204,7 +204,8 @@ def positive(covariance: FloatArray) -> FloatArray:
     """The same covariance without negative eigenvalues (of correlations just beyond one)."""
     if covariance.size == 0:
         return covariance
-    scale = np.sqrt(np.maximum(np.diag(covariance), np.finfo(float).tiny))
+    variances = np.diag(covariance)
+    scale = np.sqrt(np.where(variances > np.finfo(float).tiny, variances, 1.0))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     if values[0] > 1e-9:
         return covariance
