@@ -198,6 +198,20 @@ class MachineFile(BaseModel):
     ingest: IngestSettings = IngestSettings()
     alarms: AlarmSettings = AlarmSettings()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _lag_step_of_the_rate(cls, fields: object) -> object:
+        """A lag spacing that is not given is the whole number of samples nearest to a millisecond."""
+        if not isinstance(fields, dict) or not isinstance(fields.get("window", {}), dict):
+            return fields
+        window, rate_hz = fields.get("window", {}), fields.get("rate_hz")
+        if "lag_step_s" in window or not isinstance(rate_hz, int | float) or not 0 < rate_hz <= 1e6:
+            return fields
+        usual = WindowSettings.model_fields["lag_step_s"].default
+        if _whole(usual * rate_hz):
+            return fields
+        return fields | {"window": window | {"lag_step_s": max(1, round(usual * rate_hz)) / rate_hz}}
+
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         try:

@@ -26,6 +26,7 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError, WireError
 from models.ingest import Gate, Reason, Verdict
 from models.signals.block import SampleBlock
+from models.signals.channels import with_channel_names
 from models.signals.wire import decode_block
 from service.alarms import MODEL, SENSOR, SHAPE, Alarm, AlarmBook, AlarmEvent, Severity
 from service.residuals import Evaluation, Opinion, evaluator_for
@@ -277,6 +278,7 @@ class MachineMonitor:
             )
             self._latest = report
             return report, events
+        evaluation = self._named(evaluation)
         looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
         whole = self._test.settings.window_hops
         looks[whole] = _stretch(evaluation.deciding, statistics)
@@ -306,6 +308,18 @@ class MachineMonitor:
         )
         self._latest = report
         return report, events
+
+    def _named(self, evaluation: Evaluation) -> Evaluation:
+        """The same with sentences in the names of this machine's channels."""
+        channels = self.machine.sensors
+        suspect = with_channel_names(evaluation.deciding.suspect, channels)
+        return replace(
+            evaluation,
+            deciding=replace(evaluation.deciding, suspect=suspect),
+            shapes=tuple(
+                replace(one, sentence=with_channel_names(one.sentence, channels)) for one in evaluation.shapes
+            ),
+        )
 
     def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> tuple[AlarmEvent, ...]:
         """Bring what was found to the alarms; without clean data they stay where they are."""

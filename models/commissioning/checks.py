@@ -39,6 +39,8 @@ _STEADY_LEVEL = 2.0
 """Ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute."""
 SAME_SPEED = 0.03
 """Relative difference within which speeds count as one."""
+_MOST_OUTSIDE = 0.8
+"""Share of healthy windows outside a theory beyond which it is not the machine's."""
 _RATE = 1e-3
 """Probability that a healthy machine fails a comparison of its own windows."""
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5
@@ -78,7 +80,8 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     advice = f"record at least {wanted_s:g} s without interruption, in one or several files"
     if hops < _FEWEST_HOPS:
         return Check(name=name, verdict="refused", text=f"too short: {found}", advice=advice)
-    share = missing_s / (used_s + missing_s)
+    span_s = sum((one.hops[-1].end_ns - one.hops[0].start_ns) / 1e9 for one in recordings if one.hops)
+    share = missing_s / span_s
     if share > _TOO_MUCH_REFUSED:
         advice = f"find out why {share:.0%} of the data are missing, and {advice}"
         return Check(name=name, verdict="refused", text=f"too many gaps: {found}", advice=advice)
@@ -96,13 +99,19 @@ def check_sensors_of(findings: Mapping[str, Sequence[SensorFinding]]) -> Check:
         By recording.
     """
     name = "sensors"
-    faults = [f"{recording}: {finding.text}" for recording, found in findings.items() for finding in found]
+    faults: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
+    for recording, found in findings.items():
+        for finding in found:
+            faults.setdefault((recording, finding.kind, finding.states), []).append(finding.text)
     if not faults:
         return Check(name=name, verdict="passed", text="no sensor stuck, clipped, swapped, delayed or in contradiction")
     return Check(
         name=name,
         verdict="refused",
-        text="; ".join(dict.fromkeys(faults)),
+        text="; ".join(
+            f"{recording}: {texts[0]}" + (f" (in {len(texts)} windows)" if len(texts) > 1 else "")
+            for (recording, _, _), texts in faults.items()
+        ),
         advice="repair, re-range or rewire what is named, and record again: a fault must not become the healthy state",
     )
 
@@ -273,10 +282,10 @@ def check_agreement(diagnoses: Sequence[Diagnosis], what: str) -> Check:
     what : str
         In words: "the parameters in the machine file".
     """
-    return _compared(f"agrees with {what}", diagnoses, f"between the healthy data and {what}")
+    return _compared(f"agrees with {what}", diagnoses, f"between the healthy data and {what}", theory=True)
 
 
-def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str) -> Check:
+def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory: bool = False) -> Check:
     readable = [each for each in diagnoses if each.evaluable]
     if not readable:
         reasons = dict.fromkeys(reading.reason for each in diagnoses for reading in each.parameters if reading.reason)
@@ -305,7 +314,7 @@ def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str) -> Check:
     if 2 * outside > len(readable):
         return Check(
             name=name,
-            verdict="limited",
+            verdict="refused" if theory and outside > _MOST_OUTSIDE * len(readable) else "limited",
             text=f"{outside} of {len(readable)} windows lie further apart than chance explains, {between}",
             advice="give fewer parameters in [rotor], so that more is learned from the recordings",
         )

@@ -26,7 +26,7 @@ from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.fallback.shape import HealthyShape
 from models.diagnosis.sensors.reference import SensorReference
 from models.errors import BundleError
-from models.machine import Machine, MachineFile
+from models.machine import Machine, MachineFile, validation_text
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
@@ -163,7 +163,7 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     except OSError as error:
         raise BundleError(f"{path}: not a commissioned bundle: {error.strerror}") from error
     except ValidationError as error:
-        raise BundleError(f"{path}: {error}") from error
+        raise BundleError(f"damaged, or of another version: {validation_text(path, error)}") from error
     if (found.site, found.machine) != (machine.site, machine.name):
         raise BundleError(
             f"{path}: commissioned for {found.site}/{found.machine}, not for {machine.site}/{machine.name}"

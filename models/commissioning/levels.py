@@ -24,7 +24,7 @@ from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.baseline.determination import disagreements, undetermined
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import Baseline, learn_baseline
+from models.diagnosis.baseline.learned import Baseline, learn_baseline, unsuitable
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.fallback.shape import HealthyShape, learn_shape
@@ -133,6 +133,10 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
 
 def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
+    wrong = unsuitable(windows[0])
+    if wrong:
+        advice = "change lag_step_s, lag_to_s or length_s in [window] of the machine file; the recordings can stay"
+        return Learned((Check(name="window settings", verdict="refused", text=wrong, advice=advice),))
     try:
         shape = learn_shape(windows)
         no_shape = ""

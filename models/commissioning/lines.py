@@ -56,7 +56,7 @@ def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
     states = recording.plan.states
     power = np.abs(segments[:, :, : len(states)]) ** 2
     mean = power.mean(axis=0)
-    steadiness = (power**2).mean(axis=0) / np.maximum(mean, np.finfo(float).tiny) ** 2
+    steadiness = (power**2).mean(axis=0) / np.maximum(mean**2, np.finfo(float).tiny)
     frequencies_hz = recording.plan.frequencies_hz
     step_hz = float(frequencies_hz[1] - frequencies_hz[0])
     size = max(5, 2 * round(_NEIGHBOURHOOD_HZ / step_hz / 2) + 1)

@@ -2,12 +2,22 @@
 
 import hashlib
 import json
+import re
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["ACCELERATIONS", "UNIT_TO_SI", "Channel", "ChannelDescriptor", "Quantity", "state_name"]
+__all__ = [
+    "ACCELERATIONS",
+    "UNIT_TO_SI",
+    "Channel",
+    "ChannelDescriptor",
+    "Quantity",
+    "state_name",
+    "with_channel_names",
+]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
@@ -100,6 +110,9 @@ class Channel(BaseModel):
         return UNIT_TO_SI[self.quantity][self.unit]
 
 
+_STATE = re.compile(r"(?<![\w-])(?:[yz][12](?:_d?dot)?|(?:psi|phi)(?:_dot)?|theta)(?![\w-])")
+
+
 def state_name(channel: Channel) -> str:
     """Name of the state variable that a channel measures (``y1`` … ``phi_dot``, ``theta``).
 
@@ -109,6 +122,19 @@ def state_name(channel: Channel) -> str:
     'y1_dot'
     """
     return _STATE_NAMES[channel.quantity, channel.location, channel.direction]
+
+
+def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
+    """A sentence about states (``y1``, ``z2_dot``) in the names that the machine's channels have.
+
+    Examples
+    --------
+    >>> probe = Channel(name="XE-1", quantity="displacement", location="bearing", direction="y", unit="um")
+    >>> with_channel_names("gain of y1 or y1_dot", (probe,))
+    'gain of XE-1 or y1_dot'
+    """
+    names = {state_name(channel): channel.name for channel in channels}
+    return _STATE.sub(lambda found: names.get(found[0], found[0]), text)
 
 
 class ChannelDescriptor(BaseModel):

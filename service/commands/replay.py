@@ -217,8 +217,7 @@ def summary_lines(summary: "OfflineSummary") -> list[str]:
     """What an offline replay found, for people."""
     refused = ", ".join(f"{count} {reason}" for reason, count in summary.refused_blocks.items())
     lines = [
-        f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, "
-        f"bundle {summary.bundle or 'none'}",
+        f"{summary.site}/{summary.machine}, machine file {summary.machine_hash}, bundle {summary.bundle or 'none'}",
         f"{summary.windows} windows, {summary.alarms} alarm events, raised at the end: "
         f"{', '.join(summary.raised) or 'none'}",
         f"{summary.data_s:.1f} s of data in {summary.elapsed_s:.1f} s: {summary.times_real_time:.0f} times real time",

@@ -108,8 +108,8 @@ def draw_plot(request: PlotRequest) -> None:
         machine, bundle = installed.known, installed.bundle
         if machine is None or bundle is None:
             raise MachineFileError(
-                "correlations are compared with what trained networks predict, and none were named: "
-                "--machine FILE@BUNDLE"
+                "correlations are compared with what trained networks predict: name a bundle that has networks, as "
+                "--machine FILE@BUNDLE (one that was commissioned without the rotor's parameters has none)"
             )
         found = correlations_of(latest_window(source, keys, machine, from_ns, to_ns), machine, bundle)
         networks = bundle.identity

@@ -149,3 +149,20 @@ def test_sensors_that_allow_no_equation_are_limited_to_changed_or_not() -> None:
     assert not any(row.used for row in made.report.equations)
     short = made_of(blocks[:1000], machine)
     assert refused(short)
+
+
+def test_a_window_that_no_relation_can_be_read_in_is_a_matter_of_the_machine_file() -> None:
+    window = NOTHING.window.model_copy(update={"lag_step_s": 0.0025})
+    made = made_of(stream(HEALTHY_S, 52), NOTHING.model_copy(update={"window": window}))
+    assert refused(made)
+    _, text, advice = verdict_of(made, "window settings")
+    assert "lags are 2.5 ms apart" in text
+    assert "change lag_step_s" in advice
+
+
+def test_the_usual_lag_spacing_fits_every_rate() -> None:
+    fields = NOTHING.model_dump(exclude={"window"}) | {"rate_hz": 2560.0}
+    machine = MachineFile.model_validate(fields)
+    assert machine.window.lag_step_s == 3 / 2560
+    assert MachineFile.model_validate(machine.model_dump()).window == machine.window
+    assert MachineFile.model_validate(fields | {"rate_hz": 4000.0}).window.lag_step_s == 0.001

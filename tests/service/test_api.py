@@ -125,7 +125,7 @@ def test_alarms_and_their_events(client: httpx.Client) -> None:
     (active,) = get(client, f"{PLACE}/alarms", AlarmStates).alarms
     assert (active.parameter, active.state, active.severity, active.occurrence) == ("k_by", "active", "alert", 1)
     everything = get(client, f"{PLACE}/alarms?all=true", AlarmStates).alarms
-    assert {alarm.parameter for alarm in everything} == {*PARAMETERS, "model"}
+    assert {alarm.parameter for alarm in everything} == {*PARAMETERS, "model", "sensor"}
     assert [alarm.parameter for alarm in everything if alarm.state != "normal"] == ["k_by"]
     (event,) = get(client, f"{PLACE}/alarms/events", AlarmEventList).events
     assert event.type == "org.rotorwatch.alarm.raised"

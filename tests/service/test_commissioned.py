@@ -149,3 +149,23 @@ def test_a_machine_that_is_neither_known_nor_commissioned_is_refused() -> None:
     unknown: MachineFile = NOTHING
     with pytest.raises(BundleError, match="neither known nor commissioned"):
         MachineMonitor(Installed(unknown))
+
+
+def test_a_swap_that_no_pair_of_sensors_shows_is_not_called_healthy() -> None:
+    displacements = [n for n, channel in enumerate(MACHINE.sensors) if channel.quantity != "velocity"]
+    machine = MACHINE.model_copy(update={"sensors": tuple(MACHINE.sensors[n] for n in displacements)})
+
+    def seen(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
+        return [replace(block, samples=block.samples[:, displacements]) for block in blocks]
+
+    made = commissioned(machine, recording(machine, seen(stream(HEALTHY_S, SEED))))
+    assert made.commissioned is not None
+    names = [channel.name for channel in machine.sensors]
+    blocks = seen(stream(75.0, SEED + 6))
+    samples = samples_of(blocks)
+    bearing, disc = names.index("y1"), names.index("y2")
+    samples[:, [bearing, disc]] = samples[:, [disc, bearing]]
+    windows, events = feed(with_samples(blocks, samples), Installed(machine, None, made.commissioned))
+    assert HealthState.HEALTHY not in {window.state for window in full(windows)}
+    assert "model" in {event.alarm.parameter for event in events}
+    assert all(event.alarm.low_confidence for event in events if event.alarm.parameter != "model")

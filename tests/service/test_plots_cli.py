@@ -92,7 +92,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffi
         (("--kind", "trend", "--at", "5"), "--at makes sense only with --kind correlation or orbit or spectrum"),
         (("--kind", "trend", "--to", "30"), "no parameter was read in this stretch of time"),
         (("--kind", "correlation", "--at", "30"), "a window is 60 s, usable data are 30 s"),
-        (("--kind", "correlation", "--machine", "lab"), "none were named: --machine FILE@BUNDLE"),
+        (("--kind", "correlation", "--machine", "lab"), "name a bundle that has networks, as --machine FILE@BUNDLE"),
         (("--kind", "correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),
         (("--kind", "orbit", "--from", "20", "--at", "20"), "--at 20: nothing was recorded before that"),
         (("--kind", "orbit", "--from", "500"), "nothing was recorded in between"),

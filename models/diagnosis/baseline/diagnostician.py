@@ -42,6 +42,11 @@ BASELINE_PARAMETERS = parameters_of(ROWS)
 
 _WORST_ERROR = 0.2
 _RPM = 30 / math.pi
+_GONE = -0.95
+"""A loss beyond this is no loss of a bearing."""
+_LOST = 0.5
+"""Standard error of a stiffness beyond which the relation does not hold in the window at all."""
+_SURELY_OUTSIDE = 8.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +162,9 @@ class BaselineDiagnostician:
             common=positive(common[np.ix_(known, known)]) if known else None,
             misfit_z=_misfit(changes),
         )
+        impossible = _impossible(diagnosis)
+        if impossible:
+            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
         suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
         if suspicion is None:
             return diagnosis
@@ -257,6 +265,17 @@ class BaselineDiagnostician:
         if healthy.absolute and now.absolute:
             return healthy, now
         return healthy.turned(healthy.largest), now.turned(healthy.largest)
+
+
+def _impossible(diagnosis: Diagnosis) -> str:
+    """What no bearing does: a stiffness or damping that is gone or has changed its sign, or cannot be told at all."""
+    for reading in diagnosis.evaluable:
+        if reading.name == "e" or reading.change is None or reading.standard_error is None:
+            continue
+        gone = reading.change + 2 * reading.standard_error < _GONE
+        if gone or (reading.name.startswith("k") and reading.standard_error > _LOST):
+            return f"a sensor of this plane that is swapped, reversed or late ({reading.name} makes no sense)"
+    return ""
 
 
 def _bordered(matrix: FloatArray, border: FloatArray, corner: float) -> FloatArray:
