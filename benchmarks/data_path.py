@@ -14,10 +14,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from models.commissioning.installed import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for
 from models.diagnosis.networks.amortised import NetworkDiagnostician
-from models.commissioning.installed import Installed
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
