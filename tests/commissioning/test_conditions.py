@@ -5,7 +5,7 @@ from models.commissioning.installed import Installed
 from models.diagnosis.readings import ParameterReading
 from service.residuals import Evaluation, evaluator_for
 from simulator.scenario import Event
-from tests.commissioning.material import LAB, NOTHING, commissioned, recording, stream
+from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream
 
 SLOW = LAB.operation.speed_rpm
 FAST = 1.15 * SLOW

@@ -14,7 +14,7 @@ from models.errors import BundleError
 from models.machine import MachineFile
 from models.physics.parameters import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
-from tests.commissioning.material import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
+from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
 
 HEALTHY_S = 189.0
 

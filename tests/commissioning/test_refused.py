@@ -9,7 +9,7 @@ from models.commissioning.commission import Commissioning
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from simulator.scenario import Event
-from tests.commissioning.material import (
+from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
     commissioned,

@@ -9,7 +9,7 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
-from tests.commissioning.material import LAB, recording, samples_of, stream, with_samples
+from tests.commissioning.rotor_kit import LAB, recording, samples_of, stream, with_samples
 
 SEED = 63
 

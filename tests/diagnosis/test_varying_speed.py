@@ -6,7 +6,7 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from simulator.scenario import Event
-from tests.commissioning.material import LAB, recording, stream
+from tests.commissioning.rotor_kit import LAB, recording, stream
 
 SEED = 900
 

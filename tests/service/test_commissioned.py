@@ -15,7 +15,7 @@ from service.alarms import AlarmEvent
 from service.conversion import Identity, report
 from service.monitor import HealthState, MachineMonitor, WindowReport
 from simulator.scenario import Event
-from tests.commissioning.material import (
+from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
     commissioned,

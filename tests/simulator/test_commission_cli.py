@@ -12,7 +12,7 @@ import pytest
 from models.commissioning.commissioned import load_commissioned
 from models.machine import load_machine_file
 from simulator.recorder import record
-from tests.commissioning.material import LAB, stream
+from tests.commissioning.rotor_kit import LAB, stream
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = (ROOT / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")

@@ -22,7 +22,7 @@ from simulator.commission.console import print_report
 from simulator.commission.page import HTML, JSON, write_report
 from simulator.commission.units import channel_text, duration, parameter_value, percent
 from simulator.commission.verdict import budget_sentences, dominant, headline, next_steps, smallest_change
-from tests.commissioning.material import (
+from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,
     PARTIAL,
