@@ -24,8 +24,10 @@ from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.baseline.determination import disagreements, undetermined
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import Baseline, learn_baseline, unsuitable
-from models.diagnosis.baseline.rows import evaluable_rows
+from models.diagnosis.baseline.kernels import passband_hz
+from models.diagnosis.baseline.kinematics import formation_of
+from models.diagnosis.baseline.learned import Baseline, learn_baseline, learned_rows, unsuitable
+from models.diagnosis.baseline.rows import ROWS, evaluable_rows
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.fallback.shape import HealthyShape, learn_shape
 from models.diagnosis.likelihood.fit import LikelihoodFit
@@ -34,6 +36,7 @@ from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics, window_statistics
 from models.errors import EstimationError
 from models.machine import Machine, MachineFile
+from models.signals.channels import ACCELERATIONS
 
 __all__ = ["LEVELS", "Learned", "Piece", "Progress", "Read", "learned_baseline", "pieces_of"]
 
@@ -110,7 +113,7 @@ def _learn_full(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
                 "what is not known for certain, so that it is identified"
             }
         )
-    return Learned((check,), read, read, machine)
+    return Learned((check,), read, read, machine, notes=_integrated(pieces, machine))
 
 
 def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
@@ -128,7 +131,8 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
         covariance=tuple(tuple(row) for row in identified.covariance.tolist()),
     )
     check = check_agreement([each for _, _, each in read], "the identified rotor")
-    return Learned((check,), read, read, identified.machine, record)
+    notes = _integrated(pieces, identified.machine)
+    return Learned((check,), read, read, identified.machine, record, notes=notes)
 
 
 def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
@@ -185,11 +189,13 @@ def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Pro
     sources = check_sources(
         {name: [piece.window for piece in pieces if piece.recording == name] for name in _speeds(pieces)}
     )
+    band = _differentiated(baselines[0], machine.window.band_hz[1])
     checks = (determined_, sources, halves) if agreement is None else (determined_, sources, agreement, halves)
     return Learned(
         checks,
         tuple(read),
         tuple(compared),
+        notes=(band,),
         baselines=tuple(
             ConditionBaseline(
                 conditions=OperatingRange.of([piece.window for piece in group]), baseline=BaselineRecord.of(baseline)
@@ -221,6 +227,28 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
     if all(relation is None for relation in relations):
         raise EstimationError("; ".join(dict.fromkeys(reasons)))
     return replace(baseline, relations=relations, reasons=reasons)
+
+
+def _differentiated(baseline: Baseline, band_to_hz: float) -> str:
+    """Up to which frequency the derivatives of what is measured hold, in a sentence."""
+    deepest = max(
+        formation_of([term.motions for term in row.terms], relation.states).deepest
+        for row, relation in zip(learned_rows(ROWS), baseline.relations, strict=True)
+        if relation is not None
+    )
+    edge = passband_hz(deepest, band_to_hz)
+    return (
+        f"What is not measured is derived: up to {deepest} derivatives are taken of the correlation functions under "
+        f"smooth kernels, valid from 0 to {edge:.0f} Hz; what lies above hardly counts."
+    )
+
+
+def _integrated(pieces: Sequence[Piece], machine: Machine) -> tuple[str, ...]:
+    """How accelerations are used, in a sentence; none where none is measured."""
+    if not any(name in ACCELERATIONS for name in pieces[0].window.states):
+        return ()
+    low, high = machine.window.band_hz
+    return (f"Accelerations are integrated to velocities in the spectrum, valid from {low:g} to {high:g} Hz.",)
 
 
 def _baseline(pieces: Sequence[Piece]) -> Baseline:

@@ -6,8 +6,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.diagnosis.baseline.diagnostician import BASELINE_PARAMETERS, BaselineDiagnostician
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import learn_baseline
+from models.diagnosis.baseline.rows import parameters_of
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
@@ -37,7 +38,7 @@ def z_of(diagnosis: Diagnosis) -> dict[str, float]:
 
 def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
     found = [z_of(monitor().diagnose(window)) for window in recorded(ROTOR, OTHER, 2, 3)]
-    for name in BASELINE_PARAMETERS:
+    for name in parameters_of():
         z = np.array([each[name] for each in found])
         assert np.all(np.abs(z) < 3.5), (name, z)
         assert abs(z.mean()) < 2, (name, z)
@@ -76,7 +77,7 @@ def test_little_healthy_data_widens_every_interval_and_they_still_hold() -> None
 def test_sensor_noise_does_not_bias() -> None:
     clean = BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 3, noise=1e-4)))
     noisy = recorded(ROTOR, OTHER, 2, 3, noise=0.05, noise_memory_s=0.002)
-    z = np.array([[z_of(clean.diagnose(window))[name] for name in BASELINE_PARAMETERS[:4]] for window in noisy])
+    z = np.array([[z_of(clean.diagnose(window))[name] for name in parameters_of()[:4]] for window in noisy])
     assert np.all(np.abs(z.mean(axis=0)) < 2), z
 
 

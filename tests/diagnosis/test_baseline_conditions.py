@@ -14,7 +14,7 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.gain import gain_suspicion
 from models.diagnosis.baseline.learned import Baseline, learn_baseline, learned_rows
 from models.diagnosis.baseline.rows import ROWS
-from models.diagnosis.baseline.stored import from_json, to_json
+from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -91,8 +91,9 @@ def test_conditions_are_one_for_each_window() -> None:
 
 
 def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
-    again = from_json(to_json(baseline()))
-    assert to_json(again) == to_json(baseline())
+    text = BaselineRecord.of(baseline()).model_dump_json()
+    again = BaselineRecord.model_validate_json(text).baseline()
+    assert BaselineRecord.of(again).model_dump_json() == text
     (window,) = recorded(with_bearing(SLOW, c_y=-0.3), OTHER, 87, 1)
     one, other = (BaselineDiagnostician(each).diagnose(window) for each in (baseline(), again))
     assert one.parameters == other.parameters
@@ -105,7 +106,7 @@ def test_a_restored_baseline_reads_the_same_to_the_last_bit() -> None:
 
 @pytest.mark.parametrize("damage", ["nan", "shape", "reason", "unknown", "text"])
 def test_a_damaged_baseline_is_refused(damage: str) -> None:
-    record = json.loads(to_json(baseline()))
+    record = json.loads(BaselineRecord.of(baseline()).model_dump_json())
     relation = record["relations"][0]
     if damage == "nan":
         relation["coefficients"][0] = math.nan
@@ -118,7 +119,7 @@ def test_a_damaged_baseline_is_refused(damage: str) -> None:
     else:
         relation["coefficients"][0] = "1.0"
     with pytest.raises(ValidationError):
-        from_json(json.dumps(record))
+        BaselineRecord.model_validate_json(json.dumps(record))
 
 
 def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str:

@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.diagnosis.baseline.diagnostician import BASELINE_PARAMETERS, BaselineDiagnostician
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.kernels import gain, kernels, passband_hz, shape_for
 from models.diagnosis.baseline.kinematics import Source, formation_of, not_measured
 from models.diagnosis.baseline.learned import learn_baseline
-from models.diagnosis.baseline.rows import ROWS, Own, Row, evaluable_rows
+from models.diagnosis.baseline.rows import ROWS, Own, Row, evaluable_rows, parameters_of
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
@@ -159,5 +159,5 @@ def test_a_row_that_is_added_is_learned_and_read() -> None:
     monitor = BaselineDiagnostician(learn_baseline(base, rows=rows), rows)
     (softer,) = recorded(with_bearing(Rotor(), k_y=-0.1), OTHER, 74, 1)
     found = {reading.name: reading for reading in monitor.diagnose(of_states(softer, DISPLACEMENTS)).parameters}
-    assert set(found) == {*BASELINE_PARAMETERS, "EI"}
+    assert set(found) == {*parameters_of(), "EI"}
     assert found["EI"].change == pytest.approx(-0.09, abs=0.03)

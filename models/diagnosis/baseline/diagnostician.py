@@ -35,10 +35,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["BASELINE_PARAMETERS", "BaselineDiagnostician"]
-
-BASELINE_PARAMETERS = parameters_of(ROWS)
-"""What can be read without any parameter of the machine; the shaft cannot."""
+__all__ = ["BaselineDiagnostician"]
 
 _WORST_ERROR = 0.2
 _RPM = 30 / math.pi

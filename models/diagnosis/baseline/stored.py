@@ -16,7 +16,7 @@ from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import Rotation
 from models.signals.block import FloatArray
 
-__all__ = ["BaselineRecord", "RelationRecord", "RotationRecord", "from_json", "to_json"]
+__all__ = ["BaselineRecord", "RelationRecord", "RotationRecord"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -173,22 +173,6 @@ class BaselineRecord(BaseModel):
                 for one in self.consistency
             ),
         )
-
-
-def to_json(baseline: Baseline) -> str:
-    """Write a baseline as JSON."""
-    return BaselineRecord.of(baseline).model_dump_json()
-
-
-def from_json(text: str | bytes) -> Baseline:
-    """Read a baseline from JSON.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        Naming what is missing, not finite or of the wrong shape.
-    """
-    return BaselineRecord.model_validate_json(text).baseline()
 
 
 def _check_covariance(of: str, matrix: _Matrix, size: int) -> None:
