@@ -28,7 +28,7 @@ $(RUN): pyproject.toml constraints.txt
 
 $(READY): $(RUN)
 	@echo "installing what training and the checks need ..."
-	@$(INSTALL) '.[train,dev,peers,io]'
+	@$(INSTALL) '.[train,dev,peers,io,postgres]'
 	@touch $@
 
 demo: $(RUN)
