@@ -106,14 +106,14 @@ def publish(
     Raises
     ------
     MachineFileError
-        If an endpoint is malformed.
+        If an endpoint is malformed, or a password, certificate or key cannot be used.
     PublishError
         If the session cannot be opened, or nobody subscribed in time.
     """
     stop = Event() if stop is None else stop
     with _session(settings) as session, _declared(session, machine, settings.pace) as outlets:
         if settings.wait_for_subscriber_s is not None:
-            _wait_for_subscriber(session, machine.keys, settings.wait_for_subscriber_s, stop)
+            _wait_for_subscriber(session, machine.keys, settings, stop)
         outlets.descriptor.put(descriptor_payload(machine))
         summary = _send(outlets, machine, stream, settings, stop, on_block)
         if not stop.is_set():
@@ -142,11 +142,15 @@ def _session(settings: PublishSettings) -> Iterator[zenoh.Session]:
         try:
             config.insert_json5(path, value)
         except zenoh.ZError as error:
-            raise MachineFileError(f"link setting {path} = {value} is refused: {_reason(error)}") from error
+            # Only endpoints are text of the user's that Zenoh may refuse; a password is never shown.
+            shown = f" = {value}" if path.endswith("endpoints") else ""
+            raise MachineFileError(f"link setting {path}{shown} is refused: {_reason(error)}") from error
     try:
         session = zenoh.open(config)
     except zenoh.ZError as error:
-        raise PublishError(f"no Zenoh session (listen {list(settings.link.listen)}): {_reason(error)}") from error
+        link = settings.link
+        ends = f"listen {list(link.listen)}, connect {list(link.connect)}"
+        raise PublishError(f"no Zenoh session ({ends}): {link.explain(str(error))}") from error
     try:
         yield session
     finally:
@@ -197,7 +201,8 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
             item.undeclare()  # type: ignore[no-untyped-call]
 
 
-def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, timeout_s: float, stop: Event) -> None:
+def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, settings: PublishSettings, stop: Event) -> None:
+    link, timeout_s = settings.link, settings.wait_for_subscriber_s or 0.0
     # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
     probe = session.declare_publisher(keys.stream)
     deadline = time.monotonic() + timeout_s
@@ -205,7 +210,12 @@ def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, timeout_s: f
         if stop.wait(_POLL_S):
             break
         if time.monotonic() > deadline:
-            raise PublishError(f"nobody subscribed to {keys.stream} within {timeout_s:g} s")
+            why = ""
+            if session.info.peers_zid() or session.info.routers_zid():
+                why = ": is a monitor of this machine there, and may this program publish it?"
+            elif link.connect:
+                why = f": {link.refusal()}"
+            raise PublishError(f"nobody subscribed to {keys.stream} within {timeout_s:g} s{why}")
     probe.undeclare()  # type: ignore[no-untyped-call]
 
 

@@ -16,6 +16,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
 from models.errors import MachineFileError, RotorwatchError
+from models.link_file import load_link
 from models.machine import Machine, load_machine
 from models.signals.link import LinkSettings
 from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
@@ -85,7 +86,16 @@ def publish(
         list[str] | None, typer.Option(help="Endpoint to connect to, default tcp/127.0.0.1:7447. Repeatable.")
     ] = None,
     listen: Annotated[list[str] | None, typer.Option(help="Endpoint to listen on, default none. Repeatable.")] = None,
-    mode: Annotated[_Mode, typer.Option(help="Role in the Zenoh network.")] = _Mode.PEER,
+    mode: Annotated[_Mode | None, typer.Option(help="Role in the Zenoh network, default peer.")] = None,
+    link_file: Annotated[
+        Path | None,
+        typer.Option(
+            "--link",
+            metavar="FILE",
+            help="How to connect (TOML with a table [link]): endpoints, password, certificates. --mode replaces its "
+            "mode, --connect and --listen replace its endpoints.",
+        ),
+    ] = None,
     start: Annotated[
         str | None, typer.Option(help="Time of the first sample, ISO 8601 (UTC if no zone); now if left out.")
     ] = None,
@@ -112,6 +122,9 @@ def publish(
     A bearing that loses stiffness after 140 s, twenty times faster:
     [cyan]rotorsim publish k_by --pace 20[/cyan]
 
+    To a router that wants a password or a certificate (docs/zenoh-security.md):
+    [cyan]rotorsim publish --link publisher.toml[/cyan]
+
     Two faults of your own in ten minutes, as fast as the monitor can take them:
     [cyan]rotorsim publish --duration 600 --fault e=0.3@200 --fault c_by=-0.3@400 --pace max[/cyan]
     """
@@ -119,17 +132,11 @@ def publish(
         loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
         factor = _pace(pace)
         start_ns = None if start is None else _time_ns(start)
-        endpoints = tuple(connect) if connect else () if listen else None
-        from simulator.publisher import DEFAULT_CONNECT, PublishSettings  # noqa: PLC0415  # keeps --help quick
+        from simulator.publisher import PublishSettings  # noqa: PLC0415  # keeps --help quick
         from simulator.publisher import publish as publish_stream  # noqa: PLC0415
 
-        link = LinkSettings(
-            mode=mode.value,
-            listen=tuple(listen or ()),
-            connect=(DEFAULT_CONNECT,) if endpoints is None else endpoints,
-        )
         settings = PublishSettings(
-            link=link,
+            link=_link(link_file, mode, listen, connect),
             pace=factor,
             encoding=encoding.value,
             wait_for_subscriber_s=wait_for_subscriber_s,
@@ -206,6 +213,17 @@ def _stream(scenario: Scenario, machine: Machine, block_s: float, start_ns: int 
     from simulator.stream import blocks  # noqa: PLC0415  # imports scipy
 
     yield from blocks(scenario, machine, block_s, time.time_ns() if start_ns is None else start_ns, run)
+
+
+def _link(file: Path | None, mode: _Mode | None, listen: list[str] | None, connect: list[str] | None) -> LinkSettings:
+    """What the file says, and the command line over it; without either, a monitor on this computer."""
+    from simulator.publisher import DEFAULT_CONNECT  # noqa: PLC0415  # keeps --help quick
+
+    update: dict[str, object] = {} if mode is None else {"mode": mode.value}
+    if listen or connect:
+        update |= {"listen": tuple(listen or ()), "connect": tuple(connect or ())}
+    link = LinkSettings(connect=(DEFAULT_CONNECT,)) if file is None else load_link(file)
+    return link.model_copy(update=update)
 
 
 def _pace(text: str) -> float | None:

@@ -1,14 +1,58 @@
-"""How a program connects to Zenoh: settings and the configuration they stand for. Opens nothing itself."""
+"""How a program connects to Zenoh: settings and the configuration they stand for. Opens nothing itself.
+
+Settings hold names of files and variables, never a password: secrets are read when a session is opened.
+"""
 
 import json
-from typing import Literal
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-__all__ = ["NAMESPACE_PATTERN", "LinkSettings"]
+from models.errors import MachineFileError
+from models.signals.link_access import Grant, access_control
+from models.signals.link_files import check_certificate, check_key, read_password, read_user_names
+
+__all__ = ["NAMESPACE_PATTERN", "LinkSettings", "TlsSettings"]
 
 NAMESPACE_PATTERN = r"^([A-Za-z0-9][A-Za-z0-9_.-]*(/[A-Za-z0-9][A-Za-z0-9_.-]*)*)?$"
 """Key segments that could begin any key: no wildcards, no empty ones."""
+
+_ENCRYPTED = ("tls/", "quic/")
+_SECRETS = {"password": "password_file", "passwords": "passwords_file"}
+
+
+class TlsSettings(BaseModel):
+    """Certificates of endpoints that begin with ``tls/``; all files are PEM.
+
+    Examples
+    --------
+    >>> TlsSettings(root_certificate="ca.pem", certificate="pump-7.pem", key="pump-7.key", mutual=True).mutual
+    True
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    root_certificate: Path | None = Field(
+        default=None, description="certificate of the authority by which the other side's certificate must be issued"
+    )
+    certificate: Path | None = Field(default=None, description="this program's own certificate")
+    key: Path | None = Field(default=None, description="private key of the certificate, without a passphrase, mode 600")
+    mutual: bool = Field(
+        default=False,
+        description="whoever connects shows a certificate too: listening asks for it, connecting shows it",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key belong together, found one of them")
+        if self.mutual and (self.certificate is None or self.root_certificate is None):
+            raise ValueError("mutual needs root_certificate, certificate and key")
+        return self
 
 
 class LinkSettings(BaseModel):
@@ -17,7 +61,7 @@ class LinkSettings(BaseModel):
     Multicast and gossip discovery are always off: a program talks to the endpoints it was given and no other.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
     mode: Literal["peer", "client", "router"] = Field(default="peer", description="role in the Zenoh network")
     listen: tuple[str, ...] = Field(default=(), description='endpoints to listen on, as "tcp/127.0.0.1:7447"')
@@ -29,9 +73,63 @@ class LinkSettings(BaseModel):
         description='what goes before every key, as "replay/monday"; the program then hears nothing from outside it, '
         "and nobody outside hears the program",
     )
+    user: str | None = Field(
+        default=None, pattern=r"^[^\s:]+$", description="name under which this program connects to others"
+    )
+    password_file: Path | None = Field(default=None, description="file of mode 600 with the password of user")
+    password_variable: str | None = Field(
+        default=None,
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
+        description="environment variable with the password of user, instead of a file",
+    )
+    passwords_file: Path | None = Field(
+        default=None,
+        description="file of mode 600 with a line name:password for each user who may connect to this program",
+    )
+    tls: TlsSettings | None = Field(default=None, description='certificates of endpoints that begin with "tls/"')
+    grants: tuple[Grant, ...] = Field(
+        default=(), description="who may do what; with one grant everything is refused that none allows"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_secrets(cls, fields: Any) -> Any:  # whatever the file has; checked field by field afterwards
+        for name in _SECRETS.keys() & fields.keys() if isinstance(fields, dict) else ():
+            # Raised here, so that the value is in no message.
+            raise ValueError(
+                f"{name} does not belong into settings, which many may read: put it into a file of mode 600 and name "
+                f"that in {_SECRETS[name]}"
+            )
+        return fields
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for fault in self._faults():
+            raise ValueError(fault)
+        return self
+
+    def beside(self, folder: Path) -> Self:
+        """These settings with files that are named without a whole path taken from a folder, that of the settings."""
+        tls = self.tls
+        if tls is not None:
+            places = {name: getattr(tls, name) for name in ("root_certificate", "certificate", "key")}
+            tls = tls.model_copy(update={name: folder / path for name, path in places.items() if path is not None})
+        files = {name: getattr(self, name) for name in ("password_file", "passwords_file")}
+        found = {name: folder / path for name, path in files.items() if path is not None}
+        return self.model_copy(update={**found, "tls": tls})
 
     def zenoh_items(self) -> dict[str, str]:
-        """Configuration paths and their JSON5 values, to be inserted one by one into a Zenoh configuration."""
+        """Configuration paths and their JSON5 values, to be inserted one by one into a Zenoh configuration.
+
+        The password is among them: they go to Zenoh and nowhere else, not into a message and not into a log.
+
+        Raises
+        ------
+        MachineFileError
+            If a password, certificate or key cannot be used, or the settings contradict each other.
+        """
+        for fault in self._faults():  # again: endpoints of a command line are put over settings that were checked
+            raise MachineFileError(f"link: {fault}")
         items = {
             "mode": json.dumps(self.mode),
             "listen/endpoints": json.dumps(list(self.listen)),
@@ -43,4 +141,124 @@ class LinkSettings(BaseModel):
         }
         if self.namespace:
             items["namespace"] = json.dumps(self.namespace)
+        return items | self._tls_items() | self._password_items() | self._access_items()
+
+    def explain(self, error: str) -> str:
+        """Why a session could not be opened, in plain words.
+
+        Zenoh does not tell a program why it was turned away; what may be the reason with these settings is listed.
+
+        Parameters
+        ----------
+        error : str
+            Zenoh's own text.
+        """
+        if "Address already in use" in error:
+            return "address already in use: does another program listen there?"
+        if "Timeout" in error or "Unable to connect" in error:
+            return self.refusal()
+        return re.sub(r"\s*\(?at \S+\.rs:\d+\)?\.?", "", error)
+
+    def refusal(self) -> str:
+        """Why nobody may have let this program in; a sentence."""
+        reasons = []
+        if self.user is not None:
+            where = (
+                f"environment variable {self.password_variable}" if self.password_file is None else self.password_file
+            )
+            reasons.append(f"whoever listens there does not know the user {self.user} with the password in {where}")
+        else:
+            reasons.append("whoever listens there wants a user name, and link.user has none")
+        if self._encrypted(self.connect) and self.tls is not None:
+            reasons.append(
+                f"the certificate there is not issued by {self.tls.root_certificate}, has expired, or is for "
+                "another name than the endpoint's"
+            )
+            if self.tls.mutual:
+                reasons.append(f"{self.tls.certificate} is not issued by the authority that is trusted there")
+            else:
+                reasons.append("a certificate is wanted from whoever connects, and link.tls.mutual is false")
+        elif self.connect:
+            reasons.append("only tls/ endpoints are served there")
+        return f"nobody answers there; or {'; or '.join(reasons)}"
+
+    def _faults(self) -> Iterator[str]:
+        """What contradicts what."""
+        if self.user is None and (self.password_file or self.password_variable):
+            yield "a password is given, but no user"
+        if self.user is not None and (self.password_file is None) == (self.password_variable is None):
+            yield f"user is {self.user}: expected its password by one of password_file and password_variable"
+        if self.passwords_file is not None and not self.listen:
+            yield "passwords_file is for those who connect to this program, which has no listen endpoint"
+        if self._encrypted(self.listen) and (self.tls is None or self.tls.certificate is None):
+            yield f"listen is {', '.join(self.listen)}: expected [link.tls] with certificate and key"
+        if self._encrypted(self.connect) and (self.tls is None or self.tls.root_certificate is None):
+            yield f"connect is {', '.join(self.connect)}: expected [link.tls] with root_certificate"
+        if self.grants:
+            yield from self._faults_of_grants()
+
+    def _faults_of_grants(self) -> Iterator[str]:
+        if not self.listen:
+            yield "grants are for those who connect to this program, which has no listen endpoint"
+        if self.connect:
+            # Who is at the other end of an outgoing connection has shown no name, so all of it would be refused.
+            yield "grants and connect endpoints do not go together: give the grants to the router that all connect to"
+        if self.passwords_file is None:
+            if self.tls is None or not self.tls.mutual:
+                yield "grants go by names, expected passwords_file or tls.mutual: without, nobody who connects has one"
+            for endpoint in self.listen:
+                if not endpoint.startswith(_ENCRYPTED):
+                    yield f"grants go by certificates, but nobody shows one to {endpoint}: expected tls/ endpoints only"
+
+    @staticmethod
+    def _encrypted(endpoints: tuple[str, ...]) -> bool:
+        return any(endpoint.startswith(_ENCRYPTED) for endpoint in endpoints)
+
+    def _tls_items(self) -> dict[str, str]:
+        tls = self.tls
+        if tls is None:
+            return {}
+        place = "transport/link/tls"
+        items = {f"{place}/enable_mtls": json.dumps(tls.mutual), f"{place}/verify_name_on_connect": "true"}
+        if tls.root_certificate is not None:
+            check_certificate("tls.root_certificate", tls.root_certificate)
+            items[f"{place}/root_ca_certificate"] = json.dumps(str(tls.root_certificate))
+        if tls.certificate is not None and tls.key is not None:
+            check_certificate("tls.certificate", tls.certificate)
+            check_key("tls.key", tls.key)
+            for role, ends in (("listen", self.listen), ("connect", self.connect)):
+                if self._encrypted(ends) and (role == "listen" or tls.mutual):
+                    items[f"{place}/{role}_certificate"] = json.dumps(str(tls.certificate))
+                    items[f"{place}/{role}_private_key"] = json.dumps(str(tls.key))
         return items
+
+    def _password_items(self) -> dict[str, str]:
+        place, items = "transport/auth/usrpwd", {}
+        if self.user is not None:
+            items[f"{place}/user"] = json.dumps(self.user)
+            items[f"{place}/password"] = json.dumps(self._password())
+        if self.passwords_file is not None:
+            names = read_user_names("passwords_file", self.passwords_file)
+            items[f"{place}/dictionary_file"] = json.dumps(str(self.passwords_file))
+            strangers = sorted({name for grant in self.grants for name in grant.who} - names)
+            if strangers:
+                raise MachineFileError(f"link.grants: who: {', '.join(strangers)} has no line in {self.passwords_file}")
+        return items
+
+    def _password(self) -> str:
+        if self.password_file is not None:
+            return read_password("password_file", self.password_file)
+        password = os.environ.get(self.password_variable or "", "")
+        if not password:
+            raise MachineFileError(
+                f"link.password_variable: the environment variable {self.password_variable} is empty or not there, "
+                f"expected the password of user {self.user}"
+            )
+        return password
+
+    def _access_items(self) -> dict[str, str]:
+        if not self.grants:
+            return {}
+        known_by: Literal["usernames", "cert_common_names"]
+        known_by = "cert_common_names" if self.passwords_file is None else "usernames"
+        return {"access_control": json.dumps(access_control(self.grants, known_by))}
