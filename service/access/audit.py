@@ -1,0 +1,166 @@
+"""The audit log of the HTTP API: who did what, when and from where, and who was refused.
+
+::
+
+    request that may change something     started (status 0) --> the action --> outcome (its status)
+    any request refused (401, 403, 429)                                         outcome, a few a minute and address
+
+The first entry is written before the action, and without it there is no action. The second has the same time as the
+first; if it is missing, the outcome is not known.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from models.errors import RotorwatchError
+from service.access.rates import MovingWindow
+from service.access.tokens import masked
+from service.logs import logger
+from service.store.records import AuditEntry
+
+__all__ = ["STARTED", "AuditLog", "AuditNote", "AuditTrail", "Visit"]
+
+STARTED = "started"
+"""Action of an entry that was written before the action, whose status is 0."""
+
+_LONGEST = 500
+_REFUSALS_IN_ALL = 60
+_log = logger(part="access")
+
+
+class AuditLog(Protocol):
+    """Where entries go, for ever; calls may wait for a database."""
+
+    def append(self, entry: AuditEntry) -> object:
+        """Add an entry, which gets its number there."""
+
+
+@dataclass(frozen=True, slots=True)
+class AuditNote:
+    """What a route says of what it does, as ``request.state.audit``.
+
+    Attributes
+    ----------
+    action : str
+        In one word, such as ``acknowledge``.
+    machine, alarm : str
+        What it is done to: ``site/machine``, and the alarm's name.
+    reason : str
+        Why, in the words of the caller.
+    """
+
+    action: str = ""
+    machine: str = ""
+    alarm: str = ""
+    reason: str = ""
+
+
+@dataclass(slots=True)
+class Visit:
+    """A request on its way, as far as the audit log is concerned."""
+
+    at_ns: int
+    address: str
+    method: str
+    path: str
+    actor: str = ""
+    started: bool = False
+
+
+class AuditTrail:
+    """Writes the audit log.
+
+    Parameters
+    ----------
+    log : AuditLog
+        Where entries go.
+    refusals_per_minute : int
+        Refused requests of one address that are written down.
+    clock_ns : callable
+        Time of day, nanoseconds since 1970 UTC.
+    monotonic : callable
+        Monotonic seconds.
+    """
+
+    def __init__(
+        self,
+        log: AuditLog,
+        refusals_per_minute: int,
+        *,
+        clock_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._journal = log
+        self._clock_ns = clock_ns
+        self._lock = threading.Lock()
+        self._latest_ns = 0
+        self._by_address = MovingWindow(refusals_per_minute, clock=monotonic)
+        self._in_all = MovingWindow(_REFUSALS_IN_ALL, clock=monotonic)
+        self._withheld = 0
+
+    def visit(self, address: str, method: str, path: str) -> Visit:
+        """Begin to follow a request; no two have the same time."""
+        with self._lock:
+            self._latest_ns = max(self._latest_ns + 1, self._clock_ns())
+            return Visit(self._latest_ns, address, method, path)
+
+    def start(self, visit: Visit) -> None:
+        """Write down that something is about to be done.
+
+        Raises
+        ------
+        RotorwatchError
+            If that is not possible; then it must not be done.
+        """
+        self._write(visit, 0, AuditNote(action=STARTED))
+        visit.started = True
+
+    def finish(self, visit: Visit, status: int, note: AuditNote) -> None:
+        """Write down what came of it; trouble is logged, because it cannot be undone."""
+        try:
+            self._write(visit, status, note)
+        except RotorwatchError as error:
+            _log.error(
+                "outcome is missing from the audit log",
+                actor=visit.actor,
+                method=visit.method,
+                path=_short(visit.path),
+                status=status,
+                why=str(error),
+            )
+
+    def admits_refusal(self, network: str) -> int | None:
+        """How many refusals were left out before this one, or None if this one is to be left out as well."""
+        if self._by_address.wait(network) or self._in_all.hit(""):
+            self._withheld += 1
+            return None
+        self._by_address.hit(network)
+        withheld, self._withheld = self._withheld, 0
+        return withheld
+
+    def _write(self, visit: Visit, status: int, note: AuditNote) -> None:
+        entry = AuditEntry(
+            number=0,
+            at_ns=visit.at_ns,
+            actor=visit.actor,
+            address=visit.address,
+            method=_short(visit.method),
+            path=_short(visit.path),
+            status=status,
+            action=_short(note.action),
+            machine=_short(note.machine),
+            alarm=_short(note.alarm),
+            reason=_short(note.reason),
+        )
+        self._journal.append(entry)
+
+
+def _short(text: str) -> str:
+    """At most 500 printable characters, and no token's secret."""
+    text = masked(text)
+    if not text.isprintable():
+        text = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in text)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"

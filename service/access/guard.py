@@ -1,0 +1,236 @@
+"""Who may call which route, and that no route forgets to say so.
+
+::
+
+    middleware   token, rate, origin -----------> 401, 403, 413, 415, 429   (every path but /healthz needs a token)
+    gate         scopes of the route, audit log -> 403, 503                 (before the route's own code)
+    route        dependencies=[guard.read], or caller: Annotated[Caller, guard.operate]
+
+A route that declares no scope is refused by the gate. How an application is guarded::
+
+    guard = Guard(store.tokens, store.audit, settings.access, settings.http.host)
+    app = FastAPI(dependencies=[guard.gate], openapi_url=None, docs_url=None, redoc_url=None)
+    ...                                     # routes
+    guard.protect(app)                      # after all of them
+"""
+
+import math
+import time
+from collections import OrderedDict
+from collections.abc import AsyncIterator, Callable
+from typing import Annotated, Any
+
+from fastapi import Depends, FastAPI, Request
+from fastapi.responses import JSONResponse
+from starlette.concurrency import run_in_threadpool
+from starlette.exceptions import HTTPException
+
+from models.errors import RotorwatchError
+from service.access.audit import AuditLog, AuditTrail, Visit
+from service.access.middleware import VISIT, AccessMiddleware
+from service.access.origin import SAFE_METHODS, check_origin
+from service.access.presented import address_of, challenge, key_of, network_of, presented_text
+from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
+from service.access.requirement import NEEDED, Requirement, requires
+from service.access.routes import PUBLIC_PATHS, declared_scopes, unguarded_routes
+from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
+from service.access.tokens import TokenStore, parse_token, token_is_valid
+from service.access_settings import AccessSettings
+
+__all__ = ["ACCESS_PROBLEMS", "AccessError", "Guard"]
+
+ACCESS_PROBLEMS = (401, 403, 429, 503)
+"""What any guarded route may answer besides its own; those that take a body also 413 and 415."""
+
+_KNOWN_TOKENS = 1_000
+_SEATS_RETRY_S = 5
+
+
+class AccessError(RotorwatchError):
+    """An application cannot be guarded the way it is built."""
+
+
+class Guard:
+    """Guards an application.
+
+    Parameters
+    ----------
+    tokens : TokenStore
+        Looked up at every request, so that a token that is revoked is refused at the next one.
+    audit : AuditLog
+        Where what is done and refused is written down.
+    access : AccessSettings
+        ``[access]``.
+    host : str
+        Address that is listened on; a name of the service's.
+    clock_ns : callable
+        Time of day, nanoseconds since 1970 UTC.
+    monotonic : callable
+        Monotonic seconds.
+
+    Attributes
+    ----------
+    read, operate, configure
+        Dependencies that give a `Caller` with the scope.
+    stream
+        Dependency of an event stream that needs ``read``: holds one of the caller's streams until its end.
+    gate
+        Dependency of the application as a whole.
+    """
+
+    def __init__(
+        self,
+        tokens: TokenStore,
+        audit: AuditLog,
+        access: AccessSettings,
+        host: str,
+        *,
+        clock_ns: Callable[[], int] = time.time_ns,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        limits = access.limits
+        self.access = access
+        self.trail = AuditTrail(audit, limits.refusals_recorded_per_minute, clock_ns=clock_ns, monotonic=monotonic)
+        self.seats = StreamSeats(limits.streams_per_caller, limits.streams)
+        self.read: Any = requires(Scope.READ, in_browsers=True)
+        self.operate: Any = requires(Scope.OPERATE)
+        self.configure: Any = requires(Scope.CONFIGURE)
+        self.stream: Any = Depends(self._stream_dependency())
+        self.gate: Any = Depends(self.pass_gate)
+        self._tokens = tokens
+        self._clock_ns = clock_ns
+        self._hosts = frozenset(("localhost", host.lower(), *access.hosts))
+        self._requests = MovingWindow(limits.requests_per_minute, clock=monotonic)
+        self._failures = MovingWindow(limits.failures_per_minute, clock=monotonic)
+        self._known: OrderedDict[bytes, None] = OrderedDict()
+
+    def protect(self, app: FastAPI) -> None:
+        """Put the middleware around an application all of whose routes are there, and serve its ``/openapi.json``.
+
+        Raises
+        ------
+        AccessError
+            If there is a route that the gate does not stand before.
+        """
+
+        @app.get("/openapi.json", include_in_schema=False, dependencies=[self.read])
+        def description() -> JSONResponse:
+            return JSONResponse(app.openapi())
+
+        outside = unguarded_routes(app, self.pass_gate)
+        if outside:
+            raise AccessError(
+                f"{', '.join(outside)}: the gate does not stand before this; build the application with "
+                "FastAPI(dependencies=[guard.gate], openapi_url=None, docs_url=None, redoc_url=None), and add nothing "
+                "but its own routes"
+            )
+        app.add_middleware(
+            AccessMiddleware, admit=self.admit, trail=self.trail, body_bytes=self.access.limits.body_bytes
+        )
+
+    async def admit(self, request: Request) -> Caller:
+        """Find out who calls, and whether that is welcome at all.
+
+        Raises
+        ------
+        HTTPException
+            401, 403, 415, 429 or 503.
+        """
+        address = address_of(request)
+        in_the_open = self.access.open_on_loopback
+        if outside := unguarded_routes(request.app, self.pass_gate):  # one that was added since `protect`
+            raise HTTPException(403, f"{', '.join(outside)}: declares no scope, so nothing is served")
+        if _is_public(request):
+            caller: Caller | None = Caller(NOBODY, address=address)
+        elif in_the_open:
+            caller = Caller(ANONYMOUS, frozenset(Scope), address)
+        else:
+            caller = await self._authenticated(request, address)
+        wait_s = self._requests.hit(network_of(address) if caller is None else key_of(caller))
+        if wait_s:
+            raise _too_many(f"more than {self.access.limits.requests_per_minute} requests in a minute", wait_s)
+        if caller is None:
+            raise HTTPException(401, NEEDED, {"WWW-Authenticate": challenge(request)})
+        check_origin(request.headers, request.method, hosts=self._hosts, open_to_all=in_the_open)
+        return caller
+
+    def pass_gate(self, request: Request) -> None:
+        """Refuse what the route's caller may not do, or nobody; write down what is about to be done.
+
+        Raises
+        ------
+        HTTPException
+            403 if the scope is missing or the route declares none, 503 if the audit log cannot be written.
+        """
+        if _is_public(request):
+            return
+        needed = declared_scopes(request.app, request.scope.get("endpoint"))
+        if not needed:
+            raise HTTPException(403, "this route declares no scope, so nobody may call it")
+        for scope in sorted(needed):
+            Requirement(scope)(request)
+        if request.method in SAFE_METHODS:
+            return
+        visit: Visit = getattr(request.state, VISIT)
+        try:
+            self.trail.start(visit)
+        except RotorwatchError as error:
+            raise HTTPException(503, f"nothing was done, because the audit log cannot be written: {error}") from error
+
+    def still_valid(self, caller: Caller) -> bool:
+        """Whether a caller's token still holds, for streams that stay open for long; may wait for a database."""
+        if not caller.token_id:
+            return True
+        record = self._tokens.find(caller.token_id)
+        if record is None or record.revoked_ns is not None:
+            return False
+        return record.expires_ns is None or self._clock_ns() < record.expires_ns
+
+    def _stream_dependency(self) -> Callable[[Caller], AsyncIterator[Caller]]:
+        async def stream(caller: Annotated[Caller, self.read]) -> AsyncIterator[Caller]:
+            try:
+                with self.seats.seat(key_of(caller)):
+                    yield caller
+            except TooManyStreamsError as error:
+                raise HTTPException(429, str(error), {"Retry-After": str(_SEATS_RETRY_S)}) from error
+
+        return stream
+
+    async def _authenticated(self, request: Request, address: str) -> Caller | None:
+        """Return the owner of the token that is presented; None if none is presented or it is not valid."""
+        if "authorization" not in request.headers:
+            return None
+        text = presented_text(request.headers, request.method)
+        presented = None if text is None else parse_token(text)
+        network = network_of(address)
+        wait_s = self._failures.wait(network)
+        # Who shares an address with somebody who tries tokens out is not locked out with them.
+        if wait_s and (presented is None or presented.secret_hash not in self._known):
+            raise _too_many("too many attempts with a wrong token from this address", wait_s)
+        record = None
+        if presented is not None:
+            try:
+                record = await run_in_threadpool(self._tokens.find, presented.token_id)
+            except RotorwatchError as error:
+                raise HTTPException(503, f"tokens cannot be looked up: {error}") from error
+        valid = token_is_valid(record, presented, self._clock_ns())
+        if record is None or presented is None or not valid:
+            if presented is not None:
+                self._known.pop(presented.secret_hash, None)
+            self._failures.hit(network)
+            return None
+        self._known[presented.secret_hash] = None
+        self._known.move_to_end(presented.secret_hash)
+        if len(self._known) > _KNOWN_TOKENS:
+            self._known.popitem(last=False)
+        granted = frozenset(scope for scope in Scope if scope.value in record.scopes)
+        return Caller(record.name, granted, address, record.token_id)
+
+
+def _is_public(request: Request) -> bool:
+    return request.scope["path"] in PUBLIC_PATHS and request.method in SAFE_METHODS
+
+
+def _too_many(detail: str, wait_s: float) -> HTTPException:
+    seconds = math.ceil(wait_s)
+    return HTTPException(429, f"{detail}; try again in {seconds} s", {"Retry-After": str(seconds)})

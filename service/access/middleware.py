@@ -1,0 +1,151 @@
+"""Around the whole application: who calls, how much they send, what the audit log says of it, and safe headers.
+
+Written against ASGI itself, so that event streams pass through piece by piece.
+"""
+
+from collections.abc import Awaitable, Callable
+
+from fastapi import Request
+from starlette.concurrency import run_in_threadpool
+from starlette.datastructures import MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Send
+from starlette.types import Scope as AsgiScope
+
+from service.access.audit import AuditNote, AuditTrail, Visit
+from service.access.origin import SAFE_METHODS
+from service.access.presented import address_of, network_of
+from service.access.requirement import CALLER
+from service.access.scopes import Caller
+from service.logs import Limiter, logger
+from service.problems import problem_answer
+
+__all__ = ["VISIT", "AccessMiddleware"]
+
+VISIT = "access_visit"
+"""Where the request on its way is kept, in ``request.state``."""
+
+_TOO_LARGE = 413
+_LONGEST_NUMBER = 18
+_REFUSED = (401, 403, 429)
+_HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    # The page has a style of its own and neither scripts nor pictures.
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+}
+_log = logger(part="access")
+
+
+class AccessMiddleware:
+    """Lets requests in, or answers them with the problem.
+
+    Parameters
+    ----------
+    app : callable
+        The application inside.
+    admit : callable
+        Gives the caller of a request, or raises `HTTPException`.
+    trail : AuditTrail
+        Where requests are written down.
+    body_bytes : int
+        Largest request body.
+    """
+
+    def __init__(
+        self, app: ASGIApp, *, admit: Callable[[Request], Awaitable[Caller]], trail: AuditTrail, body_bytes: int
+    ) -> None:
+        self._app = app
+        self._admit = admit
+        self._trail = trail
+        self._body_bytes = body_bytes
+        self._limiter = Limiter()
+
+    async def __call__(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] == "http":
+            await self._serve(scope, receive, send)
+        elif scope["type"] == "websocket":  # no route of this service is one
+            await send({"type": "websocket.close", "code": 1008})
+        else:
+            await self._app(scope, receive, send)
+
+    async def _serve(self, scope: AsgiScope, receive: Receive, send: Send) -> None:
+        request = Request(scope, receive)
+        visit = self._trail.visit(address_of(request), request.method, scope["path"])
+        received = 0
+        answered = False
+
+        async def measured() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > self._body_bytes:  # a body that is sent in chunks states no length beforehand
+                raise self._too_large()
+            return message
+
+        async def watched(message: Message) -> None:
+            nonlocal answered
+            if message["type"] == "http.response.start":
+                if received > self._body_bytes and message["status"] != _TOO_LARGE:
+                    return  # what others made of the body's end
+                answered = True
+                # Before the answer: whoever has it can find it in the log.
+                await self._record(visit, message["status"], request)
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+            if answered:
+                await send(message)
+
+        async def refuse(refusal: HTTPException) -> None:
+            request.state.audit = AuditNote(reason=refusal.detail)
+            answer = problem_answer(request, refusal.status_code, refusal.detail)
+            answer.headers.update(refusal.headers or {})
+            await answer(scope, receive, watched)
+
+        try:
+            caller = await self._admit(request)
+            visit.actor = caller.name
+            length = request.headers.get("content-length", "0")
+            if length.isdecimal() and (len(length) > _LONGEST_NUMBER or int(length) > self._body_bytes):
+                raise self._too_large()
+        except HTTPException as refusal:
+            await refuse(refusal)
+            return
+        setattr(request.state, CALLER, caller)
+        setattr(request.state, VISIT, visit)
+        await self._app(scope, measured, watched)
+        if not answered and received > self._body_bytes:
+            await refuse(self._too_large())
+
+    def _too_large(self) -> HTTPException:
+        return HTTPException(_TOO_LARGE, f"the request body is too large, expected at most {self._body_bytes} bytes")
+
+    async def _record(self, visit: Visit, status: int, request: Request) -> None:
+        note = getattr(request.state, "audit", None)
+        if not isinstance(note, AuditNote):
+            note = AuditNote()
+        refused = status in _REFUSED or not hasattr(request.state, CALLER)
+        if refused and not visit.started:
+            withheld = self._limiter.admit(f"refused {status}")
+            if withheld is not None:
+                _log.warning(
+                    "request refused",
+                    status=status,
+                    address=visit.address,
+                    actor=visit.actor,
+                    method=visit.method,
+                    **({"withheld": withheld} if withheld else {}),
+                )
+            left_out = self._trail.admits_refusal(network_of(visit.address))
+            if left_out is None:
+                return
+            if left_out:
+                more = f"{left_out} refused requests before this one are not in this log"
+                note = AuditNote(note.action, note.machine, note.alarm, "; ".join(filter(None, (note.reason, more))))
+        elif visit.method in SAFE_METHODS:
+            return
+        await run_in_threadpool(self._trail.finish, visit, status, note)

@@ -1,0 +1,79 @@
+"""What a page from elsewhere could make a browser send is refused.
+
+A browser adds by itself whatever lets its user in: the address of a loopback service, a password it has kept. So no
+request that could change anything is taken from another page, and where no token is needed none under a name that is
+not this service's: somebody else's name that leads here would make their page one of ours.
+"""
+
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+
+from service.access_settings import is_address
+
+__all__ = ["SAFE_METHODS", "check_origin"]
+
+SAFE_METHODS = frozenset(("GET", "HEAD", "OPTIONS"))
+"""Methods that change nothing."""
+
+_WITH_BODY = frozenset(("POST", "PUT", "PATCH"))
+_FROM_HERE = ("none", "same-origin")
+_FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip")
+
+
+def check_origin(headers: Headers, method: str, *, hosts: frozenset[str], open_to_all: bool) -> None:
+    """Refuse what may come from a page of somebody else's.
+
+    Parameters
+    ----------
+    headers : Headers
+        Of the request.
+    method : str
+        Of the request.
+    hosts : frozenset of str
+        Names, other than addresses, under which browsers reach the service.
+    open_to_all : bool
+        Whether callers need no token; then the service's name is looked at, and nothing is taken from a proxy.
+
+    Raises
+    ------
+    HTTPException
+        403 for a request from elsewhere, 415 for a body that a form could send.
+    """
+    host = headers.get("host", "")
+    if open_to_all:
+        name = _host_name(f"//{host}")
+        if not is_address(name) and name not in hosts:
+            raise HTTPException(403, f"host {host!r} is not one of this service; see [access] hosts in the settings")
+        passed_on = next((header for header in _FORWARDED if header in headers), None)
+        if passed_on is not None:
+            raise HTTPException(
+                403, f"a proxy sent this (header {passed_on}), but without tokens the API is for this computer alone"
+            )
+    if method in SAFE_METHODS:
+        return
+    origin = headers.get("origin")
+    if origin is not None and not _is_ours(origin, host, hosts):
+        raise HTTPException(403, f"a page from {origin[:200]} may not do this")
+    if headers.get("sec-fetch-site", "none") not in _FROM_HERE:
+        raise HTTPException(403, "a page from elsewhere may not do this")
+    # A form can send neither this type nor other methods; a script from elsewhere would have to ask first.
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    if method in _WITH_BODY and kind != "application/json":
+        raise HTTPException(415, f"content type is {kind[:100] or 'missing'}, expected application/json")
+
+
+def _is_ours(origin: str, host: str, hosts: frozenset[str]) -> bool:
+    """Whether a page is one of this service, whose name a proxy may have changed on the way."""
+    scheme, found, place = origin.partition("://")
+    if not found or scheme not in ("http", "https"):
+        return False
+    return place == host or _host_name(origin) in hosts - {"localhost"}
+
+
+def _host_name(url: str) -> str:
+    try:
+        return urlsplit(url).hostname or ""
+    except ValueError:  # brackets that do not close, or without an address in them
+        return ""

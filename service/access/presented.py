@@ -1,0 +1,58 @@
+"""What a request says about its caller: address, and token if there is one."""
+
+import base64
+import binascii
+import ipaddress
+
+from fastapi import Request
+from starlette.datastructures import Headers
+
+from service.access.origin import SAFE_METHODS
+from service.access.scopes import Caller
+
+__all__ = ["address_of", "challenge", "key_of", "network_of", "presented_text"]
+
+_V6_NETWORK = 64
+
+
+def address_of(request: Request) -> str:
+    """Where a request came from; empty where there are no addresses."""
+    return "" if request.client is None else request.client.host
+
+
+def network_of(address: str) -> str:
+    """What is counted as one address: of IPv6 the first 64 bits, because a caller has the others to itself."""
+    try:
+        parsed = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(parsed, ipaddress.IPv4Address):
+        return str(parsed)
+    if parsed.ipv4_mapped is not None:
+        return str(parsed.ipv4_mapped)
+    return str(ipaddress.ip_network((parsed, _V6_NETWORK), strict=False))
+
+
+def key_of(caller: Caller) -> str:
+    """Under which a caller's requests and streams are counted."""
+    return caller.token_id or network_of(caller.address)
+
+
+def presented_text(headers: Headers, method: str) -> str | None:
+    """Token in the header ``Authorization``; the password of HTTP Basic counts only where nothing can be changed."""
+    found = headers.getlist("authorization")
+    scheme, _, value = found[0].partition(" ") if len(found) == 1 else ("", "", "")
+    if scheme.lower() == "bearer":
+        return value.strip()
+    if scheme.lower() == "basic" and method in SAFE_METHODS:
+        try:
+            return base64.b64decode(value.strip(), validate=True).decode("utf-8").partition(":")[2]
+        except (binascii.Error, ValueError):
+            return None
+    return None
+
+
+def challenge(request: Request) -> str:
+    """Value of ``WWW-Authenticate``; a browser that shows a page is also told how to ask for a password."""
+    shows_page = request.method in SAFE_METHODS and "text/html" in request.headers.get("accept", "")
+    return 'Bearer, Basic realm="rotorwatch", charset="UTF-8"' if shows_page else "Bearer"

@@ -1,0 +1,63 @@
+"""Which scope each route of an application declares."""
+
+from collections.abc import Callable
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
+
+from service.access.requirement import Requirement
+from service.access.scopes import Scope
+
+__all__ = ["PUBLIC_PATHS", "declared_scopes", "undeclared_routes", "unguarded_routes"]
+
+PUBLIC_PATHS = frozenset(("/healthz",))
+"""Paths that anybody may GET."""
+
+
+def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozenset[Scope]:
+    """Scopes that whoever reaches `endpoint` must have; none if one of its routes declares none."""
+    found: set[Scope] = set()
+    for context in iter_route_contexts(app.routes):
+        if context.endpoint is endpoint and endpoint is not None:
+            declared = _scopes(context)
+            if not declared:
+                return frozenset()
+            found |= declared
+    return frozenset(found)
+
+
+def undeclared_routes(app: FastAPI) -> list[str]:
+    """Routes that declare no scope and are not public, as ``GET /path``; there should be none."""
+    return sorted(
+        _title(context)
+        for context in iter_route_contexts(app.routes)
+        if not _scopes(context) and not (context.path in PUBLIC_PATHS and context.methods == {"GET"})
+    )
+
+
+def unguarded_routes(app: FastAPI, gate: Callable[..., Any]) -> list[str]:
+    """Routes before which `gate` does not stand: static files, sockets, mounted programs, or routes without it."""
+    return sorted(
+        _title(context)
+        for context in iter_route_contexts(app.routes)
+        if not isinstance(context.original_route, APIRoute)
+        or not any(inner.call == gate for inner in context.dependant.dependencies)
+    )
+
+
+def _scopes(context: RouteContext) -> frozenset[Scope]:
+    if not isinstance(context.original_route, APIRoute):
+        return frozenset()
+    return frozenset(_required(context.dependant))
+
+
+def _required(dependant: Dependant) -> set[Scope]:
+    found = {dependant.call.scope} if isinstance(dependant.call, Requirement) else set()
+    return found.union(*(_required(inner) for inner in dependant.dependencies))
+
+
+def _title(context: RouteContext) -> str:
+    methods = "|".join(sorted(context.methods or ())) or type(context.original_route).__name__
+    return f"{methods} {context.path or '?'}"

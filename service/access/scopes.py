@@ -1,0 +1,47 @@
+"""Scopes of access, and who is calling."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+__all__ = ["ANONYMOUS", "NOBODY", "Caller", "Scope"]
+
+
+class Scope(StrEnum):
+    """What a caller may do; each is granted by itself, none includes another.
+
+    ``read`` looks, ``operate`` acknowledges, shelves and resets alarms and starts replays, ``configure`` takes alarms
+    out of service and changes what is monitored.
+    """
+
+    READ = "read"
+    OPERATE = "operate"
+    CONFIGURE = "configure"
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """Who sent a request.
+
+    Attributes
+    ----------
+    name : str
+        Name of the token; ``anonymous`` where the API is open on loopback, empty for nobody in particular.
+    scopes : frozenset of Scope
+        What the caller may do.
+    address : str
+        Where the request came from.
+    token_id : str
+        Public part of the token, empty without one.
+    """
+
+    name: str
+    scopes: frozenset[Scope] = field(default_factory=frozenset)
+    address: str = ""
+    token_id: str = ""
+
+
+ANONYMOUS = "anonymous"
+"""Name of every caller where the API is open on loopback."""
+
+NOBODY = ""
+"""Name of a caller without a token."""

@@ -1,0 +1,149 @@
+"""Access tokens: ``rw_<id>_<secret>``, of which only a hash of the secret is stored (docs/decisions/0015-tokens.md)."""
+
+import hashlib
+import hmac
+import re
+import secrets
+import string
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from models.errors import MachineFileError
+from service.access.scopes import ANONYMOUS, Scope
+from service.store.records import TokenRecord
+
+__all__ = ["LONGEST_DAYS", "PresentedToken", "TokenStore", "masked", "new_token", "parse_token", "token_is_valid"]
+
+LONGEST_DAYS = 3650
+_ALPHABET = string.digits + string.ascii_uppercase + string.ascii_lowercase
+_ID_LENGTH = 12
+_SECRET_LENGTH = 43  # the fewest digits to base 62 that hold 256 bits
+_SECRET_BITS = 256
+_TOKEN = re.compile(f"rw_([0-9A-Za-z]{{{_ID_LENGTH}}})_([0-9A-Za-z]{{{_SECRET_LENGTH}}})")
+_ANY_SECRET = re.compile(f"rw_([0-9A-Za-z]{{{_ID_LENGTH}}})_[0-9A-Za-z]+")  # one that was cut off is a secret as well
+_LONGEST_NAME = 64
+_DAY_NS = 86_400 * 10**9
+_NO_HASH = bytes(hashlib.sha256().digest_size)
+
+
+class TokenStore(Protocol):
+    """Where tokens are kept; calls may wait for a database."""
+
+    def add(self, record: TokenRecord) -> None:
+        """Keep a new token."""
+
+    def find(self, token_id: str) -> TokenRecord | None:
+        """Return a token as it is now, revoked ones included."""
+
+    def all(self) -> tuple[TokenRecord, ...]:
+        """Every token there ever was."""
+
+    def revoke(self, token_id: str, at_ns: int) -> bool:
+        """Revoke a token; False if there is none that could be."""
+
+
+@dataclass(frozen=True, slots=True)
+class PresentedToken:
+    """A token that somebody sent, without its secret."""
+
+    token_id: str
+    secret_hash: bytes = field(repr=False)
+
+
+def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | None = None) -> tuple[TokenRecord, str]:
+    """Make a token.
+
+    Parameters
+    ----------
+    name : str
+        Who uses it, as the audit log shall say: at most 64 printable characters.
+    scopes : iterable of Scope
+        What it is good for, at least one.
+    now_ns : int
+        Time of day, nanoseconds since 1970 UTC.
+    days : int, optional
+        How long it holds; for ever if left out.
+
+    Returns
+    -------
+    record : TokenRecord
+        What is stored.
+    text : str
+        The token. It cannot be had again.
+
+    Raises
+    ------
+    MachineFileError
+        Naming what cannot be used.
+
+    Examples
+    --------
+    >>> record, text = new_token("control room", [Scope.READ], now_ns=0)
+    >>> token_is_valid(record, parse_token(text), now_ns=1)
+    True
+    """
+    if not name or len(name) > _LONGEST_NAME or not name.isprintable() or name != name.strip():
+        raise MachineFileError(
+            f"name is {name!r}, expected 1 to {_LONGEST_NAME} printable characters without spaces at the ends"
+        )
+    if name == ANONYMOUS or _ANY_SECRET.search(name):
+        raise MachineFileError(f"name is {masked(name)!r}, which is no name of a token's user")
+    granted = tuple(scope.value for scope in Scope if scope in set(scopes))
+    if not granted:
+        raise MachineFileError(f"scope: none is given, expected one or more of {', '.join(Scope)}")
+    if days is not None and not 1 <= days <= LONGEST_DAYS:
+        raise MachineFileError(f"days is {days}, expected 1 to {LONGEST_DAYS}")
+    token_id = "".join(secrets.choice(_ALPHABET) for _ in range(_ID_LENGTH))
+    secret = _base_62(secrets.randbits(_SECRET_BITS))
+    record = TokenRecord(
+        token_id=token_id,
+        name=name,
+        scopes=granted,
+        secret_hash=_hash(secret),
+        created_ns=now_ns,
+        expires_ns=None if days is None else now_ns + days * _DAY_NS,
+        revoked_ns=None,
+    )
+    return record, f"rw_{token_id}_{secret}"
+
+
+def parse_token(text: str) -> PresentedToken | None:
+    """Take a token apart; None if it is not one."""
+    found = _TOKEN.fullmatch(text)
+    return None if found is None else PresentedToken(found[1], _hash(found[2]))
+
+
+def token_is_valid(record: TokenRecord | None, presented: PresentedToken | None, now_ns: int) -> bool:
+    """Whether a presented token is the stored one, has not expired and was not revoked.
+
+    How long this takes does not depend on the secret, nor on whether there is such a token.
+    """
+    stored = _NO_HASH if record is None else record.secret_hash
+    same = hmac.compare_digest(stored, b"" if presented is None else presented.secret_hash)
+    if record is None or presented is None or record.token_id != presented.token_id:
+        return False
+    return same and record.revoked_ns is None and (record.expires_ns is None or now_ns < record.expires_ns)
+
+
+def masked(text: str) -> str:
+    """Text in which every token has lost its secret.
+
+    Examples
+    --------
+    >>> masked("/rw_0123456789AB_" + 43 * "x")
+    '/rw_0123456789AB_…'
+    """
+    return _ANY_SECRET.sub(r"rw_\1_…", text)
+
+
+def _hash(secret: str) -> bytes:
+    return hashlib.sha256(secret.encode("ascii")).digest()
+
+
+def _base_62(number: int) -> str:
+    digits = []
+    for _ in range(_SECRET_LENGTH):
+        number, digit = divmod(number, len(_ALPHABET))
+        digits.append(_ALPHABET[digit])
+    return "".join(reversed(digits))

@@ -1,0 +1,134 @@
+"""Settings of access to the HTTP API: who may, from where, how much, and under which certificate."""
+
+import ipaddress
+from pathlib import Path
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from models.errors import MachineFileError
+
+__all__ = ["AccessSettings", "LimitSettings", "TlsSettings", "check_access", "is_address", "is_loopback"]
+
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+
+
+class TlsSettings(BaseModel):
+    """Certificate and key of the HTTP API, PEM files relative to the settings file; TLS 1.2 or newer."""
+
+    model_config = _STRICT
+
+    certificate: Path = Field(description="the service's certificate, followed by those that lead to its authority")
+    key: Path = Field(description="private key, without a password and not readable by others")
+    client_ca: Path | None = Field(
+        default=None, description="authorities of clients; with it, whoever has no certificate of theirs is refused"
+    )
+
+
+class LimitSettings(BaseModel):
+    """How much one caller may ask for; a caller is a token, or an address where there is none."""
+
+    model_config = _STRICT
+
+    body_bytes: int = Field(default=1_000_000, ge=1_000, le=1_000_000_000, description="largest request body, in bytes")
+    requests_per_minute: int = Field(default=600, ge=1, le=1_000_000, description="most requests of one caller")
+    failures_per_minute: int = Field(
+        default=10, ge=1, le=100_000, description="most attempts with a wrong token from one address"
+    )
+    streams_per_caller: int = Field(default=5, ge=1, le=10_000, description="most open event streams of one caller")
+    streams: int = Field(default=50, ge=1, le=100_000, description="most open event streams in all")
+    refusals_recorded_per_minute: int = Field(
+        default=5, ge=1, le=1_000, description="most refused requests of one address that the audit log takes"
+    )
+
+
+class AccessSettings(BaseModel):
+    """Who may use the HTTP API; without anything here a token is needed for all but ``/healthz``."""
+
+    model_config = _STRICT
+
+    open_on_loopback: bool = Field(
+        default=False, description="everybody on this computer may do everything without a token"
+    )
+    hosts: tuple[str, ...] = Field(
+        default=(), description="names under which browsers reach the API, if not as localhost, the host or an address"
+    )
+    proxies: tuple[str, ...] = Field(
+        default=(), description="addresses of proxies that are believed when they say who the caller is"
+    )
+    tls: TlsSettings | None = Field(default=None, description="certificate; plain HTTP without it")
+    limits: LimitSettings = Field(default=LimitSettings(), description="how much one caller may ask for")
+
+    @field_validator("proxies")
+    @classmethod
+    def _addresses(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
+        for proxy in proxies:
+            try:
+                ipaddress.ip_network(proxy)
+            except ValueError as error:
+                raise ValueError(f"{proxy!r} is neither an address nor a network such as 10.0.0.0/24") from error
+        return proxies
+
+    @field_validator("hosts")
+    @classmethod
+    def _lower_case(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
+        return tuple(host.lower() for host in hosts)
+
+    def beside(self, folder: Path) -> Self:
+        """Resolve the paths of certificate and key against the folder of the settings file."""
+        if self.tls is None:
+            return self
+        ca = self.tls.client_ca
+        tls = TlsSettings(
+            certificate=folder / self.tls.certificate,
+            key=folder / self.tls.key,
+            client_ca=None if ca is None else folder / ca,
+        )
+        return self.model_copy(update={"tls": tls})
+
+
+def is_address(name: str) -> bool:
+    """Whether a host is given as an address."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Whether nobody outside this computer reaches what listens on `host`."""
+    return host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def check_access(place: str, access: AccessSettings, host: str) -> None:
+    """Check that the API is open to everybody only where everybody is on this computer.
+
+    Parameters
+    ----------
+    place : str
+        Settings file, for the message.
+    access : AccessSettings
+        ``[access]``.
+    host : str
+        ``host`` in ``[http]``.
+
+    Raises
+    ------
+    MachineFileError
+        If ``open_on_loopback`` is set although the API can be reached from elsewhere.
+    """
+    if not access.open_on_loopback:
+        return
+    if not is_loopback(host):
+        raise MachineFileError(
+            f"{place}: access.open_on_loopback is true, but http.host is {host!r}, expected a loopback address such as "
+            "127.0.0.1: everybody who reaches this address could do everything; leave open_on_loopback out and create "
+            "tokens (rotorwatch token create)"
+        )
+    if access.proxies:
+        raise MachineFileError(
+            f"{place}: access.open_on_loopback is true and access.proxies names {', '.join(access.proxies)}: whoever "
+            "the proxy serves could do everything; leave open_on_loopback out and create tokens "
+            "(rotorwatch token create)"
+        )
