@@ -1,0 +1,1 @@
+"""The history: alarms, reports, readings, checkpoints, tokens and the audit log, in SQLite or PostgreSQL."""

@@ -1,0 +1,238 @@
+"""The database behind the history: address, connections, transactions, and the one event loop that uses them."""
+
+import asyncio
+import os
+import threading
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+from sqlalchemy import URL, Connection, event, make_url
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, create_async_engine
+from sqlalchemy.sql.schema import Table
+
+from service.store.errors import StoreError
+from service.store.schema import migrate
+
+__all__ = ["Database"]
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
+
+_ANSWER_S = 60.0  # at least; a query over a long time may take a while
+_JOIN_S = 10.0
+_IMMEDIATE = "rotorwatch_immediate"
+_FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://user:password@host/database"
+
+
+class Database:
+    """Connections to one database, used in one thread of its own.
+
+    Parameters
+    ----------
+    url : str
+        ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
+    timeout_s : float
+        How long to wait for a connection, for a lock that another program holds, or for one transaction, in seconds.
+
+    Raises
+    ------
+    StoreError
+        If the address is of no known form.
+    """
+
+    def __init__(self, url: str, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self._url = _checked(url)
+        self.is_sqlite = self._url.get_backend_name() == "sqlite"
+        self.in_memory = self.is_sqlite and self._url.database in {None, "", ":memory:"}
+        self.file = None if not self.is_sqlite or self.in_memory else Path(self._url.database or "")
+        self.shown = self._url.render_as_string(hide_password=True)
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._thread: threading.Thread | None = None
+        self._engine: AsyncEngine | None = None
+        # SQLite has one writer at a time. In memory there is one connection in all, which readers share.
+        self._one_writer = asyncio.Lock()
+
+    def start(self) -> None:
+        """Start the thread, connect, and bring the tables up to date.
+
+        Raises
+        ------
+        StoreError
+            If that fails; nothing is left running then.
+        """
+        if self._loop is not None:
+            raise StoreError(f"{self.shown}: the history is open already")
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="history", daemon=True)
+        self._thread.start()
+        try:
+            self.call(self._connect)
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Close all connections and end the thread; a second time is nothing."""
+        if self._loop is None or self._thread is None:
+            return
+        try:
+            self.call(self._disconnect)
+        finally:
+            loop, self._loop = self._loop, None
+            loop.call_soon_threadsafe(loop.stop)
+            self._thread.join(_JOIN_S)
+            if not self._thread.is_alive():
+                loop.close()
+
+    def call(self, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        """Run a coroutine function in the history's loop and wait for it; for any thread but the history's own.
+
+        Raises
+        ------
+        StoreError
+            If the history is closed, or the database fails or does not answer.
+        """
+        loop = self._loop
+        if loop is None:
+            raise StoreError(f"{self.shown}: the history is closed")
+        return asyncio.run_coroutine_threadsafe(self._guarded(function, *args, **kwargs), loop).result()
+
+    async def _guarded(self, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+        try:
+            async with asyncio.timeout(max(_ANSWER_S, 10.0 * self.timeout_s)):
+                return await function(*args, **kwargs)
+        except (SQLAlchemyError, OSError, TimeoutError) as error:
+            raise self.failure(error) from error
+
+    def failure(self, error: BaseException) -> StoreError:
+        """Put an error of the database into plain words."""
+        if isinstance(error, StoreError):
+            return error
+        if isinstance(error, TimeoutError):
+            reason = "no answer in time"
+        else:
+            cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+            reason = " ".join(str(cause).split()) or type(cause).__name__
+        password = self._url.password
+        if password:
+            reason = reason.replace(str(password), "***")
+        return StoreError(f"{self.shown}: {reason}")
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the thread runs."""
+        return self._loop is not None
+
+    @property
+    def engine(self) -> AsyncEngine:
+        """The engine, while the history is open."""
+        if self._engine is None:
+            raise StoreError(f"{self.shown}: the history is closed")
+        return self._engine
+
+    @asynccontextmanager
+    async def reading(self) -> AsyncIterator[AsyncConnection]:
+        """A connection to read with, all of it at one point in time in SQLite."""
+        async with self._one_writer if self.in_memory else nullcontext(), self.engine.connect() as connection:
+            yield connection
+
+    @asynccontextmanager
+    async def writing(self, repeatable: bool = False) -> AsyncIterator[AsyncConnection]:
+        """A connection within a transaction, committed at the end.
+
+        Parameters
+        ----------
+        repeatable : bool
+            Whether all statements must see the same, which they do in SQLite anyhow.
+        """
+        async with self.alone(), self.writers.connect() as connection:
+            if repeatable and not self.is_sqlite:
+                await connection.execution_options(isolation_level="REPEATABLE READ")
+            async with connection.begin():
+                yield connection
+
+    @property
+    def writers(self) -> AsyncEngine:
+        """The engine for connections that write: in SQLite their transactions wait for their turn at the beginning."""
+        return self.engine.execution_options(**{_IMMEDIATE: True})
+
+    def alone(self) -> AbstractAsyncContextManager[None]:
+        """What keeps others of this process from writing to SQLite at the same time; nothing in PostgreSQL."""
+        return self._one_writer if self.is_sqlite else nullcontext()
+
+    def insert(self, table: Table) -> "sqlite.Insert | postgresql.Insert":
+        """Begin an INSERT that knows ON CONFLICT."""
+        return sqlite.insert(table) if self.is_sqlite else postgresql.insert(table)
+
+    async def _connect(self) -> None:
+        if self.file is not None:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            # The file holds hashes of secrets: it is made for its owner alone.
+            os.close(os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+        self._engine = self._make_engine()
+        async with self.writing() as connection:
+            try:
+                await connection.run_sync(migrate)
+            except StoreError as error:
+                raise StoreError(f"{self.shown}: {error}") from error
+
+    async def _disconnect(self) -> None:
+        engine, self._engine = self._engine, None
+        if engine is not None:
+            await engine.dispose()
+
+    def _make_engine(self) -> AsyncEngine:
+        if self.is_sqlite:
+            engine = create_async_engine(
+                self._url.set(drivername="sqlite+aiosqlite"), connect_args={"timeout": self.timeout_s}
+            )
+            event.listen(engine.sync_engine, "connect", _prepare_sqlite)
+            event.listen(engine.sync_engine, "begin", _begin_sqlite)
+            return engine
+        try:
+            return create_async_engine(
+                self._url.set(drivername="postgresql+psycopg"),
+                pool_pre_ping=True,
+                pool_timeout=self.timeout_s,
+                connect_args={
+                    "connect_timeout": max(2, round(self.timeout_s)),
+                    "application_name": "rotorwatch",
+                    "keepalives_idle": 10,
+                    "keepalives_interval": 5,
+                    "keepalives_count": 3,
+                },
+            )
+        except ImportError as error:
+            raise StoreError(f"{self.shown}: PostgreSQL needs psycopg: pip install 'rotorwatch[postgres]'") from error
+
+
+def _checked(url: str) -> URL:
+    try:
+        made = make_url(url)
+    except (ArgumentError, ValueError):
+        # The text may hold a password, and so may the error: neither is shown.
+        raise StoreError(f"history: the URL cannot be read; {_FORMS}") from None
+    if made.drivername not in {"sqlite", "postgresql"}:
+        raise StoreError(f"history: the URL begins with {made.drivername}; {_FORMS}")
+    if made.drivername == "postgresql" and not made.database:
+        raise StoreError(f"history: the URL {made.render_as_string(hide_password=True)} names no database; {_FORMS}")
+    return made
+
+
+def _prepare_sqlite(connection: Any, record: object) -> None:
+    _ = record
+    connection.isolation_level = None  # the transactions below, not those that the driver would begin
+    cursor = connection.cursor()
+    for setting in ("journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+        cursor.execute(f"PRAGMA {setting}")
+    cursor.close()
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    immediate = connection.get_execution_options().get(_IMMEDIATE, False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")

@@ -1,0 +1,314 @@
+"""What one machine writes into the history and reads from it."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sqlalchemy import Row, func, select
+from sqlalchemy.sql.elements import ColumnElement
+
+from service.store.backlog import pack, unpack
+from service.store.database import Database
+from service.store.errors import StoreError
+from service.store.group import Claim
+from service.store.records import (
+    Bucket,
+    Checkpoint,
+    CheckpointHead,
+    Step,
+    StoredEvent,
+    StoredReading,
+    StoredReport,
+)
+from service.store.tables import alarm_events, checkpoint_hops, checkpoints, evaluations, readings, reports, series
+from service.store.trend import trend
+from service.store.writer import Writer
+
+__all__ = ["MachineStore"]
+
+_EVENT = [alarm_events.c[name] for name in StoredEvent.__dataclass_fields__]
+_HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
+
+
+class MachineStore:
+    """The history of one machine, with the sole right to write it; from `Store.machine`.
+
+    `commit` is for the machine's own thread, everything else for any thread but the history's own. All that read raise
+    `StoreError` if the database fails; they see what is committed.
+    """
+
+    def __init__(self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int]) -> None:
+        self._database = database
+        self._writer = writer
+        self._claim = claim
+        self._now_ns = now_ns
+        self._last_sequence = database.call(self._latest)
+
+    @property
+    def title(self) -> str:
+        """``site/name``."""
+        return self._claim.title
+
+    @property
+    def waiting(self) -> int:
+        """Steps that are not in the database yet."""
+        return self._claim.backlog.steps
+
+    def last_sequence(self) -> int:
+        """Sequence of the latest alarm event that was committed, or waits to be; -1 if there is none."""
+        return self._last_sequence
+
+    def commit(self, step: Step) -> bool:
+        """Write what one block brought, whole or not at all, in order.
+
+        Parameters
+        ----------
+        step : Step
+            Alarm events go on from `last_sequence` without a gap. One whose sequence is there already is left out if
+            its id is the same.
+
+        Returns
+        -------
+        bool
+            True if it is in the database, for good. False if the database fails: the step waits in memory and is
+            written before all later ones, which is tried every second. Meanwhile `Store.trouble` says why. What waits
+            is bounded: the oldest reports and readings are dropped first; alarm events are never dropped.
+
+        Raises
+        ------
+        StoreError
+            If the step is refused, and thus not written at all: a value that no database takes, a gap in the sequence,
+            an alarm event whose sequence or id is in the history with another id or sequence, or another monitor that
+            has taken over the machine.
+        """
+        before = self._last_sequence
+        last = self._follow(step.events)
+        recorded_ns = self._now_ns()
+        packed = pack(self.title, step, recorded_ns)
+        self._last_sequence = last
+        try:
+            return self._database.call(self._writer.submit, self._claim, step, packed, recorded_ns)
+        except StoreError:
+            self._last_sequence = before
+            raise
+
+    def restore(self) -> Checkpoint | None:
+        """State of the monitor after the last committed step, or None if there is none."""
+        return self._database.call(self._restore)
+
+    def events(
+        self,
+        *,
+        after: int | None = None,
+        before: int | None = None,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        alarm: str | None = None,
+        kind: str | None = None,
+        severity: str | None = None,
+        limit: int = 100,
+        newest_first: bool = False,
+    ) -> tuple[StoredEvent, ...]:
+        """Alarm events in the order of their sequence.
+
+        Parameters
+        ----------
+        after, before : int, optional
+            Only those with a sequence greater than `after`, less than `before`.
+        since_ns, until_ns : int, optional
+            Only those with since_ns ≤ time_ns < until_ns.
+        alarm, kind, severity : str, optional
+            Only those of this alarm, kind, severity.
+        limit : int
+            At most this many.
+        newest_first : bool
+            Order, and thus which are returned if there are more.
+        """
+        log = alarm_events.c
+        query = select(*_EVENT).where(
+            log.machine_id == self._claim.machine_id,
+            *_between(log.time_ns, since_ns, until_ns),
+            *(
+                column == value
+                for column, value in ((log.alarm, alarm), (log.kind, kind), (log.severity, severity))
+                if value is not None
+            ),
+            *_past(log.sequence, after, before),
+        )
+        query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
+
+        async def fetch() -> tuple[StoredEvent, ...]:
+            async with self._database.reading() as connection:
+                return tuple(StoredEvent(*row) for row in await connection.execute(query))
+
+        return self._database.call(fetch)
+
+    def reports(
+        self,
+        *,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        before: int | None = None,
+        limit: int = 100,
+    ) -> tuple[tuple[int, StoredReport], ...]:
+        """Reports in the order of arrival, newest first, each with its number.
+
+        Parameters
+        ----------
+        since_ns, until_ns : int, optional
+            Only windows with since_ns ≤ end_ns < until_ns.
+        before : int, optional
+            Only reports with a smaller number: the last number of the page before.
+        limit : int
+            At most this many.
+        """
+        column = reports.c
+
+        async def fetch() -> Sequence[Row[*tuple[Any, ...]]]:
+            async with self._database.reading() as connection:
+                where = [column.machine_id == self._claim.machine_id, *_past(column.number, None, before)]
+                if since_ns is not None or until_ns is not None:
+                    within = _between(column.end_ns, since_ns, until_ns)
+                    bounds = select(func.min(column.number), func.max(column.number)).where(where[0], *within)
+                    first, last = (await connection.execute(bounds)).one()
+                    if first is None:
+                        return ()
+                    where += [*within, column.number >= first, column.number <= last]
+                query = select(column.number, column.start_ns, column.end_ns, column.state, column.filled, column.text)
+                query = query.where(*where).order_by(column.number.desc()).limit(_checked(limit))
+                return (await connection.execute(query)).all()
+
+        rows = self._database.call(fetch)
+        return tuple(
+            (row.number, StoredReport(row.start_ns, row.end_ns, row.state, row.filled, unpack(row.text)))
+            for row in rows
+        )
+
+    def readings(
+        self,
+        *,
+        quantity: str,
+        name: str,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        after: int | None = None,
+        limit: int = 1000,
+    ) -> tuple[tuple[int, StoredReading], ...]:
+        """Single readings in the order of arrival, oldest first, each with the number of its window.
+
+        Parameters
+        ----------
+        quantity, name : str
+            Of what.
+        since_ns, until_ns : int, optional
+            Only windows with since_ns ≤ end_ns < until_ns.
+        after : int, optional
+            Only windows with a greater number: the last number of the page before.
+        limit : int
+            At most this many.
+        """
+        window = evaluations.c
+
+        async def fetch() -> tuple[tuple[int, StoredReading], ...]:
+            async with self._database.reading() as connection:
+                where = [window.machine_id == self._claim.machine_id, *_past(window.number, after, None)]
+                if since_ns is not None or until_ns is not None:
+                    within = _between(window.end_ns, since_ns, until_ns)
+                    bounds = select(func.min(window.number), func.max(window.number)).where(where[0], *within)
+                    first, last = (await connection.execute(bounds)).one()
+                    if first is None:
+                        return ()
+                    where += [*within, window.number >= first, window.number <= last]
+                series_id = await connection.scalar(
+                    select(series.c.series_id).where(
+                        series.c.machine_id == self._claim.machine_id,
+                        series.c.quantity == quantity,
+                        series.c.name == name,
+                    )
+                )
+                joined = evaluations.join(
+                    readings,
+                    (readings.c.machine_id == window.machine_id)
+                    & (readings.c.number == window.number)
+                    & (readings.c.series_id == series_id),
+                )
+                query = select(window.number, window.end_ns, readings.c.value, readings.c.standard_error)
+                query = query.select_from(joined).where(*where).order_by(window.number).limit(_checked(limit))
+                rows = (await connection.execute(query)).all()
+            return tuple(
+                (row.number, StoredReading(row.end_ns, quantity, name, row.value, row.standard_error)) for row in rows
+            )
+
+        return self._database.call(fetch)
+
+    def downsampled(
+        self,
+        *,
+        quantity: str,
+        names: Sequence[str] | None = None,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        points: int = 300,
+    ) -> tuple[Bucket, ...]:
+        """Readings reduced to at most so many buckets of equal length for each name, by name and time.
+
+        Parameters
+        ----------
+        quantity : str
+            Of what.
+        names : sequence of str, optional
+            Which; all if left out.
+        since_ns, until_ns : int, optional
+            Windows with since_ns ≤ end_ns < until_ns; all if left out. Where the readings themselves have been dropped,
+            what they were reduced to is taken if its beginning is within; then buckets are multiples of that in length
+            and begin at multiples of it, so the first may begin before `since_ns`.
+        points : int
+            At most this many buckets for each name; those without a reading are left out.
+        """
+        return self._database.call(
+            trend, self._database, self._claim.machine_id, quantity, names, since_ns, until_ns, _checked(points)
+        )
+
+    def _follow(self, events: Sequence[StoredEvent]) -> int:
+        """The last sequence after these events."""
+        last = self._last_sequence
+        for event in events:
+            if event.sequence > last + 1:
+                raise StoreError(f"{self.title}: alarm event {event.sequence} comes after {last}, expected {last + 1}")
+            last = max(last, event.sequence)
+        identifiers = [event.id for event in events]
+        if len(set(identifiers)) < len(identifiers):
+            raise StoreError(f"{self.title}: two alarm events of one step have the same id: {identifiers}")
+        return last
+
+    async def _latest(self) -> int:
+        query = select(func.max(alarm_events.c.sequence)).where(alarm_events.c.machine_id == self._claim.machine_id)
+        async with self._database.reading() as connection:
+            latest: int | None = await connection.scalar(query)
+        return -1 if latest is None else latest
+
+    async def _restore(self) -> Checkpoint | None:
+        hops = checkpoint_hops.c
+        async with self._database.reading() as connection:
+            of_machine = checkpoints.c.machine_id == self._claim.machine_id
+            head = (await connection.execute(select(*_HEAD).where(of_machine))).one_or_none()
+            if head is None:
+                return None
+            query = select(hops.end_ns, hops.moments).where(hops.machine_id == self._claim.machine_id)
+            rows = (await connection.execute(query.order_by(hops.end_ns))).all()
+        return Checkpoint(CheckpointHead(*head), tuple((row.end_ns, row.moments) for row in rows))
+
+
+def _between(column: ColumnElement[int], since_ns: int | None, until_ns: int | None) -> list[ColumnElement[bool]]:
+    since = [] if since_ns is None else [column >= since_ns]
+    return since if until_ns is None else [*since, column < until_ns]
+
+
+def _past(column: ColumnElement[int], after: int | None, before: int | None) -> list[ColumnElement[bool]]:
+    greater = [] if after is None else [column > after]
+    return greater if before is None else [*greater, column < before]
+
+
+def _checked(limit: int) -> int:
+    if limit < 1:
+        raise StoreError(f"history: {limit} entries were asked for, expected 1 or more")
+    return limit

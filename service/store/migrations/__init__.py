@@ -1,0 +1,1 @@
+"""How the tables of the history came about, step by step; Alembic runs what a database does not have yet."""

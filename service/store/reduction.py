@@ -1,0 +1,148 @@
+"""Drops what has been kept long enough, and reduces readings to buckets before they go."""
+
+import asyncio
+from collections.abc import Callable
+
+import structlog
+from sqlalchemy import BigInteger, Table, bindparam, case, delete, func, literal, select, text
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from service.store.database import Database
+from service.store.records import Dropped
+from service.store.retention import Retention
+from service.store.tables import buckets, evaluations, readings, reports
+
+__all__ = ["Reduction"]
+
+_DAY_NS = 86_400 * 10**9
+_EVERY_S = 300.0
+_BATCH = 500  # rows or windows in one transaction: others write between two of them
+_LOCK = (0x726F746F, -1)  # PostgreSQL: two monitors on one database take turns
+_log = structlog.get_logger("rotorwatch", part="history")
+
+
+class Reduction:
+    """Keeps the history as long as `Retention` says.
+
+    Parameters
+    ----------
+    database : Database
+        Of which.
+    retention : Retention
+        How long.
+    now_ns : callable
+        The computer's time.
+    """
+
+    def __init__(self, database: Database, retention: Retention, now_ns: Callable[[], int]) -> None:
+        self._database = database
+        self._retention = retention
+        self._now_ns = now_ns
+        self._turn = asyncio.Lock()
+        self._task: asyncio.Task[None] | None = None
+
+    async def start(self) -> None:
+        """Begin to look every few minutes."""
+        self._task = asyncio.create_task(self._run())
+
+    async def stop(self) -> None:
+        """Stop looking; a batch that is under way is undone."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+
+    async def run(self, now_ns: int) -> Dropped:
+        """Drop everything that is too old at a time of the computer."""
+        kept = self._retention
+        async with self._turn:
+            return Dropped(
+                reports=await self._repeat(reports, now_ns - round(kept.reports_days * _DAY_NS)),
+                windows=await self._repeat(evaluations, now_ns - round(kept.readings_days * _DAY_NS)),
+                buckets=await self._repeat(buckets, now_ns - round(kept.buckets_days * _DAY_NS)),
+            )
+
+    async def _run(self) -> None:
+        while True:
+            await asyncio.sleep(_EVERY_S)
+            try:
+                dropped = await self.run(self._now_ns())
+            except (SQLAlchemyError, OSError) as error:
+                _log.warning("the history could not be tidied", why=str(self._database.failure(error)))
+                continue
+            if dropped != Dropped():
+                _log.debug("tidied", reports=dropped.reports, windows=dropped.windows, buckets=dropped.buckets)
+
+    async def _repeat(self, table: Table, until_ns: int) -> int:
+        """Drop what a table holds from before a time, batch by batch, and count it."""
+        total = 0
+        while dropped := await self._batch(table, until_ns):
+            total += dropped
+        return total
+
+    async def _batch(self, table: Table, until_ns: int) -> int:
+        async with self._database.writing(repeatable=True) as connection:
+            if not self._database.is_sqlite:
+                lock = text("SELECT pg_try_advisory_xact_lock(:high, :low)")
+                if not await connection.scalar(lock, {"high": _LOCK[0], "low": _LOCK[1]}):
+                    return 0  # another monitor is at it
+            oldest = select(table.c.recorded_ns).where(table.c.recorded_ns < until_ns)
+            oldest = oldest.order_by(table.c.recorded_ns).limit(_BATCH)
+            boundary_ns = await connection.scalar(select(func.max(oldest.subquery().c.recorded_ns)))
+            if boundary_ns is None:
+                return 0
+            if table is evaluations:
+                await self._reduce(connection, boundary_ns)
+            done = await connection.execute(delete(table).where(table.c.recorded_ns <= boundary_ns))
+            return done.rowcount
+
+    async def _reduce(self, connection: AsyncConnection, boundary_ns: int) -> None:
+        """Turn the readings of old windows into buckets."""
+        length_ns = self._retention.bucket_s * 10**9
+        window, reading, stored = evaluations.c, readings.c, buckets.c
+        start = (window.end_ns // length_ns * length_ns).label("start_ns")
+        joined = evaluations.join(
+            readings, (reading.machine_id == window.machine_id) & (reading.number == window.number)
+        )
+        added = (
+            select(
+                reading.series_id,
+                start,
+                literal(length_ns, BigInteger).label("length_ns"),
+                func.max(window.recorded_ns),
+                func.count(),
+                func.min(reading.value),
+                func.max(reading.value),
+                func.sum(reading.value),
+                func.count(reading.standard_error),
+                func.coalesce(func.sum(reading.standard_error), 0.0),
+            )
+            .select_from(joined)
+            .where(window.recorded_ns <= boundary_ns)
+            .group_by(reading.series_id, "start_ns")
+        )
+        made = self._database.insert(buckets).from_select([column.name for column in stored], added)
+        new = made.excluded
+        await connection.execute(
+            made.on_conflict_do_update(
+                index_elements=[stored.series_id, stored.start_ns, stored.length_ns],
+                set_={
+                    "recorded_ns": case(
+                        (new.recorded_ns > stored.recorded_ns, new.recorded_ns), else_=stored.recorded_ns
+                    ),
+                    "count": stored["count"] + new["count"],
+                    "minimum": case((new.minimum < stored.minimum, new.minimum), else_=stored.minimum),
+                    "maximum": case((new.maximum > stored.maximum, new.maximum), else_=stored.maximum),
+                    "total": stored.total + new.total,
+                    "errors": stored.errors + new.errors,
+                    "errors_total": stored.errors_total + new.errors_total,
+                },
+            )
+        )
+        chosen = select(window.machine_id, window.number).where(window.recorded_ns <= boundary_ns)
+        gone = [{"of_machine": row.machine_id, "of_window": row.number} for row in await connection.execute(chosen)]
+        # One by one along the key: a condition on all of them would make a database look through the whole table.
+        by_key = delete(readings).where(
+            reading.machine_id == bindparam("of_machine"), reading.number == bindparam("of_window")
+        )
+        await connection.execute(by_key, gone)

@@ -1,0 +1,135 @@
+"""The history of all machines of one monitor: one database, one event loop in a thread of its own.
+
+::
+
+    machines' threads --commit--> Writer --one transaction for all that wait--> SQLite or PostgreSQL
+    HTTP threads ------queries------------------------------------------------> (or, while it fails, memory)
+                                  Reduction: drops and reduces what is old
+"""
+
+import time
+from collections.abc import Callable
+
+from service.store.audit import AuditLog
+from service.store.database import Database
+from service.store.machine import MachineStore
+from service.store.records import Dropped
+from service.store.reduction import Reduction
+from service.store.retention import Retention
+from service.store.tokens import TokenStore
+from service.store.webhooks import WebhookCursors
+from service.store.writer import Writer
+
+__all__ = ["Store"]
+
+
+class Store:
+    """Alarms, reports, readings, checkpoints, tokens and audit log.
+
+    Parameters
+    ----------
+    url : str
+        ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
+    retention : Retention
+        How long what is kept.
+    timeout_s : float
+        How long to wait for a connection, or for a lock of another program, in seconds; a transaction may take twice
+        as long. Then steps wait in memory.
+    retry_s : float
+        Time between attempts while the database fails, in seconds.
+    waiting_reports : int
+        Reports of one machine that wait in memory meanwhile; of readings, twenty times as many.
+    now_ns : callable
+        The computer's time, nanoseconds since 1970 UTC.
+
+    Attributes
+    ----------
+    tokens : TokenStore
+    audit : AuditLog
+    webhooks : WebhookCursors
+
+    Raises
+    ------
+    StoreError
+        If the URL is of no known form.
+
+    Examples
+    --------
+    >>> store = Store("sqlite:///:memory:", Retention())
+    >>> store.open()
+    >>> lab = store.machine("demo", "lab")
+    >>> lab.last_sequence(), lab.restore()
+    (-1, None)
+    >>> store.close()
+    """
+
+    def __init__(
+        self,
+        url: str,
+        retention: Retention,
+        *,
+        timeout_s: float = 5.0,
+        retry_s: float = 1.0,
+        waiting_reports: int = 2000,
+        now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._database = Database(url, timeout_s)
+        self._writer = Writer(self._database, retry_s, waiting_reports, now_ns)
+        self._reduction = Reduction(self._database, retention, now_ns)
+        self._now_ns = now_ns
+        self.tokens = TokenStore(self._database)
+        self.audit = AuditLog(self._database)
+        self.webhooks = WebhookCursors(self._database)
+
+    @property
+    def shown(self) -> str:
+        """The database's URL without its password."""
+        return self._database.shown
+
+    @property
+    def trouble(self) -> str:
+        """Why the latest write failed; empty if it did not."""
+        return self._writer.trouble
+
+    def open(self) -> None:
+        """Connect, and bring the tables up to date; a store is opened once.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be reached or used.
+        """
+        self._database.start()
+        self._database.call(self._writer.start)
+        self._database.call(self._reduction.start)
+
+    def close(self) -> None:
+        """Write what waits, if the database takes it, let go of all machines and end the thread."""
+        if not self._database.is_open:
+            return
+        try:
+            self._database.call(self._reduction.stop)
+            self._database.call(self._writer.stop)
+        finally:
+            self._database.stop()
+
+    def machine(self, site: str, name: str) -> MachineStore:
+        """The history of a machine, which nobody else writes until this store is closed or its process ends.
+
+        Raises
+        ------
+        StoreError
+            If another monitor writes it, or the database fails.
+        """
+        claim = self._database.call(self._writer.claim, site, name)
+        return MachineStore(self._database, self._writer, claim, self._now_ns)
+
+    def retain(self, now_ns: int) -> Dropped:
+        """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        return self._database.call(self._reduction.run, now_ns)

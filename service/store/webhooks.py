@@ -1,0 +1,41 @@
+"""How far each webhook has been served."""
+
+from sqlalchemy import select
+
+from service.store.database import Database
+from service.store.tables import webhook_cursors
+
+__all__ = ["WebhookCursors"]
+
+
+class WebhookCursors:
+    """The last alarm event that each webhook has had of each machine; for any thread.
+
+    Both methods raise `StoreError` if the database fails.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def get(self, name: str, machine_key: str) -> int:
+        """Sequence of the last event delivered; -1 if there is none."""
+        column = webhook_cursors.c
+        query = select(column.sequence).where(column.name == name, column.machine_key == machine_key)
+
+        async def fetch() -> int:
+            async with self._database.reading() as connection:
+                found: int | None = await connection.scalar(query)
+            return -1 if found is None else found
+
+        return self._database.call(fetch)
+
+    def set(self, name: str, machine_key: str, sequence: int) -> None:
+        """Note the sequence of the last event delivered."""
+        made = self._database.insert(webhook_cursors).values(name=name, machine_key=machine_key, sequence=sequence)
+        made = made.on_conflict_do_update(index_elements=["name", "machine_key"], set_={"sequence": sequence})
+
+        async def write() -> None:
+            async with self._database.writing() as connection:
+                await connection.execute(made)
+
+        self._database.call(write)
