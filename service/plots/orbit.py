@@ -8,6 +8,9 @@ from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.plots.stretches import RecordedStream, Stretch
+from service.snapshots.choice import orbit_pairs
+from service.snapshots.ellipse import Ellipse, phase_lag_deg
+from service.snapshots.revolutions import pulses
 
 __all__ = ["Orbit", "Orbits", "Vector", "orbits_of", "read_orbits"]
 
@@ -40,7 +43,7 @@ class Vector:
     @property
     def phase_lag_deg(self) -> float:
         """How far the shaft turns from the keyphasor's pulse to the positive peak, 0 to 360°."""
-        return float(np.degrees(-np.angle(self.q_um) * self.direction) % 360)
+        return phase_lag_deg(self.q_um, self.direction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,27 +75,23 @@ class Orbit:
         return np.real(self.y.q_um * turn), np.real(self.z.q_um * turn)
 
     @property
-    def _forward_backward(self) -> tuple[float, float]:
-        forward = abs(self.y.q_um + 1j * self.z.q_um) / 2
-        backward = abs(np.conj(self.y.q_um) + 1j * np.conj(self.z.q_um)) / 2
-        return float(forward), float(backward)
+    def _ellipse(self) -> Ellipse:
+        return Ellipse(self.y.q_um, self.z.q_um)
 
     @property
     def major_um(self) -> float:
         """Long axis of the 1× ellipse from end to end, µm."""
-        return 2 * sum(self._forward_backward)
+        return 2 * self._ellipse.semi_major
 
     @property
     def minor_um(self) -> float:
         """Short axis from end to end, µm."""
-        forward, backward = self._forward_backward
-        return 2 * abs(forward - backward)
+        return 2 * self._ellipse.semi_minor
 
     @property
     def precession(self) -> str:
         """``forward``: round the orbit as the shaft turns; ``backward``: against it."""
-        forward, backward = self._forward_backward
-        return "forward" if forward >= backward else "backward"
+        return self._ellipse.precession
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +140,7 @@ def read_orbits(stream: RecordedStream, revolutions: int) -> Orbits:
     length_s = 2.0
     while True:
         found = stream.latest(channels, length_s)
-        enough = bool(found) and _pulses(found[-1])[1].size > revolutions
+        enough = bool(found) and pulses(found[-1].angle_rad)[1].size > revolutions
         interrupted = len(found) > 1
         if enough or interrupted or length_s > min(_LONGEST_S, (stream.to_ns - stream.from_ns) / 1e9):
             break
@@ -167,18 +166,18 @@ def orbits_of(stretch: Stretch, pairs: list[tuple[Channel, Channel]], revolution
     RotorwatchError
         If the shaft does not turn so often in it.
     """
-    direction, pulses = _pulses(stretch)
-    if pulses.size <= revolutions:
+    direction, marked = pulses(stretch.angle_rad)
+    if marked.size <= revolutions:
         raise RotorwatchError(
-            f"--revolutions is {revolutions}, but only {max(0, pulses.size - 1)} whole revolutions without a gap were "
+            f"--revolutions is {revolutions}, but only {max(0, marked.size - 1)} whole revolutions without a gap were "
             f"recorded before this time ({stretch.length_s:.3g} s of samples)"
         )
-    first, last = pulses[-1 - revolutions], pulses[-1]
+    first, last = marked[-1 - revolutions], marked[-1]
     rows = slice(int(np.ceil(first)), int(np.floor(last)) + 1)
-    assert stretch.angle_rad is not None  # noqa: S101  # _pulses found pulses
+    assert stretch.angle_rad is not None  # noqa: S101  # there are pulses
     angle = stretch.angle_rad[rows]
     regressors = np.column_stack([np.ones(angle.size), np.cos(angle), np.sin(angle)])
-    at = pulses[-1 - revolutions :]
+    at = marked[-1 - revolutions :]
     orbits = []
     for number, pair in enumerate(pairs):
         values = stretch.samples[:, 2 * number : 2 * number + 2] * np.array([c.to_si * _UM for c in pair])
@@ -200,12 +199,7 @@ def orbits_of(stretch: Stretch, pairs: list[tuple[Channel, Channel]], revolution
 
 def _pairs(stream: RecordedStream) -> list[tuple[Channel, Channel]]:
     """Displacement in y and z at each place where both are measured."""
-    found = {(channel.location, channel.direction): channel for channel in stream.displacements}
-    pairs = [
-        (found[place, "y"], found[place, "z"])
-        for place in ("bearing", "disc")
-        if (place, "y") in found and (place, "z") in found
-    ]
+    pairs = orbit_pairs(stream.displacements)
     if not pairs:
         there = ", ".join(channel.name for channel in stream.displacements) or "none"
         raise MachineFileError(
@@ -213,14 +207,3 @@ def _pairs(stream: RecordedStream) -> list[tuple[Channel, Channel]]:
             f"{stream.name}: {there}"
         )
     return pairs
-
-
-def _pulses(stretch: Stretch) -> tuple[int, FloatArray]:
-    """Direction of rotation, and where the shaft angle passes 0, in samples from the first one, interpolated."""
-    if stretch.angle_rad is None or stretch.angle_rad.size < 2:
-        return 1, np.empty(0)
-    whole = np.unwrap(stretch.angle_rad)
-    direction = 1 if whole[-1] >= whole[0] else -1
-    onwards = np.maximum.accumulate(direction * whole)  # noise on the angle must not count a pulse twice
-    turns = np.arange(np.ceil(onwards[0] / (2 * np.pi)), np.floor(onwards[-1] / (2 * np.pi)) + 1)
-    return direction, np.asarray(np.interp(turns * 2 * np.pi, onwards, np.arange(onwards.size)))

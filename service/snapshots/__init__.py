@@ -1,0 +1,1 @@
+"""Snapshots of a live machine: correlations and spectra beside what theory predicts, and orbits, as JSON."""

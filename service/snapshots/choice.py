@@ -1,0 +1,167 @@
+"""Which channels a snapshot is of: those asked for by name, or a sensible few."""
+
+from collections.abc import Iterable, Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from models.errors import RotorwatchError
+from models.machine import MachineFile
+from models.signals.channels import Channel, Quantity, state_name
+
+__all__ = [
+    "MOST_PAIRS",
+    "SnapshotError",
+    "Units",
+    "chosen_channels",
+    "chosen_pairs",
+    "figures",
+    "orbit_pairs",
+    "product_unit",
+    "si_unit",
+]
+
+Units = Literal["channel", "SI"]
+
+MOST_PAIRS = 8
+"""Pairs in a snapshot that no pair was asked for."""
+_MOST_CHANNELS = 64
+_DIGITS = 6
+_SI_UNITS = {
+    Quantity.DISPLACEMENT: "m",
+    Quantity.VELOCITY: "m/s",
+    Quantity.ACCELERATION: "m/s2",
+    Quantity.TILT: "rad",
+    Quantity.TILT_RATE: "rad/s",
+    Quantity.SHAFT_ANGLE: "rad",
+}
+
+
+class SnapshotError(RotorwatchError):
+    """A snapshot was asked for that this machine's channels do not allow; the message lists what is there."""
+
+
+def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "channel") -> tuple[Channel, ...]:
+    """Channels by name; without names all of the first quantity measured, displacements before velocities.
+
+    Parameters
+    ----------
+    machine : MachineFile
+    names : sequence of str
+    field : str
+        What the names were given as.
+
+    Raises
+    ------
+    SnapshotError
+        If there is no such channel, or it is the shaft angle, or there are too many names.
+    """
+    there = {channel.name: channel for channel in vibration_channels(machine)}
+    if len(names) > _MOST_CHANNELS:
+        raise SnapshotError(
+            f"{machine.site}/{machine.name}: {len(names)} values of {field}, expected at most {_MOST_CHANNELS}"
+        )
+    for name in names:
+        if name not in there:
+            known = {channel.name for channel in machine.sensors}
+            what = "is the shaft angle" if name in known else "is not a channel of it"
+            raise SnapshotError(
+                f"{machine.site}/{machine.name}: {field} is {name!r}, which {what}; expected one of {', '.join(there)}"
+            )
+    if names:
+        return tuple(there[name] for name in dict.fromkeys(names))
+    for quantity in _SI_UNITS:
+        found = tuple(channel for channel in there.values() if channel.quantity is quantity)
+        if found:
+            return found
+    return ()
+
+
+def chosen_pairs(
+    machine: MachineFile, first: Sequence[str] = (), second: Sequence[str] = ()
+) -> tuple[tuple[Channel, Channel], ...]:
+    """Pairs of channels by name, each channel with itself where there is no `second`; a few without names.
+
+    The few are every displacement with itself, then those of one plane, then those of one place with each other.
+
+    Raises
+    ------
+    SnapshotError
+        If there is no such channel, or `first` and `second` are not equally many.
+    """
+    if first or second:
+        if second and len(second) != len(first):
+            raise SnapshotError(
+                f"{machine.site}/{machine.name}: {len(first)} values of first and {len(second)} of second, expected as "
+                "many of one as of the other, or none of second"
+            )
+        by_name = {
+            channel.name: channel
+            for names, field in ((first, "first"), (second, "second"))
+            if names
+            for channel in chosen_channels(machine, names, field)
+        }
+        return tuple((by_name[one], by_name[other]) for one, other in zip(first, second or first, strict=True))
+    channels = chosen_channels(machine, ())
+    alone = [(channel, channel) for channel in channels]
+    several = [(one, other) for number, one in enumerate(channels) for other in channels[number + 1 :]]
+    in_plane = [pair for pair in several if pair[0].direction == pair[1].direction]
+    at_place = [pair for pair in several if pair[0].location == pair[1].location and pair not in in_plane]
+    return tuple([*alone, *in_plane, *at_place][:MOST_PAIRS])
+
+
+def vibration_channels(machine: MachineFile) -> tuple[Channel, ...]:
+    """All but the shaft angle, in the order of the stream."""
+    return tuple(channel for channel in machine.sensors if state_name(channel) != "theta")
+
+
+def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
+    """Displacements in y and z, at each place where both are measured."""
+    found = {(one.location, one.direction): one for one in channels if one.quantity is Quantity.DISPLACEMENT}
+    return [
+        (found[place, "y"], found[place, "z"])
+        for place in ("bearing", "disc")
+        if (place, "y") in found and (place, "z") in found
+    ]
+
+
+def si_unit(channel: Channel) -> str:
+    """SI unit of a channel's quantity."""
+    return _SI_UNITS[channel.quantity]
+
+
+def product_unit(first: Channel, second: Channel, units: Units) -> tuple[str, float]:
+    """Unit of a product of two channels' samples, and the factor from SI to it.
+
+    Examples
+    --------
+    >>> probe = Channel(name="XE-1", quantity="displacement", location="bearing", direction="y", unit="um")
+    >>> product_unit(probe, probe, "channel")[0], product_unit(probe, probe, "SI")
+    ('um^2', ('m^2', 1.0))
+    """
+    one, other = (channel.unit if units == "channel" else si_unit(channel) for channel in (first, second))
+    factor = 1.0 if units == "SI" else 1 / (first.to_si * second.to_si)
+    if one == other:
+        return (f"({one})^2" if "/" in one else f"{one}^2"), factor
+    return f"{one}*{other}", factor
+
+
+def figures(values: npt.ArrayLike) -> tuple[float | None, ...]:
+    """Numbers for JSON: six significant digits; None for what is not finite.
+
+    Examples
+    --------
+    >>> figures([0.123456789, float("nan"), -3e9])
+    (0.123457, None, -3000000000.0)
+    """
+    array = np.asarray(values, dtype=np.float64)
+    finite = np.isfinite(array)
+    solid = np.where(finite & (array != 0), array, 1.0)
+    # A power of ten within what a number holds exactly: the quotient is then the shortest decimal.
+    power = np.clip(_DIGITS - 1 - np.floor(np.log10(np.abs(solid))), -22, 22)
+    up, down = 10.0 ** np.maximum(power, 0), 10.0 ** np.maximum(-power, 0)
+    rounded = np.where(array == 0, 0.0, np.round(solid * up / down) * down / up)
+    return tuple(
+        value if is_finite else None for value, is_finite in zip(rounded.tolist(), finite.tolist(), strict=True)
+    )

@@ -1,0 +1,335 @@
+"""JSON of the snapshots of a live machine.
+
+Conventions as in `service.schemas`, but for one thing: what has the unit of a channel, or of two channels' product,
+says in `unit` which that is. Arrays that belong together have one length, which their descriptions name. Numbers have
+six significant digits; null stands for what is not known.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
+
+from service.window_schemas import JSON
+
+__all__ = [
+    "ChannelDensity",
+    "CorrelationPair",
+    "CorrelationSnapshot",
+    "CrossSpectrum",
+    "OrbitEllipse",
+    "OrbitSnapshot",
+    "PathSamples",
+    "PlaceOrbit",
+    "PredictedChange",
+    "RunningSpeedVector",
+    "SpectrumSnapshot",
+    "Theory",
+]
+
+_NS = 1767225805000000000
+_Series = tuple[float | None, ...]
+
+_Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
+_Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
+_Bundle = Annotated[
+    str | None,
+    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
+]
+_MachineHash = Annotated[
+    str,
+    Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
+]
+_StartNs = Annotated[
+    int | None, Field(description="oldest data in the window; null without one", examples=[_NS - 60_000_000_000])
+]
+_EndNs = Annotated[int | None, Field(description="end of the newest data in the window", examples=[_NS])]
+_Filled = Annotated[float, Field(description="fraction of a full window that is there now", examples=[1.0])]
+_Speed = Annotated[
+    float | None, Field(description="mean speed in the window; null if it is not known", examples=[138.23])
+]
+_Reason = Annotated[str, Field(description="why there is nothing to show; empty if there is", examples=[""])]
+_SumUnit = Annotated[
+    str, Field(description="unit of the values: a product of the two channels' units", examples=["um^2"])
+]
+_DensityUnit = Annotated[
+    str, Field(description="unit of the values: a product of two channels' units, per Hz", examples=["um^2/Hz"])
+]
+
+
+class PredictedChange(BaseModel):
+    """One parameter of the machine as it is estimated now."""
+
+    model_config = JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    relative_change: float = Field(description="relative change from nominal", examples=[-0.247])
+
+
+class Theory(BaseModel):
+    """What the predictions are of.
+
+    The excitation is not measured. It is the one that explains the window best with the machine as estimated (as
+    nominal, where there is no estimate), and the same for both predictions: what they differ by is what the parameters
+    have changed.
+    """
+
+    model_config = JSON
+
+    changes: tuple[PredictedChange, ...] = Field(
+        description="parameters of the machine as estimated, from the latest reading; the others are nominal"
+    )
+    nominal_reason: str = Field(
+        description="why there is no prediction for the machine as nominal; empty if there is", examples=[""]
+    )
+    estimated_reason: str = Field(
+        description="why there is no prediction for the machine as estimated; empty if there is", examples=[""]
+    )
+
+
+class CorrelationPair(BaseModel):
+    """Correlation function R_ij(τ) = E{x_i(t) x_j(t+τ)} of two channels without mean and 1×; n_lags values each."""
+
+    model_config = JSON
+
+    first: str = Field(description="name of channel i, the reference", examples=["y1"])
+    second: str = Field(description="name of channel j, the response", examples=["y2"])
+    unit: _SumUnit
+    measured: _Series = Field(description="estimated in the window", examples=[(94.31, 93.67, 91.77)])
+    standard_error: _Series = Field(description="standard error of `measured`", examples=[(3.37, 3.31, 3.19)])
+    nominal: _Series | None = Field(
+        description="what theory predicts for the machine as nominal; null without, see `theory`",
+        examples=[(96.02, 95.36, 93.41)],
+    )
+    estimated: _Series | None = Field(
+        description="what theory predicts for the machine as now estimated; null without, see `theory`",
+        examples=[(94.90, 94.25, 92.34)],
+    )
+    nominal_z: float | None = Field(
+        description="root mean square over the lags of `measured` less `nominal`, in standard errors; about 1 where "
+        "theory holds, but neighbouring lags err together, so that 2 is nothing unusual",
+        examples=[1.1],
+    )
+    estimated_z: float | None = Field(description="the same for `estimated`", examples=[0.9])
+    outside_band: float | None = Field(
+        description="where `method` is spectrum: what the band leaves out at lag zero, over the product of the two "
+        "channels' rms; null otherwise",
+        examples=[0.004],
+    )
+
+
+class CorrelationSnapshot(BaseModel):
+    """Correlation functions of the latest window, measured and predicted."""
+
+    model_config = JSON
+
+    site: _Site
+    machine: _Name
+    start_ns: _StartNs
+    end_ns: _EndNs
+    filled: _Filled
+    speed_rad_s: _Speed
+    lags_s: tuple[float, ...] = Field(description="τ, n_lags values from 0 on", examples=[(0.0, 0.001, 0.002)])
+    method: Literal["samples", "spectrum"] = Field(
+        description="samples: from the samples themselves, standard errors from the scatter of the window's hops. "
+        "spectrum: transformed from the window's spectra, where the monitor needs no lags itself; what lies outside "
+        "`band_hz` is missing in measured and predicted values alike, and the standard errors come from the spectra",
+        examples=["samples"],
+    )
+    band_hz: tuple[float, float] | None = Field(
+        description="what the values are limited to; null where `method` is samples", examples=[None]
+    )
+    pairs: tuple[CorrelationPair, ...] = Field(description="pair by pair")
+    theory: Theory = Field(description="what the predictions are of")
+    reason: _Reason
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class ChannelDensity(BaseModel):
+    """One-sided power spectral density of one channel without mean and 1×; n_lines values each."""
+
+    model_config = JSON
+
+    channel: str = Field(description="name of the channel", examples=["y2"])
+    quantity: str = Field(description="what it measures", examples=["displacement"])
+    unit: _DensityUnit
+    measured: _Series = Field(description="estimated in the window", examples=[(0.231, 0.198, 0.212)])
+    nominal: _Series | None = Field(
+        description="what theory predicts for the machine as nominal, sensor noise included; null without: `theory`",
+        examples=[(0.214, 0.215, 0.216)],
+    )
+    estimated: _Series | None = Field(
+        description="the same for the machine as now estimated", examples=[(0.216, 0.217, 0.218)]
+    )
+    rms: float | None = Field(
+        description="root mean square in the band, in the channel's unit (SI where `unit` is)", examples=[14.2]
+    )
+
+
+class CrossSpectrum(BaseModel):
+    """Cross-spectrum of two channels, one-sided, and their coherence; n_lines values each."""
+
+    model_config = JSON
+
+    first: str = Field(description="name of channel i", examples=["y1"])
+    second: str = Field(description="name of channel j", examples=["y2"])
+    unit: _DensityUnit
+    magnitude: _Series = Field(description="magnitude of the cross-spectrum", examples=[(0.116, 0.101, 0.109)])
+    phase_deg: _Series = Field(
+        description="by how much channel j leads channel i, -180 to 180°", examples=[(-0.8, 1.1, 0.3)]
+    )
+    coherence: _Series = Field(description="coherence squared, 0 to 1", examples=[(0.41, 0.38, 0.44)])
+    nominal_magnitude: _Series | None = Field(
+        description="magnitude that theory predicts for the machine as nominal; null without, see `theory`",
+        examples=[(0.110, 0.110, 0.111)],
+    )
+    nominal_coherence: _Series | None = Field(
+        description="coherence squared of the same", examples=[(0.40, 0.40, 0.40)]
+    )
+    estimated_magnitude: _Series | None = Field(
+        description="magnitude for the machine as now estimated", examples=[(0.111, 0.111, 0.112)]
+    )
+    estimated_coherence: _Series | None = Field(
+        description="coherence squared of the same", examples=[(0.41, 0.41, 0.41)]
+    )
+
+
+class SpectrumSnapshot(BaseModel):
+    """Power spectral densities of the latest window, measured and predicted."""
+
+    model_config = JSON
+
+    site: _Site
+    machine: _Name
+    start_ns: _StartNs
+    end_ns: _EndNs
+    filled: _Filled
+    speed_rad_s: _Speed
+    frequencies_hz: tuple[float, ...] = Field(description="n_lines values", examples=[(3.0, 3.2, 3.4)])
+    line_spacing_hz: float | None = Field(
+        description="distance of the lines; null without a window. The segments have a Hann window: a line sees 1.5 "
+        "distances of the segments' own lines",
+        examples=[0.2],
+    )
+    averaged_lines: int = Field(description="lines of the segments that were averaged into one", examples=[1])
+    degrees_of_freedom: float | None = Field(
+        description="of every density: measured over true is distributed as χ² over its degrees of freedom",
+        examples=[45.5],
+    )
+    interval_95: tuple[float, float] | None = Field(
+        description="factors on a measured density between which the true one lies, with 95 % probability",
+        examples=[(0.69, 1.57)],
+    )
+    coherence_95: float | None = Field(
+        description="coherence squared that two channels with nothing in common exceed in 5 % of all lines",
+        examples=[0.129],
+    )
+    rotation_hz: float | None = Field(description="1×, taken out of the densities; null if not known", examples=[22.0])
+    left_out_hz: tuple[float, float] | None = Field(
+        description="lines around 1× where what is left of it may show; null if the speed is not known",
+        examples=[(21.4, 22.6)],
+    )
+    densities: tuple[ChannelDensity, ...] = Field(description="channel by channel")
+    cross: tuple[CrossSpectrum, ...] = Field(description="pair by pair, those asked for")
+    theory: Theory = Field(description="what the predictions are of")
+    reason: _Reason
+    bundle: _Bundle
+    machine_hash: _MachineHash
+
+
+class RunningSpeedVector(BaseModel):
+    """Vibration of one channel at running speed."""
+
+    model_config = JSON
+
+    channel: str = Field(description="name of the channel", examples=["y1"])
+    amplitude: float = Field(
+        description="peak amplitude, in `unit` of the orbit; twice it is peak to peak", examples=[8.1]
+    )
+    amplitude_error: float | None = Field(
+        description="standard error of the amplitude, from the scatter of the hops; null if it is not known",
+        examples=[0.05],
+    )
+    phase_lag_deg: float | None = Field(
+        description="how far the shaft turns from the phase reference's mark to the positive peak, 0 to 360°; null "
+        "without a phase reference",
+        examples=[21.3],
+    )
+    phase_error_deg: float | None = Field(description="standard error of the phase lag", examples=[0.4])
+
+
+class OrbitEllipse(BaseModel):
+    """Path of the shaft at running speed."""
+
+    model_config = JSON
+
+    semi_major: float = Field(description="half of the long axis, in `unit` of the orbit", examples=[9.4])
+    semi_minor: float = Field(description="half of the short axis", examples=[7.2])
+    tilt_deg: float = Field(
+        description="angle from y, towards z, to the long axis, above -90 and up to 90°", examples=[12.0]
+    )
+    sense: Literal["y to z", "z to y"] = Field(
+        description="which way the shaft's centre goes round the orbit", examples=["y to z"]
+    )
+    precession: Literal["forward", "backward"] | None = Field(
+        description="forward: that is the way the shaft turns; null where the way it turns is not known, without a "
+        "phase reference",
+        examples=["forward"],
+    )
+
+
+class PathSamples(BaseModel):
+    """The newest whole revolutions as measured, about their mean; n_samples values each."""
+
+    model_config = JSON
+
+    times_s: tuple[float, ...] = Field(description="time of each sample after `start_ns`", examples=[(0.0, 0.0005)])
+    y: _Series = Field(description="samples of the y channel, in `unit` of the orbit", examples=[(3.2, 4.1)])
+    z: _Series = Field(description="samples of the z channel", examples=[(-7.7, -7.1)])
+
+
+class PlaceOrbit(BaseModel):
+    """Orbit at one place."""
+
+    model_config = JSON
+
+    location: str = Field(description="bearing or disc", examples=["bearing"])
+    unit: str = Field(description="unit of all lengths: that of the y channel, or m", examples=["um"])
+    y: RunningSpeedVector | None = Field(description="y channel at running speed; null without a window")
+    z: RunningSpeedVector | None = Field(description="z channel at running speed; null without a window")
+    ellipse: OrbitEllipse | None = Field(description="measured in the window; null without one, see `reason`")
+    nominal: OrbitEllipse | None = Field(
+        description="what the unbalance of the machine as nominal makes; null without, see `theory`"
+    )
+    estimated: OrbitEllipse | None = Field(description="the same for the machine as now estimated")
+    path: PathSamples | None = Field(description="samples as measured; null without, see `path_reason`")
+
+
+class OrbitSnapshot(BaseModel):
+    """Orbits at all places where displacements are measured in both directions."""
+
+    model_config = JSON
+
+    site: _Site
+    machine: _Name
+    start_ns: _StartNs
+    end_ns: _EndNs
+    filled: _Filled
+    speed_rad_s: _Speed
+    speed_source: Literal["phase reference", "estimated", "unknown"] = Field(
+        description="where the speed is from; estimated: from the line in the vibration", examples=["phase reference"]
+    )
+    orbits: tuple[PlaceOrbit, ...] = Field(description="place by place")
+    revolutions: int = Field(description="whole revolutions in `path`, 0 without", examples=[8])
+    path_start_ns: int | None = Field(
+        description="time of the first sample in `path`; null without", examples=[_NS - 400_000_000]
+    )
+    pulses_s: tuple[float, ...] = Field(
+        description="when the shaft angle was 0, after `path_start_ns`: revolutions + 1 values",
+        examples=[(0.0, 0.0455)],
+    )
+    theory: Theory = Field(description="what the predictions are of")
+    reason: str = Field(description="why there is no ellipse; empty if there is", examples=[""])
+    path_reason: str = Field(description="why there is no path, or a shorter one; empty otherwise", examples=[""])
+    bundle: _Bundle
+    machine_hash: _MachineHash
