@@ -6,13 +6,22 @@
     ├── MachineFileError      a machine, scenario or settings file cannot be used
     ├── WireError             bytes from outside are not a block, descriptor or report
     ├── BundleError           a trained bundle does not fit this machine or is damaged
+    ├── CheckpointError       what a monitor remembered cannot be restored
     ├── RecordingError        a recording cannot be read or written
     └── EstimationError       a window cannot be evaluated (never raised for "nothing found")
 
 Expected trouble in a live stream (a gap, a duplicate, a NaN) is a value, not an exception: see ``models.ingest``.
 """
 
-__all__ = ["BundleError", "EstimationError", "MachineFileError", "RecordingError", "RotorwatchError", "WireError"]
+__all__ = [
+    "BundleError",
+    "CheckpointError",
+    "EstimationError",
+    "MachineFileError",
+    "RecordingError",
+    "RotorwatchError",
+    "WireError",
+]
 
 
 class RotorwatchError(Exception):
@@ -29,6 +38,10 @@ class WireError(RotorwatchError):
 
 class BundleError(RotorwatchError):
     """A trained bundle is damaged or belongs to another machine; the message names what differs."""
+
+
+class CheckpointError(RotorwatchError):
+    """What a monitor remembered is damaged, or of another machine, file or version; the message says which."""
 
 
 class RecordingError(RotorwatchError):

@@ -11,11 +11,13 @@ import hashlib
 import json
 import math
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from models.alarm_names import ALARM_TEXT
 from models.errors import MachineFileError
 from models.physics.parameters import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
@@ -27,6 +29,7 @@ __all__ = [
     "IngestSettings",
     "Machine",
     "MachineFile",
+    "SuppressRule",
     "WindowSettings",
     "load_machine",
     "load_machine_file",
@@ -129,6 +132,9 @@ class IngestSettings(BaseModel):
     rate_tolerance: float = Field(default=1e-4, ge=0, lt=0.1, description="relative deviation of the sampling rate")
     max_jump_s: float = Field(default=3600.0, gt=0, description="a block further ahead than this is refused as future")
     resync_blocks: int = Field(default=10, ge=2, le=1000, description="blocks in a row that establish a stepped clock")
+    reorder_blocks: int = Field(
+        default=20, ge=0, le=1000, description="blocks that may wait for a missing one; 0 takes them as they arrive"
+    )
     no_data_after_s: float = Field(default=5.0, gt=0, le=3600, description="silence that is called no data")
 
 
@@ -151,6 +157,36 @@ class AlarmLimits(BaseModel):
         return self
 
 
+def _known_alarms(field: str, names: Iterable[str]) -> None:
+    unknown = sorted(set(names) - set(ALARM_TEXT))
+    if unknown:
+        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARM_TEXT)}")
+
+
+class SuppressRule(BaseModel):
+    """When some alarms are suppressed by design: while another alarm's condition is there, or outside some speed."""
+
+    model_config = _STRICT
+
+    alarms: tuple[str, ...] = Field(min_length=1, description="which, by name")
+    while_alarm: str | None = Field(default=None, description="as long as the condition of this alarm is there")
+    below_rpm: float | None = Field(default=None, gt=0, description="as long as the machine turns slower than this")
+    above_rpm: float | None = Field(default=None, gt=0, description="as long as the machine turns faster than this")
+    because: str = Field(min_length=1, max_length=200, description="reason, as operators will read it")
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Self:
+        _known_alarms("alarms", self.alarms)
+        given = [name for name in ("while_alarm", "below_rpm", "above_rpm") if getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected exactly one of while_alarm, below_rpm, above_rpm; found {given or 'none'}")
+        if self.while_alarm is not None:
+            _known_alarms("while_alarm", [self.while_alarm])
+            if self.while_alarm in self.alarms:
+                raise ValueError(f"while_alarm: {self.while_alarm} would suppress itself")
+        return self
+
+
 class AlarmSettings(BaseModel):
     """When a parameter change becomes an alarm; all times are data time."""
 
@@ -167,12 +203,23 @@ class AlarmSettings(BaseModel):
     )
     on_delay_s: float = Field(default=10.0, ge=0, le=86400, description="how long it must last before the alarm")
     off_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must be gone before it clears")
+    gap_s: float = Field(
+        default=1.0, ge=0, le=86400, description="shortest gap in the data that is an alarm; shorter ones are counted"
+    )
+    latching: tuple[str, ...] = Field(
+        default=(), description="alarms that stay, once cleared, until somebody resets them; by name"
+    )
+    longest_shelf_s: float = Field(
+        default=8 * 3600.0, gt=0, le=30 * 86400, description="longest time for which an alarm may be shelved"
+    )
+    suppress: tuple[SuppressRule, ...] = Field(default=(), description="when alarms are suppressed by design")
 
     @model_validator(mode="after")
     def _known(self) -> Self:
         unknown = sorted(set(self.parameters) - set(PARAMETERS))
         if unknown:
             raise ValueError(f"parameters {unknown} are not among {', '.join(PARAMETERS)}")
+        _known_alarms("latching", self.latching)
         return self
 
     def for_parameter(self, name: str) -> AlarmLimits:

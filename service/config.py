@@ -15,6 +15,8 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file, read_toml, validation_text
 from models.signals.link import LinkSettings
+from service.access_settings import AccessSettings, check_access
+from service.store.retention import Retention
 
 __all__ = [
     "DEFAULT_LISTEN",
@@ -41,7 +43,7 @@ class HttpSettings(BaseModel):
 
     model_config = _STRICT
 
-    host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on; the API has no password")
+    host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on")
     port: int = Field(default=8080, ge=0, le=65535, description="TCP port; 0 takes a free one, which is printed")
 
 
@@ -84,14 +86,26 @@ class QueueSettings(BaseModel):
 
 
 class HistorySettings(BaseModel):
-    """What is kept in memory for the HTTP API, per machine."""
+    """Where reports, alarms and what a restart needs are kept, and for how long."""
 
     model_config = _STRICT
 
-    reports: int = Field(
-        default=20_000, ge=1, le=10_000_000, description="window reports; about 6 kB each, one per hop"
+    url: str | None = Field(
+        default=None,
+        min_length=1,
+        description="database: sqlite:///FILE, relative to the settings file, or postgresql://USER:PASSWORD@HOST/NAME; "
+        "sqlite:///:memory: keeps nothing beyond the end of the program. Left out: history.sqlite in the user's state "
+        "folder",
     )
-    alarm_events: int = Field(default=5_000, ge=1, le=10_000_000, description="alarm events")
+    retention: Retention = Field(default=Retention(), description="how long what is kept; alarms are kept for ever")
+
+    @property
+    def database(self) -> str:
+        """The URL, or the one that holds if it is left out."""
+        if self.url is not None:
+            return self.url
+        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "rotorwatch"
+        return f"sqlite:///{folder / 'history.sqlite'}"
 
 
 class RecordingSettings(BaseModel):
@@ -172,11 +186,14 @@ class ServiceSettings(BaseSettings):
         description="Zenoh: role and endpoints; loopback only if left out",
     )
     http: HttpSettings = Field(default=HttpSettings(), description="HTTP API")
+    access: AccessSettings = Field(
+        default=AccessSettings(), description="who may use the HTTP API: holders of tokens, if left out"
+    )
     machines: tuple[MachineEntry, ...] = Field(
         default=(MachineEntry(file="lab", bundle="lab"),), min_length=1, description="machines to monitor"
     )
     queue: QueueSettings = Field(default=QueueSettings(), description="blocks that wait for evaluation")
-    history: HistorySettings = Field(default=HistorySettings(), description="what is kept for the HTTP API")
+    history: HistorySettings = Field(default=HistorySettings(), description="reports, alarms, restarts")
     recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
     replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
     log: LogSettings = Field(default=LogSettings(), description="log")
@@ -229,12 +246,31 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
         raise MachineFileError(f"environment: {error}") from error
     folder = Path() if path is None else path.parent
     entries = tuple(_resolved(entry, folder) for entry in settings.machines)
+    history = settings.history
+    if history.url is not None:
+        history = history.model_copy(update={"url": _beside(folder, history.url)})
     recording = settings.recording
     if recording.directory is not None:
         recording = recording.model_copy(update={"directory": str(folder / recording.directory)})
-    settings = settings.model_copy(update={"machines": entries, "recording": recording})
+    settings = settings.model_copy(
+        update={
+            "machines": entries,
+            "recording": recording,
+            "history": history,
+            "access": settings.access.beside(folder),
+        }
+    )
     check_distinct(place, settings)
+    check_access(str(place), settings.access, settings.http.host)
     return settings
+
+
+def _beside(folder: Path, url: str) -> str:
+    """The URL of an SQLite file with its path relative to a folder; any other URL as it is."""
+    scheme, separator, path = url.partition(":///")
+    if scheme != "sqlite" or not separator or path == ":memory:":
+        return url
+    return f"sqlite:///{folder.absolute() / path}"
 
 
 def _blame(place: Path, error: ValidationError) -> str:

@@ -2,10 +2,7 @@
 
 import hashlib
 import json
-import math
 from collections.abc import Iterable
-from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 
 from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.readings import EquationReading, ParameterReading
@@ -14,15 +11,11 @@ from models.diagnosis.verdict.detectable import DetectableChange, length_to_find
 from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.machine import MachineFile
 from models.physics.parameters import PARAMETER_TEXT
-from service.alarms import ALARM_TEXT, Alarm, AlarmEvent, AlarmState
-from service.monitor import DataQuality, HealthState, MachineHealth, WindowReport
+from service.alarm_conversion import Identity, alarm_entries, finite, rfc3339
+from service.reports import DataQuality, HealthState, MachineHealth, WindowReport
 from service.residuals import Opinion
 from service.schemas import Agreement as AgreementJson
-from service.schemas import Alarm as AlarmJson
 from service.schemas import (
-    AlarmCloudEvent,
-    AlarmEventData,
-    AlarmStates,
     Detectable,
     DetectableChanges,
     DetectableParameter,
@@ -40,28 +33,7 @@ from service.schemas import Equation as EquationJson
 from service.schemas import Opinion as OpinionJson
 from service.schemas import Parameter as ParameterJson
 
-__all__ = [
-    "Identity",
-    "alarm_cloud_event",
-    "alarm_states",
-    "detectable_changes",
-    "health",
-    "machine_description",
-    "machine_hash",
-    "report",
-]
-
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Who speaks: the machine and the exact files its monitor runs on."""
-
-    site: str
-    machine: str
-    bundle: str | None
-    machine_hash: str
+__all__ = ["detectable_changes", "health", "machine_description", "machine_hash", "report"]
 
 
 def machine_hash(machine: MachineFile) -> str:
@@ -79,8 +51,8 @@ def report(identity: Identity, window: WindowReport) -> Report:
         end_ns=window.end_ns,
         state=window.state,
         filled=window.filled,
-        speed_rad_s=_finite(window.speed_rad_s),
-        misfit_z=_finite(window.misfit_z),
+        speed_rad_s=finite(window.speed_rad_s),
+        misfit_z=finite(window.misfit_z),
         suspect=window.suspect,
         verdict=None if window.verdict is None else _verdict(window.verdict),
         parameters=_parameters(window.parameters),
@@ -105,6 +77,7 @@ def health(
     link_missed_blocks: int = 0,
     worker_errors: int = 0,
     last_worker_error: str = "",
+    restart: str = "",
 ) -> Health:
     """Convert a machine's health; with a reason for it, the state is no-data, and the alarms stay as they are."""
     latest = record.latest
@@ -127,61 +100,14 @@ def health(
         detectable=() if window is None else window.detectable,
         sensors=() if window is None else window.sensors,
         shapes=() if window is None else window.shapes,
-        alarms=_alarms(record.alarms, include_normal=False),
+        alarms=alarm_entries(record.alarms),
         quality=_quality(record.quality, queue_dropped_blocks, link_missed_blocks),
         stream=stream,
+        restart=restart,
         worker_errors=worker_errors,
         last_worker_error=last_worker_error,
         bundle=identity.bundle,
         machine_hash=identity.machine_hash,
-    )
-
-
-def alarm_states(identity: Identity, alarms: Iterable[Alarm], *, include_normal: bool = False) -> AlarmStates:
-    """Convert the alarms of a machine."""
-    return AlarmStates(
-        site=identity.site,
-        machine=identity.machine,
-        alarms=_alarms(alarms, include_normal=include_normal),
-        bundle=identity.bundle,
-        machine_hash=identity.machine_hash,
-    )
-
-
-def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
-    """Convert an alarm event."""
-    alarm = event.alarm
-    place = f"{identity.site}/{identity.machine}"
-    data = AlarmEventData.model_validate(
-        {
-            "site": identity.site,
-            "machine": identity.machine,
-            "parameter": alarm.parameter,
-            "text": event.text,
-            "kind": event.kind,
-            "severity": alarm.severity,
-            "time_ns": event.time_ns,
-            "raised_ns": alarm.raised_ns,
-            "occurrence": alarm.occurrence,
-            "sequence": event.sequence,
-            "relative_change": _finite(alarm.change),
-            "standard_error": _finite(alarm.standard_error),
-            "low_confidence": alarm.low_confidence,
-            "bundle": identity.bundle,
-            "machine_hash": identity.machine_hash,
-        }
-    )
-    return AlarmCloudEvent(
-        specversion="1.0",
-        # The data time is part of it because occurrences are counted anew when the monitor restarts.
-        id=f"{place}/{alarm.parameter}/{alarm.occurrence}/{event.kind}/{event.time_ns}",
-        source=f"/rotorwatch/{place}",
-        type=f"org.rotorwatch.alarm.{event.kind}",
-        subject=alarm.parameter,
-        time=_rfc3339(event.time_ns),
-        datacontenttype="application/json",
-        sequence=f"{event.sequence:020d}",
-        data=data,
     )
 
 
@@ -237,17 +163,12 @@ def detectable_changes(
     )
 
 
-def _finite(value: float | None) -> float | None:
-    """JSON has no infinity and no NaN: both become null."""
-    return value if value is not None and math.isfinite(value) else None
-
-
 def _parameters(readings: Iterable[ParameterReading]) -> tuple[ParameterJson, ...]:
     return tuple(_parameter(reading) for reading in readings)
 
 
 def _parameter(reading: ParameterReading) -> ParameterJson:
-    change, error = _finite(reading.change), _finite(reading.standard_error)
+    change, error = finite(reading.change), finite(reading.standard_error)
     known = change is not None and error is not None
     return ParameterJson(
         name=reading.name,
@@ -256,7 +177,7 @@ def _parameter(reading: ParameterReading) -> ParameterJson:
         relative_change=change,
         standard_error=error,
         interval_95=reading.interval if known else None,
-        z=_finite(reading.z) if known and error else None,
+        z=finite(reading.z) if known and error else None,
         reason=reading.reason,
     )
 
@@ -279,7 +200,7 @@ def _verdict(verdict: SequentialVerdict) -> Verdict:
         confidence=isolation.confidence,
         low_confidence=isolation.low_confidence,
         outside_model=isolation.outside,
-        outside_confidence=_finite(isolation.outside_confidence),
+        outside_confidence=finite(isolation.outside_confidence),
         decided_s=verdict.decided_s,
         settled=verdict.settled,
         current=_parameters(verdict.current),
@@ -307,7 +228,7 @@ def _verdict_text(verdict: SequentialVerdict) -> str:
 
 
 def _clock(time_ns: int) -> str:
-    return _rfc3339(time_ns)[11:19]
+    return rfc3339(time_ns)[11:19]
 
 
 def _opinion(opinion: Opinion) -> OpinionJson:
@@ -316,7 +237,7 @@ def _opinion(opinion: Opinion) -> OpinionJson:
         parameters=_parameters(opinion.parameters),
         agreement=tuple(
             AgreementJson(
-                name=one.name, between=one.between, verdict=one.verdict, difference_z=_finite(one.difference_z)
+                name=one.name, between=one.between, verdict=one.verdict, difference_z=finite(one.difference_z)
             )
             for one in opinion.agreement
         ),
@@ -333,8 +254,8 @@ def _equation(reading: EquationReading) -> EquationJson:
         equation=reading.equation,
         title=reading.title,
         evaluable=reading.evaluable,
-        msd=_finite(reading.msd),
-        msd_healthy=_finite(reading.msd_healthy),
+        msd=finite(reading.msd),
+        msd_healthy=finite(reading.msd_healthy),
         parameters=_parameters(reading.parameters),
         reason=reading.reason,
     )
@@ -342,37 +263,15 @@ def _equation(reading: EquationReading) -> EquationJson:
 
 def _sensors(findings: Iterable[SensorFinding]) -> tuple[SensorFault, ...]:
     return tuple(
-        SensorFault(
-            states=found.states, kind=found.kind, text=found.text, value=_finite(found.value), z=_finite(found.z)
-        )
+        SensorFault(states=found.states, kind=found.kind, text=found.text, value=finite(found.value), z=finite(found.z))
         for found in findings
     )
 
 
 def _shapes(shapes: Iterable[ChannelShape]) -> tuple[Shape, ...]:
     return tuple(
-        Shape(state=one.channel, verdict=one.state, z=_finite(one.z), limit=one.limit, text=one.sentence)
+        Shape(state=one.channel, verdict=one.state, z=finite(one.z), limit=one.limit, text=one.sentence)
         for one in shapes
-    )
-
-
-def _alarms(alarms: Iterable[Alarm], *, include_normal: bool) -> tuple[AlarmJson, ...]:
-    return tuple(
-        AlarmJson(
-            parameter=alarm.parameter,
-            text=ALARM_TEXT[alarm.parameter],
-            state=alarm.state,
-            raised=alarm.raised,
-            severity=alarm.severity,
-            since_ns=alarm.since_ns,
-            raised_ns=alarm.raised_ns,
-            occurrence=alarm.occurrence,
-            relative_change=_finite(alarm.change),
-            standard_error=_finite(alarm.standard_error),
-            low_confidence=alarm.low_confidence,
-        )
-        for alarm in alarms
-        if include_normal or alarm.state is not AlarmState.NORMAL
     )
 
 
@@ -387,8 +286,3 @@ def _quality(quality: DataQuality, queue_dropped_blocks: int, link_missed_blocks
         last_refusal=quality.last_refusal,
         last_gap=quality.last_gap,
     )
-
-
-def _rfc3339(time_ns: int) -> str:
-    moment = _EPOCH + timedelta(microseconds=time_ns // 1000)
-    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -36,6 +36,12 @@ __all__ = ["DemoError", "DemoOptions", "Outcome", "run_demo"]
 
 _START_S = 60.0
 _STOP_S = 10.0
+_ENVIRONMENT = {
+    "PYTHONUNBUFFERED": "1",
+    # A demo leaves nothing behind, and who runs it is the only one to look at it.
+    "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
+    "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
+}
 
 
 class DemoError(RotorwatchError):
@@ -208,10 +214,10 @@ def _show(message: TopicMessage, outcome: Outcome, console: Console, base: str) 
         event = AlarmCloudEvent.model_validate_json(message.text)
         console.print(alarm_event_line(event), style="bold white on red")
         if event.data.kind == "raised" and event.data.relative_change is not None:
-            outcome.raised[event.data.parameter] = event.data.relative_change
+            outcome.raised[event.data.name] = event.data.relative_change
             answer = httpx.get(f"{base}/alarms", timeout=_STOP_S)
             states = AlarmStates.model_validate_json(answer.content)
-            shown = {alarm.parameter for alarm in states.alarms if alarm.raised}
+            shown = {alarm.name for alarm in states.alarms if alarm.raised}
             outcome.over_http |= shown
             console.print(f"          over HTTP, {base}/alarms: {', '.join(sorted(shown)) or 'nothing'} raised")
 
@@ -251,7 +257,7 @@ def _program(name: str, module: str, *arguments: str) -> Iterator[_Program]:
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
-                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+                env=os.environ | _ENVIRONMENT,
             )
         try:
             yield _Program(name, process, output)

@@ -1,7 +1,8 @@
-"""Blocks of one machine between their arrival and their evaluation."""
+"""Blocks of one machine between their arrival and their evaluation, and what else its thread is to do."""
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -33,6 +34,7 @@ class Inbox:
         self._bound = bound
         self._wait = when_full == "wait"
         self._blocks: deque[RawBlock] = deque()
+        self._calls: deque[Callable[[], None]] = deque()
         self._changed = threading.Condition()
         self._closed = False
         self._dropped = 0
@@ -57,10 +59,20 @@ class Inbox:
                 self._blocks.append(block)
                 self._changed.notify_all()
 
-    def get(self) -> RawBlock | None:
-        """Take the oldest block, waiting for one; None after `close`."""
+    def call(self, function: Callable[[], None]) -> bool:
+        """Have a function called by the worker before the next block; False after `close`: it will not be."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or bool(self._blocks))
+            if not self._closed:
+                self._calls.append(function)
+                self._changed.notify_all()
+            return not self._closed
+
+    def get(self) -> RawBlock | Callable[[], None] | None:
+        """Take what is to be called, or else the oldest block, waiting for one; None after `close`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or bool(self._calls) or bool(self._blocks))
+            if self._calls:
+                return self._calls.popleft()
             if self._closed:
                 return None
             block = self._blocks.popleft()
@@ -68,7 +80,7 @@ class Inbox:
             return block
 
     def close(self) -> None:
-        """Wake everybody who waits; what is queued is dropped."""
+        """Wake everybody who waits; blocks that are queued are dropped, calls are still made."""
         with self._changed:
             self._closed = True
             self._blocks.clear()

@@ -48,7 +48,7 @@ def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
     """One line per raised alarm."""
     return tuple(
         f"{_clock(alarm.raised_ns or alarm.since_ns)}  {states.machine}  {alarm.severity.upper()} ({alarm.state}): "
-        f"{alarm.text}  {_change(alarm.parameter, alarm.relative_change, alarm.standard_error)}"
+        f"{alarm.text}  {_change(alarm.name, alarm.relative_change, alarm.standard_error)}"
         for alarm in states.alarms
         if alarm.raised
     )

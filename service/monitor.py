@@ -2,25 +2,30 @@
 
 ::
 
-    SampleBlock -> Gate -> SlidingWindow -> WindowEvaluator -> SequentialTest -> AlarmBook -> MonitorReport
-                 (ingest)  (correlations)     (residuals)     (what changed)     (alarms)
+    payload -> Arrivals -> Gate -> SlidingWindow -> WindowEvaluator -> SequentialTest -> AlarmBook -> MonitorReport
+               (order)   (ingest)  (correlations)     (residuals)     (what changed)     (alarms)
 
 `MachineMonitor` knows no network, clock or thread: all times are the data's own. Live running and replay are two ways
-of feeding it, and the same blocks give the same reports.
+of feeding it, and the same blocks give the same reports. What it remembers can be taken out between two blocks and put
+into another one, which goes on as if nothing had happened.
 """
 
 from collections import Counter
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from collections.abc import Collection
+from dataclasses import replace
 
+import numpy as np
+from models.arrivals import Arrivals
+
+from models.alarm_names import CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST, data_alarm
+from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
 from models.commissioning.installed import Installed
-from models.diagnosis.fallback.shape import ChannelShape
-from models.diagnosis.moments import plan_for
-from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
+from models.diagnosis.moments import HopMoments, plan_for
+from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sensors.finding import SensorFinding
-from models.diagnosis.verdict.detectable import DetectableChange, detectable_changes
-from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest, SequentialVerdict
+from models.diagnosis.sensors.finding import FAULT_KINDS, SensorFinding
+from models.diagnosis.verdict.detectable import detectable_changes
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
 from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError, WireError
@@ -28,136 +33,15 @@ from models.ingest import Gate, Reason, Verdict
 from models.signals.block import SampleBlock
 from models.signals.channels import with_channel_names
 from models.signals.wire import decode_block
-from service.alarms import MODEL, SENSOR, SHAPE, Alarm, AlarmBook, AlarmEvent, Severity
-from service.residuals import Evaluation, Opinion, evaluator_for
+from service.alarms.alarm import AlarmEvent, Evidence, Severity
+from service.alarms.book import AlarmBook
+from service.alarms.operation import Operation
+from service.reports import DataQuality, HealthState, MachineHealth, MonitorReport, MonitorState, WindowReport
+from service.residuals import Evaluation, evaluator_for
 
-__all__ = ["DataQuality", "HealthState", "MachineHealth", "MachineMonitor", "MonitorReport", "WindowReport"]
+__all__ = ["MachineMonitor"]
 
-
-class HealthState(StrEnum):
-    """Health of a machine in one word."""
-
-    WARMING = "warming"
-    HEALTHY = "healthy"
-    ALERT = "alert"
-    DANGER = "danger"
-    OUTSIDE_MODEL = "outside-model"
-    DATA_HEALTH = "data-health"
-    UNCHANGED = "unchanged"
-    NO_DATA = "no-data"
-    NOT_EVALUABLE = "not-evaluable"
-
-
-@dataclass(frozen=True, slots=True)
-class DataQuality:
-    """What came in since the monitor started.
-
-    Attributes
-    ----------
-    accepted : int
-        Blocks accepted.
-    refused : dict of str to int
-        Blocks refused, by reason.
-    gaps : int
-        Interruptions before accepted blocks.
-    missing_s : float
-        Data time that the gaps cost.
-    last_refusal : str
-        Latest reason for refusing a block, in a sentence.
-    last_gap : str
-        Latest gap, in a sentence.
-    """
-
-    accepted: int = 0
-    refused: tuple[tuple[str, int], ...] = ()
-    gaps: int = 0
-    missing_s: float = 0.0
-    last_refusal: str = ""
-    last_gap: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class WindowReport:
-    """One evaluation of the window, at the end of a hop.
-
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Oldest and newest data in the window.
-    state : HealthState
-        After this window: warming, healthy, alert, danger, outside-model, data-health, unchanged (no
-        equation can be evaluated, but every channel is as it was) or not-evaluable.
-    filled : float
-        Fraction of a full window.
-    speed_rad_s : float or None
-        Mean speed in the window.
-    parameters : tuple of ParameterReading
-        Readings of the whole window by the diagnostician that decides: the likelihood, or the baseline.
-    equations : tuple of EquationReading
-        The networks' opinion, equation by equation.
-    opinions : tuple of Opinion
-        What the other diagnosticians read, and whether they agree.
-    misfit_z : float or None
-        How far the window is from what the model can explain; standard normal where the model holds.
-    suspect : str
-        What explains the misfit best, if one thing does.
-    verdict : SequentialVerdict or None
-        What has changed since the machine was nominal; the alarms are decided on it.
-    detectable : tuple of DetectableChange
-        What would have been noticed in this window, parameter by parameter.
-    reason : str
-        Why the window was not evaluated; empty if it was.
-    sensors : tuple of SensorFinding
-        Faults of sensors in the window; with any of them nothing is said of the machine.
-    shapes : tuple of ChannelShape
-        Where no equation can be evaluated: whether each channel's vibration is as it was.
-    """
-
-    start_ns: int
-    end_ns: int
-    state: HealthState
-    filled: float
-    speed_rad_s: float | None = None
-    parameters: tuple[ParameterReading, ...] = ()
-    equations: tuple[EquationReading, ...] = ()
-    opinions: tuple[Opinion, ...] = ()
-    misfit_z: float | None = None
-    suspect: str = ""
-    verdict: SequentialVerdict | None = None
-    detectable: tuple[DetectableChange, ...] = ()
-    reason: str = ""
-    sensors: tuple[SensorFinding, ...] = ()
-    shapes: tuple[ChannelShape, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class MonitorReport:
-    """What one block did.
-
-    Attributes
-    ----------
-    verdict : Verdict
-        Accepted or refused, and why.
-    windows : tuple of WindowReport
-        One per hop that the block completed.
-    events : tuple of AlarmEvent
-        What operators should hear.
-    """
-
-    verdict: Verdict
-    windows: tuple[WindowReport, ...] = ()
-    events: tuple[AlarmEvent, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class MachineHealth:
-    """Where the machine stands: the latest window, the alarms, and the quality of the data."""
-
-    state: HealthState
-    filled: float
-    latest: WindowReport | None
-    alarms: tuple[Alarm, ...]
-    quality: DataQuality
+_RPM = 30 / np.pi
 
 
 class MachineMonitor:
@@ -174,6 +58,7 @@ class MachineMonitor:
         self._evaluator = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
+        self._arrivals = Arrivals(machine.ingest.reorder_blocks)
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
         settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
@@ -182,15 +67,27 @@ class MachineMonitor:
         self._quality = DataQuality()
         self._refused: Counter[str] = Counter()
         self._latest: WindowReport | None = None
+        self._end_ns: int | None = None
 
-    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> MonitorReport:
-        """Decode a message of the stream and take it as `step` does; undecodable bytes are a refusal like any other."""
+    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> tuple[MonitorReport, ...]:
+        """Decode a message of the stream and take what is in order now as `step` does.
+
+        Returns
+        -------
+        tuple of MonitorReport
+            One per block that was taken: none while a block waits for an earlier one, several when that has come.
+            Undecodable bytes are a refusal like any other.
+        """
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
             name = f"{self.machine.site}/{self.machine.name}"
-            return MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}")))
-        return self.step(block, schema_hash)
+            return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
+        return tuple(self.step(one.block, one.schema_hash) for one in self._arrivals.take(block, schema_hash))
+
+    def flush(self) -> tuple[MonitorReport, ...]:
+        """Take the blocks that wait for earlier ones: those will not come any more."""
+        return tuple(self.step(one.block, one.schema_hash) for one in self._arrivals.flush())
 
     def step(self, block: SampleBlock, schema_hash: str = "") -> MonitorReport:
         """Take one block: gate, window, evaluation, alarms.
@@ -215,19 +112,103 @@ class MachineMonitor:
         if verdict.clock_step_s:
             self._window.clear()
             self._test.clear()
-            self._alarms.clock_stepped(block.start_ns)
+            self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
         windows: list[WindowReport] = []
-        events: list[AlarmEvent] = []
+        events = list(self._stream_alarms(verdict, block.start_ns))
+        self._end_ns = block.end_ns
         for end_ns in self._window.feed(self._plan.to_si(block.samples), block.start_ns):
             report, heard = self._evaluate(end_ns)
             windows.append(report)
             events.extend(heard)
-        return MonitorReport(verdict, tuple(windows), tuple(events))
+        return MonitorReport(verdict, tuple(windows), tuple(events), float(block.samples.shape[0] / block.rate_hz))
+
+    def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Take note of time that has passed, with data or without.
+
+        Parameters
+        ----------
+        time_ns : int
+            Data time that has been reached by now, as far as anybody knows.
+        """
+        events = self._alarms.passed(time_ns)
+        lost_ns = round(self.machine.ingest.no_data_after_s * 1e9)
+        if self._end_ns is not None and time_ns - self._end_ns >= lost_ns:
+            events += self._lost(self._end_ns + lost_ns)
+        return events
+
+    @property
+    def end_ns(self) -> int | None:
+        """End of the newest data; None before the first."""
+        return self._end_ns
+
+    @property
+    def next_sequence(self) -> int:
+        """Number the next alarm event will have."""
+        return self._alarms.next_sequence
+
+    def operate(self, operation: Operation, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Do what an operator asks for, see `AlarmBook.operate`."""
+        return self._alarms.operate(operation, time_ns)
+
+    def state(self, kept: Collection[int] = ()) -> MonitorState:
+        """Everything that is remembered, to be put into another monitor.
+
+        Parameters
+        ----------
+        kept : collection of int
+            Ends of the hops that are stored already and need not be handed over again.
+        """
+        hops = self._window.hops
+        return MonitorState(
+            alarms=self._alarms.checkpoint(),
+            state=to_bytes(
+                {
+                    **prefixed("gate", self._gate.checkpoint()),
+                    **prefixed("window", self._window.checkpoint()),
+                    **prefixed("test", self._test.state.checkpoint()),
+                    **prefixed("evaluator", self._evaluator.checkpoint()),
+                    "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
+                }
+            ),
+            new_hops=tuple((hop.end_ns, to_bytes(hop.checkpoint())) for hop in hops if hop.end_ns not in kept),
+            hops=tuple(hop.end_ns for hop in hops),
+            end_ns=self._end_ns,
+        )
+
+    def restore(self, state: bytes, hops: Collection[bytes]) -> None:
+        """Go on where another monitor of the same machine, files and version stood; alarms are restored by themselves.
+
+        Raises
+        ------
+        CheckpointError
+            If the bytes are damaged or of another form; nothing is restored then.
+        """
+        arrays = from_bytes(state)
+        moments = tuple(HopMoments.restored(from_bytes(hop)) for hop in hops)
+        test = SequentialState.restored(unprefixed("test", arrays))
+        end_ns = int(arrays["end_ns"][0]) if arrays["end_ns"].size else None
+        self._gate.restore(unprefixed("gate", arrays))
+        self._window.restore(unprefixed("window", arrays), moments)
+        self._evaluator.restore(unprefixed("evaluator", arrays))
+        self._test.state = test
+        self._end_ns = end_ns
+        self._arrivals.resume(self._gate.courses)
+
+    def restore_alarms(self, alarms: str, next_sequence: int = 0) -> None:
+        """Go on with the alarms of another monitor, see `AlarmBook.restore`."""
+        self._alarms.restore(alarms, next_sequence)
 
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
         state = HealthState.WARMING if self._latest is None else self._latest.state
-        return MachineHealth(state, self._window.filled, self._latest, self._alarms.alarms, self._quality)
+        return MachineHealth(
+            state,
+            self._window.filled,
+            self._latest,
+            self._alarms.alarms,
+            self._quality,
+            self._alarms.next_sequence - 1,
+        )
 
     def _count(self, verdict: Verdict) -> Verdict:
         quality = self._quality
@@ -247,16 +228,53 @@ class MachineMonitor:
             )
         return verdict
 
+    def _stream_alarms(self, verdict: Verdict, start_ns: int) -> tuple[AlarmEvent, ...]:
+        """Alarms on the stream itself, at an accepted block."""
+        alarms, settings = self._alarms, self.machine
+        events: tuple[AlarmEvent, ...] = ()
+        if verdict.gap_s >= settings.ingest.no_data_after_s:
+            events += self._lost(start_ns - round((verdict.gap_s - settings.ingest.no_data_after_s) * 1e9))
+        events += alarms.update_state(STREAM_LOST, False, start_ns, at_once=True)
+        if verdict.gap_s > 0 and verdict.gap_s >= settings.alarms.gap_s:
+            events += alarms.update_state(GAP, True, start_ns, verdict.text, at_once=True)
+        if verdict.clock_step_s:
+            events += alarms.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
+        return events
+
+    def _lost(self, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
+        note = f"no data for {self.machine.ingest.no_data_after_s:g} s; what was raised stays raised"
+        return self._alarms.update_state(STREAM_LOST, True, time_ns, note, at_once=True)
+
+    def _sensor_alarms(
+        self, findings: tuple[SensorFinding, ...], statistics: WindowStatistics
+    ) -> tuple[AlarmEvent, ...]:
+        """One alarm for each kind of fault, with a sentence for each channel it is found in."""
+        said: dict[str, list[str]] = {}
+        for found in findings:
+            # Whatever is wrong with the shaft's angle costs the phase reference.
+            name = PHASE_REFERENCE if found.states == ("theta",) else data_alarm(found.kind)
+            said.setdefault(name, []).append(found.text)
+        evidence = Evidence(statistics.start_ns, statistics.end_ns)
+        events: tuple[AlarmEvent, ...] = ()
+        for name in (PHASE_REFERENCE, *map(data_alarm, FAULT_KINDS)):
+            note = "; ".join(said.get(name, ()))
+            events += self._alarms.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
+        return events
+
     def _evaluate(self, end_ns: int) -> tuple[WindowReport, tuple[AlarmEvent, ...]]:
         """Evaluate the window as it is after a completed hop."""
         filled = self._window.filled
+        events = self._alarms.update_state(GAP, False, end_ns) + self._alarms.update_state(CLOCK, False, end_ns)
         statistics = self._window.statistics()
         if statistics is None:
             report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
             self._latest = report
-            return report, ()
+            return report, events
+        speed_rad_s = statistics.speed_rad_s
+        events += self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
-        events = self._alarms.update_state(SENSOR, bool(findings), end_ns, "; ".join(each.text for each in findings))
+        events += self._sensor_alarms(findings, statistics)
         if findings:
             report = WindowReport(
                 statistics.start_ns,
@@ -286,7 +304,8 @@ class MachineMonitor:
         changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
         events += self._alarm(verdict, evaluation.deciding.suspect, end_ns)
         if evaluation.shapes:
-            events += self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed))
+            evidence = Evidence(statistics.start_ns, end_ns)
+            events += self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
         outside = verdict.isolation.outside
         report = WindowReport(
             start_ns=statistics.start_ns,
@@ -324,6 +343,7 @@ class MachineMonitor:
     def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> tuple[AlarmEvent, ...]:
         """Bring what was found to the alarms; without clean data they stay where they are."""
         named = {finding.name for finding in verdict.findings}
+        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.isolation.confidence)
         events: list[AlarmEvent] = []
         for reading in verdict.current:
             if reading.change is not None and reading.standard_error is not None:
@@ -335,11 +355,13 @@ class MachineMonitor:
                         end_ns,
                         named=reading.name in named,
                         low_confidence=verdict.isolation.outside,
+                        evidence=evidence,
                     )
                 )
         if verdict.current:
             note = f"best explained by: {suspect}" if suspect else ""
-            events.extend(self._alarms.update_state(MODEL, verdict.isolation.outside, end_ns, note))
+            outside = verdict.isolation.outside
+            events.extend(self._alarms.update_state(MODEL, outside, end_ns, note, evidence=evidence))
         return tuple(events)
 
     def _state(self, otherwise: HealthState) -> HealthState:

@@ -2,7 +2,7 @@
 
 import html
 
-from service.alarms import Severity
+from service.alarms.alarm import Severity
 from service.schemas import Health, Opinion, Parameter, Verdict
 
 __all__ = ["front_page"]
@@ -37,7 +37,7 @@ def _machine(health: Health) -> str:
     name = f"{health.site}/{health.machine}"
     place = f"/api/v1/machines/{name}"
     links = ", ".join(f'<a href="{place}/{part}">{part}</a>' for part in _ROUTES)
-    raised = {alarm.parameter: alarm.severity for alarm in health.alarms if alarm.raised}
+    raised = {alarm.name: alarm.severity for alarm in health.alarms if alarm.raised}
     reason = f"<p>{html.escape(health.reason)}</p>" if health.reason else ""
     suspect = f" Best explained by: {html.escape(health.suspect)}." if health.suspect else ""
     verdict = f"<p>{html.escape(health.verdict.text)}.{suspect}</p>" if health.verdict else ""

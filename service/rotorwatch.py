@@ -198,7 +198,7 @@ def status(
         healths = _fetch_healths(url.rstrip("/"))
         table = Table("machine", "state", "window", "raised alarms", "data age", "refused", "gaps", "why")
         for health in healths:
-            alarms = [f"{a.parameter} {a.severity}" for a in health.alarms if a.raised]
+            alarms = [f"{a.name} {a.severity}" for a in health.alarms if a.raised]
             age_s = health.stream.data_age_s
             table.add_row(
                 f"{health.site}/{health.machine}",
@@ -331,8 +331,9 @@ def _overridden(
         update["link"] = settings.link.model_copy(update=ends)
     if namespace is not None:
         update["link"] = in_namespace(update.get("link", settings.link), namespace)
-        # What is replayed must not end up among the recordings of the live machine.
+        # What is replayed must not end up among the recordings and in the history of the live machine.
         update["recording"] = settings.recording.model_copy(update={"directory": None})
+        update["history"] = settings.history.model_copy(update={"url": "sqlite:///:memory:"})
     if http_port is not None:
         update["http"] = settings.http.model_copy(update={"port": http_port})
     if when_full is not None:

@@ -6,13 +6,14 @@
     -------------            ----------------------              ----------            ------------
     stream callback --> Inbox --> MachineMonitor.step_payload
       (bounded, counts)           |        |        |            four times a second:
-                                  |        |        '--> snapshot --> health topic <-- /api/.../health
-                                  |        '--> History <------------------------------ /api/.../reports
-                                  '--> report, alarm topics
+                                  |                 '--> snapshot --> health topic <-- /api/.../health
+                                  '--> Store (one thread, commits) <----------------- /api/.../reports, alarms/events
+                                         '--> then report, alarm topics
     queries on health, alarm/state <-------------------- snapshot
 
 The main thread waits for a signal. Only a machine's own thread touches its monitor; everybody else reads immutable
-snapshots. Silence is noticed by the supervisor on the monotonic clock: no other time of this computer is used.
+snapshots, or asks it to do something between two blocks (operators; the passing of time, four times a second). Silence
+is noticed on the monotonic clock; the time of day is used for what is recorded when, and for how long a restart took.
 """
 
 import signal
@@ -25,11 +26,15 @@ from pathlib import Path
 from types import FrameType
 
 import uvicorn
+from fastapi import FastAPI
 
 from models.commissioning.installed import install
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.keys import MachineKeys
+from service.access.guard import Guard
+from service.access.tls import server_arguments
+from service.access_settings import AccessSettings
 from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
 from service.logs import logger
@@ -37,6 +42,7 @@ from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder
 from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
+from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.worker import MachineWorker
 
@@ -70,10 +76,9 @@ class Runtime:
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
+        self._installed = [install(entry.load(), entry.bundle) for entry in settings.machines]
         self._workers: list[MachineWorker] = []
-        for entry in settings.machines:
-            installed = install(entry.load(), entry.bundle)
-            self._workers.append(MachineWorker(installed, settings.queue, settings.history))
+        self.store = Store(settings.history.database, settings.history.retention)
         directory = settings.recording.directory
         self.catalogue = None if directory is None else Catalogue(Path(directory))
         self.replays = ReplayDesk(settings, self.catalogue)
@@ -127,13 +132,23 @@ class Runtime:
             If the Zenoh endpoints cannot be used.
         HttpError
             If the HTTP address cannot be listened on.
+        StoreError
+            If the history cannot be opened, or another monitor writes that of one of the machines.
         """
         with ExitStack() as undo:
-            server = _HttpServer(self.settings.http)  # takes the port first: the commonest mistake, the quickest check
+            # Takes the port first: the commonest mistake, the quickest check.
+            server = _HttpServer(self.settings.http, self.settings.access)
             undo.callback(server.stop)
+            guard = Guard(self.store.tokens, self.store.audit, self.settings.access, self.settings.http.host)
             self._link = Link(self.settings.link)
             undo.callback(self._link.close)
+            self.store.open()
+            undo.callback(self.store.close)
             links = []
+            for installed in self._installed:
+                machine = installed.machine
+                history = self.store.machine(machine.site, machine.name)
+                self._workers.append(MachineWorker(installed, self.settings.queue, history))
             for worker in self._workers:
                 self._record(worker.machine, self._link, undo)
                 links.append(self._connect(worker, self._link, undo))
@@ -142,7 +157,7 @@ class Runtime:
             supervisor.start()
             undo.callback(self.replays.close)
             self._server = server
-            server.start(self)
+            server.start(create_app(self, guard))
             self._undo = undo.pop_all()
         _log.info("running", http=server.url, machines=len(self._workers))
 
@@ -269,6 +284,7 @@ class _Supervisor:
         while True:
             for number, (worker, link) in enumerate(self._watched):
                 try:
+                    worker.tick()
                     self._look(number, worker, link)
                 except Exception:
                     # Nothing narrower: an error of any kind, Zenoh's while publishing or one in making up the health,
@@ -301,7 +317,8 @@ def _news(health: Health) -> Health:
 class _HttpServer:
     """The HTTP server in a thread of its own; the address is taken when it is built."""
 
-    def __init__(self, settings: HttpSettings) -> None:
+    def __init__(self, settings: HttpSettings, access: AccessSettings) -> None:
+        self._arguments = server_arguments(access)
         family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
         try:
             self._socket = socket.create_server((settings.host, settings.port), family=family)
@@ -310,13 +327,13 @@ class _HttpServer:
                 f"HTTP cannot listen on {settings.host} port {settings.port}: {error.strerror or error}"
             ) from error
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        self.url = f"http://{host}:{self._socket.getsockname()[1]}"
+        self.url = f"{'http' if access.tls is None else 'https'}://{host}:{self._socket.getsockname()[1]}"
         self._server: uvicorn.Server | None = None
         self._thread: threading.Thread | None = None
 
-    def start(self, runtime: Runtime) -> None:
+    def start(self, app: FastAPI) -> None:
         """Serve the API."""
-        config = uvicorn.Config(create_app(runtime), log_config=None, access_log=False, lifespan="off")
+        config = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", **self._arguments)
         server = self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=server.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True)
         self._thread.start()

@@ -5,13 +5,23 @@ intervals are plain ratios: 0.01 is one per cent. Times in ns count from 1970-01
 """
 
 import json
-from typing import Annotated, Literal, get_args, get_origin
+from typing import Annotated, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from models.signals.channels import Channel
-from service.alarms import AlarmState, Severity
-from service.monitor import HealthState
+from service.alarm_schemas import (
+    EXAMPLE_NS,
+    Alarm,
+    AlarmCloudEvent,
+    AlarmEventData,
+    AlarmStates,
+    BundleIdentity,
+    MachineHash,
+    Name,
+    Site,
+)
+from service.reports import HealthState
 from service.window_schemas import (
     JSON,
     Agreement,
@@ -53,26 +63,6 @@ __all__ = [
     "example",
 ]
 
-_NS = 1767225805000000000
-
-_Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
-_Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
-_Bundle = Annotated[
-    str | None,
-    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
-]
-_MachineHash = Annotated[
-    str,
-    Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
-]
-_AlarmParameter = Annotated[
-    str,
-    Field(description="k_by, c_by, k_bz, c_bz, e, EI, model (outside the model), sensor or shape", examples=["k_by"]),
-]
-_LowConfidence = Annotated[
-    bool,
-    Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
-]
 _State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
 
 
@@ -108,10 +98,10 @@ class Report(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
-    start_ns: int = Field(description="oldest data in the window", examples=[_NS - 60_000_000_000])
-    end_ns: int = Field(description="end of the newest data in the window", examples=[_NS])
+    site: Site
+    machine: Name
+    start_ns: int = Field(description="oldest data in the window", examples=[EXAMPLE_NS - 60_000_000_000])
+    end_ns: int = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
     state: _State
     filled: float = Field(description="fraction of a full window", examples=[1.0])
     speed_rad_s: float | None = Field(description="mean speed in the window", examples=[138.23])
@@ -127,43 +117,8 @@ class Report(BaseModel):
     sensors: _Sensors
     shapes: _Shapes
     reason: Reason
-    bundle: _Bundle
-    machine_hash: _MachineHash
-
-
-class Alarm(BaseModel):
-    """Alarm of one parameter, of the model, of the sensors, or of the shape of vibration."""
-
-    model_config = JSON
-
-    parameter: _AlarmParameter
-    text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
-    state: AlarmState = Field(
-        description="normal, pending (must last before it is raised), active, clearing (must last before it ends)",
-        examples=["active"],
-    )
-    raised: bool = Field(description="whether operators should see it: active or clearing", examples=[True])
-    severity: Severity = Field(
-        description="of the present occurrence while raised; otherwise of the last one", examples=["alert"]
-    )
-    since_ns: int = Field(description="data time at which `state` was entered", examples=[_NS])
-    raised_ns: int | None = Field(description="data time at which the present occurrence was raised", examples=[_NS])
-    occurrence: int = Field(description="how often it was raised since the monitor started", examples=[1])
-    relative_change: float | None = Field(description="latest relative change; null for model", examples=[-0.247])
-    standard_error: float | None = Field(description="its standard error", examples=[0.0071])
-    low_confidence: _LowConfidence
-
-
-class AlarmStates(BaseModel):
-    """The alarms of one machine that are not normal (or all of them, if asked for)."""
-
-    model_config = JSON
-
-    site: _Site
-    machine: _Name
-    alarms: tuple[Alarm, ...] = Field(description="one entry per parameter")
-    bundle: _Bundle
-    machine_hash: _MachineHash
+    bundle: BundleIdentity
+    machine_hash: MachineHash
 
 
 class Quality(BaseModel):
@@ -205,8 +160,8 @@ class Health(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
+    site: Site
+    machine: Name
     state: HealthState = Field(
         description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
         "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence; outranks everything, see "
@@ -215,8 +170,10 @@ class Health(BaseModel):
     )
     reason: str = Field(description="why the state is no-data or not-evaluable; empty otherwise", examples=[""])
     filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
-    window_start_ns: int | None = Field(description="oldest data of the latest window", examples=[_NS - 60_000_000_000])
-    window_end_ns: int | None = Field(description="end of the latest window", examples=[_NS])
+    window_start_ns: int | None = Field(
+        description="oldest data of the latest window", examples=[EXAMPLE_NS - 60_000_000_000]
+    )
+    window_end_ns: int | None = Field(description="end of the latest window", examples=[EXAMPLE_NS])
     speed_rad_s: float | None = Field(description="mean speed in the latest window", examples=[138.23])
     misfit_z: _MisfitZ
     suspect: _Suspect
@@ -230,57 +187,14 @@ class Health(BaseModel):
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
     quality: Quality = Field(description="what came in")
     stream: StreamStatus = Field(description="what is known about the publisher")
+    restart: str = Field(
+        description="what became of the state from before the latest start of the monitor; empty if there was none",
+        examples=["went on where it stood at 2026-01-01T00:02:55Z"],
+    )
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
     last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
-    bundle: _Bundle
-    machine_hash: _MachineHash
-
-
-class AlarmEventData(BaseModel):
-    """What happened to an alarm."""
-
-    model_config = JSON
-
-    site: _Site
-    machine: _Name
-    parameter: _AlarmParameter
-    text: str = Field(
-        description="the event in a sentence",
-        examples=["ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%"],
-    )
-    kind: Literal["raised", "escalated", "cleared"] = Field(description="what happened", examples=["raised"])
-    severity: Severity = Field(description="alert or danger", examples=["alert"])
-    time_ns: int = Field(description="data time of the event", examples=[_NS])
-    raised_ns: int | None = Field(description="data time at which this occurrence was raised", examples=[_NS])
-    occurrence: int = Field(description="how often the alarm was raised since the monitor started", examples=[1])
-    sequence: int = Field(description="counts the machine's events since the monitor started, from 0", examples=[0])
-    relative_change: float | None = Field(description="relative change that decided; null for model", examples=[-0.247])
-    standard_error: float | None = Field(description="its standard error", examples=[0.0071])
-    low_confidence: _LowConfidence
-    bundle: _Bundle
-    machine_hash: _MachineHash
-
-
-class AlarmCloudEvent(BaseModel):
-    """An alarm event as a CloudEvent 1.0 in structured JSON form."""
-
-    model_config = JSON
-
-    specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
-    id: str = Field(
-        description="the same however often the event is delivered: machine, parameter, occurrence, kind, data time",
-        examples=[f"demo/lab/k_by/1/raised/{_NS}"],
-    )
-    source: str = Field(description="the machine", examples=["/rotorwatch/demo/lab"])
-    type: str = Field(description="org.rotorwatch.alarm.<kind>", examples=["org.rotorwatch.alarm.raised"])
-    subject: str = Field(description="the parameter", examples=["k_by"])
-    time: str = Field(description="data time, RFC 3339, microseconds", examples=["2026-01-01T00:03:25.000000Z"])
-    datacontenttype: Literal["application/json"] = Field(description="of `data`", examples=["application/json"])
-    sequence: str = Field(
-        description="CloudEvents extension: order of the machine's events since the monitor started; sorts as text",
-        examples=["00000000000000000000"],
-    )
-    data: AlarmEventData = Field(description="what happened")
+    bundle: BundleIdentity
+    machine_hash: MachineHash
 
 
 class MachineDescription(BaseModel):
@@ -288,8 +202,8 @@ class MachineDescription(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
+    site: Site
+    machine: Name
     description: str = Field(description="from the machine file", examples=["Rotor kit with an overhung disc"])
     state: _State
     speed_rpm: float | None = Field(
@@ -306,8 +220,8 @@ class MachineDescription(BaseModel):
         description="Zenoh keys by name",
         examples=[{"stream": "rotorwatch/demo/lab/stream", "health": "rotorwatch/demo/lab/health"}],
     )
-    bundle: _Bundle
-    machine_hash: _MachineHash
+    bundle: BundleIdentity
+    machine_hash: MachineHash
 
 
 class DetectableParameter(BaseModel):
@@ -329,16 +243,16 @@ class DetectableChanges(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
-    window_end_ns: int | None = Field(description="end of the window this is computed from", examples=[_NS])
+    site: Site
+    machine: Name
+    window_end_ns: int | None = Field(description="end of the window this is computed from", examples=[EXAMPLE_NS])
     window_length_s: float = Field(description="length of the window", examples=[60.0])
     false_alarms_per_month: float = Field(description="declared in the machine file", examples=[1.0])
     change: float | None = Field(description="relative change asked for; null without", examples=[-0.05])
     parameters: tuple[DetectableParameter, ...] = Field(description="one entry per parameter that can be read")
     reason: str = Field(description="why there is no entry; empty otherwise", examples=[""])
-    bundle: _Bundle
-    machine_hash: _MachineHash
+    bundle: BundleIdentity
+    machine_hash: MachineHash
 
 
 class MachineReadiness(BaseModel):
@@ -346,8 +260,8 @@ class MachineReadiness(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
+    site: Site
+    machine: Name
     state: _State
     worker_alive: bool = Field(description="the thread that evaluates the machine's blocks runs", examples=[True])
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])

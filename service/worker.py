@@ -1,30 +1,82 @@
-"""One machine's thread: takes blocks out of the inbox, steps the monitor, hands on what comes out."""
+"""One machine's thread: takes blocks out of the inbox, steps the monitor, hands on what comes out.
+
+What a block brought and what the monitor remembers afterwards are committed to the history in one step; only then is
+anything published.
+"""
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from models.commissioning.installed import Installed
+from models.errors import RotorwatchError
 from service import conversion
-from service.config import HistorySettings, QueueSettings
-from service.conversion import Identity
+from service.alarm_conversion import Identity, alarm_states
+from service.alarm_schemas import AlarmCloudEvent, AlarmStates
+from service.alarms.alarm import AlarmEvent
+from service.alarms.book import NO_ALARMS
+from service.alarms.operation import Operation
+from service.config import QueueSettings
 from service.descriptor import descriptor_mismatch
-from service.history import History
 from service.inbox import Inbox, RawBlock
 from service.logs import Limiter, logger
-from service.monitor import MachineHealth, MachineMonitor, MonitorReport
-from service.schemas import (
-    AlarmCloudEvent,
-    AlarmStates,
-    DetectableChanges,
-    Health,
-    MachineDescription,
-    Report,
-    StreamStatus,
-)
+from service.monitor import MachineMonitor
+from service.remembered import checkpoint_step, restored, stored_event, stored_readings, stored_report
+from service.reports import MachineHealth, MonitorReport, WindowReport
+from service.schemas import DetectableChanges, Health, MachineDescription, StreamStatus
+from service.store.machine import MachineStore
+from service.store.records import Step, StoredEvent
 
-__all__ = ["MachineWorker", "Outlet"]
+__all__ = ["Clocks", "MachineWorker", "NotInTime", "Outlet", "Tally"]
+
+_OPERATION_S = 10.0
+_LATEST = 100
+
+
+class NotInTime(RotorwatchError):  # noqa: N818  # said to an operator, by its name
+    """The machine's thread did not get round to what was asked; whether it will be done is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """The computer's clocks; a test puts others in.
+
+    Attributes
+    ----------
+    monotonic_s : callable
+        Seconds that only pass.
+    utc_ns : callable
+        Time of day.
+    """
+
+    monotonic_s: Callable[[], float] = time.monotonic
+    utc_ns: Callable[[], int] = time.time_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What a worker has done since it started, for whoever measures the service.
+
+    Attributes
+    ----------
+    windows, blocks : int
+        Windows evaluated, blocks taken.
+    step_s : float
+        Time spent in the monitor altogether.
+    commit_s : float
+        Time spent waiting for the history altogether.
+    data_s : float
+        Length of the data taken altogether.
+    """
+
+    windows: int = 0
+    blocks: int = 0
+    step_s: float = 0.0
+    commit_s: float = 0.0
+    data_s: float = 0.0
 
 
 class Outlet(Protocol):
@@ -51,21 +103,25 @@ class MachineWorker:
     installed : Installed
         The machine file, and what was trained and commissioned for it.
     queue : QueueSettings
-    history : HistorySettings
-    clock : callable
-        Monotonic seconds; says how old the latest data are, nothing else.
+    history : MachineStore
+        Where everything is kept; what is there from an earlier run is gone on from.
+    clocks : Clocks
+        Say how old the latest data are and when things were recorded, nothing else.
+    on_events : callable
+        Called after alarm events were committed.
     """
 
     def __init__(
         self,
         installed: Installed,
         queue: QueueSettings,
-        history: HistorySettings,
-        clock: Callable[[], float] = time.monotonic,
+        history: MachineStore,
+        clocks: Clocks = Clocks(),  # immutable
+        on_events: Callable[[], None] = lambda: None,
     ) -> None:
         self.machine = machine = installed.machine
         self.inbox = Inbox(queue.blocks, queue.when_full)
-        self.history = History(history.reports, history.alarm_events)
+        self.history = history
         self.identity = Identity(
             site=machine.site,
             machine=machine.name,
@@ -74,20 +130,45 @@ class MachineWorker:
         )
         self.errors = 0
         self.last_error = ""
-        self._clock = clock
+        self.tally = Tally()
+        self._clocks = clocks
+        self._on_events = on_events
         self._log = logger(machine=f"{machine.site}/{machine.name}")
-        self._limiter = Limiter(clock)
-        self._monitor = MachineMonitor(installed)
+        self._limiter = Limiter(clocks.monotonic_s)
+        self._kept: tuple[int, ...] = ()
+        self._unpublished: tuple[StoredEvent, ...] = ()
+        self._asleep_s = 0.0
+        self._monitor, self.restart = self._restored(installed)
         self._snapshot: MachineHealth = self._monitor.health()
-        self._begin_s = clock()
+        self._begin_s = clocks.monotonic_s()
         self._latest_data_s: float | None = None
+        self._operated_ns = 0
         self._missed = 0
         self._publisher_alive = False
         self._mismatch: tuple[str, ...] = ()
         self._outlet: Outlet | None = None
-        self._published_alarms: tuple[tuple[str, str, str], ...] = ()
+        self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
         self._dropped_logged = 0
+        self._ticking = False
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.site}/{machine.name}", daemon=True)
+
+    def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
+        """A monitor that goes on from the history, if there is anything to go on from."""
+        last = self.history.last_sequence()
+        checkpoint = self.history.restore()
+        if checkpoint is None:
+            monitor = MachineMonitor(installed)
+            if last >= 0:
+                monitor.restore_alarms(NO_ALARMS, last + 1)
+            return monitor, ""
+        monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
+        self._kept = tuple(end_ns for end_ns, _ in checkpoint.hops) if monitor.end_ns is not None else ()
+        self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
+        # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
+        latest = self.history.events(after=last - _LATEST, limit=_LATEST)
+        self._unpublished = tuple(one for one in latest if one.recorded_ns >= checkpoint.head.recorded_ns)
+        self._log.info("restart", what=text)
+        return monitor, text
 
     @property
     def alive(self) -> bool:
@@ -97,7 +178,9 @@ class MachineWorker:
     def start(self, outlet: Outlet) -> None:
         """Start the thread; it publishes to `outlet`."""
         self._outlet = outlet
-        self._begin_s = self._clock()
+        self._begin_s = self._clocks.monotonic_s()
+        for event in self._unpublished:
+            outlet.publish_alarm_event(event.text)
         self._thread.start()
 
     def stop(self) -> None:
@@ -128,7 +211,7 @@ class MachineWorker:
 
     def health(self) -> Health:
         """Where the machine stands now."""
-        now_s = self._clock()
+        now_s = self._clocks.monotonic_s()
         latest_s = self._latest_data_s
         silent_s = now_s - (self._begin_s if latest_s is None else latest_s)
         limit_s = self.machine.ingest.no_data_after_s
@@ -149,11 +232,13 @@ class MachineWorker:
             link_missed_blocks=self._missed,
             worker_errors=self.errors,
             last_worker_error=self.last_error,
+            restart=self.restart,
         )
 
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
-        return conversion.alarm_states(self.identity, self._snapshot.alarms, include_normal=include_normal)
+        snapshot = self._snapshot
+        return alarm_states(self.identity, snapshot.alarms, snapshot.sequence, include_normal=include_normal)
 
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
@@ -163,20 +248,80 @@ class MachineWorker:
         """Identity, stream, keys, and the present state."""
         return conversion.machine_description(self.identity, self.machine, self.health().state)
 
-    def reports(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[Report, ...]:
-        """Window reports with since_ns ≤ end_ns < until_ns, newest first."""
-        found = self.history.reports(since_ns, until_ns, limit)
-        return tuple(conversion.report(self.identity, window) for window in found)
+    def operate(self, operation: Operation) -> tuple[AlarmCloudEvent, ...]:
+        """Do what an operator asks for, on the machine's thread, and say what happened.
 
-    def alarm_events(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[AlarmCloudEvent, ...]:
-        """Alarm events with since_ns ≤ time_ns < until_ns, newest first."""
-        found = self.history.alarm_events(since_ns, until_ns, limit)
-        return tuple(conversion.alarm_cloud_event(self.identity, event) for event in found)
+        Raises
+        ------
+        UnknownAlarm, OperationConflict, OperationRefused
+            As `AlarmBook.operate`.
+        NotInTime
+            If the thread does not answer.
+        """
+        done: Future[tuple[AlarmCloudEvent, ...]] = Future()
+
+        def work() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                time_ns = self._operated_ns = max(self._data_now_ns(), self._operated_ns + 1)
+                events = self._monitor.operate(operation, time_ns)
+                done.set_result(tuple(AlarmCloudEvent.model_validate_json(text) for text in self._conclude((), events)))
+            except Exception as error:  # belongs to whoever asked; the thread goes on
+                done.set_exception(error)
+
+        if not self.inbox.call(work):
+            raise NotInTime(f"{self._place}: the monitor is being stopped")
+        try:
+            return done.result(_OPERATION_S)
+        except TimeoutError as error:
+            if done.cancel():
+                raise NotInTime(f"{self._place}: busy for {_OPERATION_S:g} s; nothing was done") from error
+            raise NotInTime(
+                f"{self._place}: busy for {_OPERATION_S:g} s; look at the alarm before trying again"
+            ) from error
+
+    def tick(self) -> None:
+        """Let the machine's thread notice that time passes, with data or without; called every now and then."""
+        if not self._ticking:
+            self._ticking = True
+            self.inbox.call(self._tick)
+
+    @property
+    def _place(self) -> str:
+        return f"{self.machine.site}/{self.machine.name}"
+
+    def _data_now_ns(self) -> int:
+        """Data time that has been reached: end of the newest data, and what has passed since."""
+        end_ns = self._monitor.end_ns
+        if end_ns is None:
+            return self._clocks.utc_ns()
+        now_s = self._clocks.monotonic_s()
+        if self._latest_data_s is None:
+            return end_ns + round((self._asleep_s + now_s - self._begin_s) * 1e9)
+        return end_ns + round((now_s - self._latest_data_s) * 1e9)
+
+    def _tick(self) -> None:
+        self._ticking = False
+        if len(self.inbox) or self._monitor.end_ns is None:
+            return  # time passes with the blocks that wait
+        silent_s = self._clocks.monotonic_s() - (self._begin_s if self._latest_data_s is None else self._latest_data_s)
+        if silent_s < self.machine.ingest.no_data_after_s:
+            # After a restart the publishers get as long to come back as a silence may last.
+            if self._latest_data_s is not None:
+                self._conclude((), self._monitor.passed(self._data_now_ns()))
+            return
+        for report in self._monitor.flush():
+            self._conclude_report(report)
+        self._conclude((), self._monitor.passed(self._data_now_ns()))
 
     def _run(self) -> None:
-        while (block := self.inbox.get()) is not None:
+        while (item := self.inbox.get()) is not None:
             try:
-                self._take(block)
+                if isinstance(item, RawBlock):
+                    self._take(item)
+                else:
+                    item()
             except Exception as error:  # one bad block must not end the monitoring of the machine
                 self.errors += 1
                 self.last_error = f"{type(error).__name__}: {error}"
@@ -184,24 +329,65 @@ class MachineWorker:
                     self._log.exception("a block was lost to an error in the monitor", withheld=withheld)
 
     def _take(self, block: RawBlock) -> None:
-        report = self._monitor.step_payload(block.payload, block.attachment, block.encoding)
-        self._snapshot = self._monitor.health()
-        self.history.add(report.windows, report.events)
+        begin_s = self._clocks.monotonic_s()
+        reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding)
+        tally = self.tally
+        self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
+        for report in reports:
+            self._conclude_report(report)
+
+    def _conclude_report(self, report: MonitorReport) -> None:
         self._explain(report)
         if report.verdict.accepted:
-            self._latest_data_s = self._clock()
-        self._publish(report)
+            self._latest_data_s = self._clocks.monotonic_s()
+            self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
+        self._conclude(report.windows, report.events)
 
-    def _publish(self, report: MonitorReport) -> None:
+    def _conclude(self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...]) -> tuple[str, ...]:
+        """Commit, then publish; returns the events as they are published."""
+        self._snapshot = self._monitor.health()
+        if not windows and not events:
+            return ()
+        recorded_ns = self._clocks.utc_ns()
+        state = self._monitor.state(self._kept)
+        reports = tuple(stored_report(self.identity, window) for window in windows)
+        told = tuple(stored_event(self.identity, event, recorded_ns) for event in events)
+        step = Step(
+            reports=reports,
+            readings=stored_readings(windows),
+            events=told,
+            checkpoint=checkpoint_step(self.identity, state, recorded_ns),
+        )
+        begin_s = self._clocks.monotonic_s()
+        if not self.history.commit(step):
+            self._warn("history", "the history cannot be written; what happened waits in memory and is published")
+        self._kept = state.hops
+        tally = self.tally
+        self.tally = replace(
+            tally,
+            windows=tally.windows + len(windows),
+            commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s,
+        )
+        self._publish([one.text for one in reports], [one.text for one in told])
+        for event in events:
+            self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
+        if events:
+            self._on_events()
+        return tuple(one.text for one in told)
+
+    def _publish(self, reports: Iterable[str], events: Iterable[str]) -> None:
         outlet = self._outlet
-        if outlet is None or not report.windows:
+        if outlet is None:
             return
-        for window in report.windows:
-            outlet.publish_report(conversion.report(self.identity, window).model_dump_json())
-        for event in report.events:
-            outlet.publish_alarm_event(conversion.alarm_cloud_event(self.identity, event).model_dump_json())
+        for text in reports:
+            outlet.publish_report(text)
+        for text in events:
+            outlet.publish_alarm_event(text)
         # The latest change of each alarm is in every report; here only what an operator would call news.
-        now = tuple((alarm.parameter, alarm.state.value, alarm.severity.value) for alarm in self._snapshot.alarms)
+        now = tuple(
+            (alarm.name, alarm.version, alarm.beyond_ns is None, alarm.small_ns is None)
+            for alarm in self._snapshot.alarms
+        )
         if now != self._published_alarms:
             self._published_alarms = now
             outlet.publish_alarm_state(self.alarms().model_dump_json())
@@ -216,8 +402,6 @@ class MachineWorker:
         if dropped > self._dropped_logged:
             self._warn("dropped", "cannot keep up, blocks dropped", count=dropped - self._dropped_logged)
             self._dropped_logged = dropped
-        for event in report.events:
-            self._log.warning("alarm", kind=event.kind, text=event.text, time_ns=event.time_ns)
 
     def _warn(self, kind: str, text: str, **details: object) -> None:
         withheld = self._limiter.admit(kind)

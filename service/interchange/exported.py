@@ -165,8 +165,8 @@ def alarm_table(selection: Selection) -> Table:
     """Alarm events, one row each."""
     fields = [
         _field("time_ns", pa.int64(), "ns", "data time of the event"),
-        _field("parameter", pa.string(), "", "parameter, or model"),
-        _field("kind", pa.string(), "", "raised, escalated or cleared"),
+        _field("name", pa.string(), "", "the alarm"),
+        _field("kind", pa.string(), "", "raised, escalated, cleared, or what an operator or a rule did"),
         _field("severity", pa.string(), "", "alert or danger"),
         _field("text", pa.string(), "", "the event in a sentence"),
         _field("relative_change", pa.float64(), "1", "relative change that decided"),
@@ -175,6 +175,9 @@ def alarm_table(selection: Selection) -> Table:
         _field("raised_ns", pa.int64(), "ns", "when this occurrence was raised"),
         _field("occurrence", pa.int64(), "1", "how often it was raised"),
         _field("sequence", pa.int64(), "1", "counts the machine's events"),
+        _field("state", pa.string(), "", "of the alarm after the event"),
+        _field("actor", pa.string(), "", "who did it; empty for the monitor"),
+        _field("reason", pa.string(), "", "why"),
         _field("id", pa.string(), "", "the same however often the event is delivered"),
     ]
     return _message_table(selection, "alarm/event", fields, _alarm_row, "time_ns")
@@ -316,7 +319,7 @@ def _report_row(payload: bytes) -> _Row:
 
 def _alarm_row(payload: bytes) -> _Row:
     event = AlarmCloudEvent.model_validate_json(payload)
-    names = ("time_ns", "parameter", "kind", "severity", "text", "relative_change", "standard_error")
-    more = ("low_confidence", "raised_ns", "occurrence", "sequence")
+    names = ("time_ns", "name", "kind", "severity", "text", "relative_change", "standard_error")
+    more = ("low_confidence", "raised_ns", "occurrence", "sequence", "state", "actor", "reason")
     row: _Row = {name: getattr(event.data, name) for name in (*names, *more)}
     return {**row, "id": event.id}

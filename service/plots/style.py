@@ -174,7 +174,7 @@ def time_axis(axes: Axes, *, vertical: bool = False) -> None:
 
 def alarm_text(alarm: AlarmEventData) -> str:
     """An alarm event in two words."""
-    return f"{alarm.parameter} cleared" if alarm.kind == "cleared" else f"{alarm.severity} {alarm.parameter}"
+    return f"{alarm.name} cleared" if alarm.kind == "cleared" else f"{alarm.severity} {alarm.name}"
 
 
 def alarm_lines(axes: Axes, alarms: Iterable[AlarmEventData], *, vertical: bool = False) -> None:

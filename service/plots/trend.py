@@ -14,14 +14,19 @@ from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import FloatArray
 from models.signals.keys import PREFIX, MachineKeys
+from service.alarms.alarm import EventKind
 from service.conversion import machine_hash
-from service.monitor import HealthState
 from service.replay.choice import choose_machine
 from service.replay.offline import OfflineReplay
 from service.replay.source import RecordingSource
+from service.reports import HealthState
 from service.schemas import AlarmCloudEvent, AlarmEventData, Report
 
-__all__ = ["ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of"]
+__all__ = ["SHOWN", "ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of"]
+
+
+SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
+"""Events that say something of the machine; what operators did to alarms is left out of the picture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +142,8 @@ def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to
             event = AlarmCloudEvent.model_validate_json(message.payload)
         except ValidationError:
             continue
-        found[event.id] = event.data
+        if event.data.kind in SHOWN:
+            found[event.id] = event.data
     return tuple(sorted(found.values(), key=lambda data: data.time_ns))
 
 

@@ -9,17 +9,16 @@ import time
 from collections.abc import Callable
 
 from models.commissioning.installed import Installed
-from models.errors import WireError
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
-from models.signals.wire import decode_block
 from service import conversion
-from service.conversion import Identity
+from service.alarm_conversion import Identity, alarm_cloud_event
 from service.descriptor import descriptor_mismatch
-from service.monitor import MachineMonitor, MonitorReport
+from service.monitor import MachineMonitor
 from service.replay.control import Control
 from service.replay.schemas import OfflineSummary, ReplayProgress
 from service.replay.source import RecordingSource
+from service.reports import MonitorReport
 
 __all__ = ["OfflineReplay", "result_lines"]
 
@@ -31,7 +30,7 @@ def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -
         for window in report.windows
     ]
     timed += [
-        (event.time_ns, 1, keys.alarm_event, conversion.alarm_cloud_event(identity, event).model_dump_json())
+        (event.time_ns, 1, keys.alarm_event, alarm_cloud_event(identity, event).model_dump_json())
         for event in report.events
     ]
     ordered = sorted(timed, key=lambda entry: entry[:2])  # stable: several events of one window keep their order
@@ -116,6 +115,9 @@ class OfflineReplay:
             self._take(message)
             if on_progress is not None:
                 on_progress(self._progress(message.log_time_ns))
+        if not control.stopped:
+            for report in self._monitor.flush():
+                self._note(report)
         return self._summary(time.perf_counter() - begin_s, stopped=control.stopped)
 
     def _describe(self, message: RecordedMessage) -> None:
@@ -123,9 +125,11 @@ class OfflineReplay:
         self._differences = tuple(dict.fromkeys((*self._differences, *found)))
 
     def _take(self, message: RecordedMessage) -> None:
-        report = self._monitor.step_payload(message.payload, message.attachment, self._encoding(message.encoding))
-        if report.verdict.accepted:
-            self._data_s += _length_s(message)
+        for report in self._monitor.step_payload(message.payload, message.attachment, self._encoding(message.encoding)):
+            self._note(report)
+
+    def _note(self, report: MonitorReport) -> None:
+        self._data_s += report.data_s
         self._windows += len(report.windows)
         self._alarms += len(report.events)
         for line in result_lines(self.identity, self._machine.keys, report):
@@ -166,7 +170,7 @@ class OfflineReplay:
             machine_hash=self.identity.machine_hash,
             windows=self._windows,
             alarms=self._alarms,
-            raised=tuple(alarm.parameter for alarm in health.alarms if alarm.raised),
+            raised=tuple(alarm.name for alarm in health.alarms if alarm.raised),
             blocks=quality.accepted,
             refused_blocks=dict(quality.refused),
             last_refusal=quality.last_refusal,
@@ -179,11 +183,3 @@ class OfflineReplay:
             stopped=stopped,
             sha256=self._digest.hexdigest(),
         )
-
-
-def _length_s(message: RecordedMessage) -> float:
-    try:
-        block, _ = decode_block(message.payload, message.attachment, message.encoding)
-    except WireError:
-        return 0.0
-    return float(block.samples.shape[0] / block.rate_hz)

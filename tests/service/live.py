@@ -21,7 +21,8 @@ from models.machine import MachineFile, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
-from service.config import HttpSettings, MachineEntry, QueueSettings, ServiceSettings
+from service.access_settings import AccessSettings
+from service.config import HistorySettings, HttpSettings, MachineEntry, QueueSettings, ServiceSettings
 from service.runtime import Runtime, running
 from service.schemas import Health
 from service.worker import MachineWorker
@@ -51,6 +52,8 @@ ROOT = Path(__file__).parents[2]
 LAB = load_machine("lab")
 START_NS = 1_767_225_600_000_000_000
 _USED_PORTS: set[int] = set()
+_ALONE = {"ROTORWATCH_HISTORY__URL": "sqlite:///:memory:", "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true"}
+"""Unless a test says otherwise, programs leave nothing behind and are open to everybody on this computer."""
 
 
 def endpoint() -> str:
@@ -102,6 +105,8 @@ def settings(
     return ServiceSettings(
         link=LinkSettings(listen=(listen,)),
         http=HttpSettings(port=0),
+        history=HistorySettings(url="sqlite:///:memory:"),
+        access=AccessSettings(open_on_loopback=True),
         machines=(MachineEntry(file=machine, bundle=bundle),),
         queue=QueueSettings.model_validate({"blocks": bound, "when_full": when_full}),
     )
@@ -246,7 +251,7 @@ def program(folder: Path, *arguments: str, **environment: str) -> Iterator[Progr
             stdin=subprocess.DEVNULL,
             stdout=out_file,
             stderr=err_file,
-            env={**os.environ, "COLUMNS": "200", **environment},
+            env={**os.environ, "COLUMNS": "200", **_ALONE, **environment},
         )
     try:
         yield Program(process, out, err)

@@ -45,7 +45,7 @@ def lines_of(worker: MachineWorker) -> list[str]:
         for window in reversed(worker.history.reports(limit=most))
     ]
     timed += [
-        (event.time_ns, 1, keys.alarm_event, conversion.alarm_cloud_event(worker.identity, event).model_dump_json())
+        (event.time_ns, 1, keys.alarm_event, alarm_cloud_event(worker.identity, event).model_dump_json())
         for event in reversed(worker.history.alarm_events(limit=most))
     ]
     timed.sort(key=lambda entry: entry[:2])

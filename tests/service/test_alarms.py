@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from models.alarm_names import MODEL, STREAM_LOST
 from models.machine import AlarmSettings
-from service.alarms import MODEL, AlarmBook, AlarmEvent, AlarmState, Severity
+from service.alarms.alarm import AlarmEvent, Severity
+from service.alarms.book import AlarmBook
 
 CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6}
 MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}
@@ -58,7 +60,7 @@ def test_a_change_must_have_been_found() -> None:
 def test_outside_the_model_is_an_alarm_of_its_own() -> None:
     book = AlarmBook(SETTINGS)
     told = [event for n in range(4) for event in book.update_state(MODEL, True, n * 5_000_000_000)]
-    assert [(event.kind, event.alarm.parameter) for event in told] == [("raised", "model")]
+    assert [(event.kind, event.alarm.name) for event in told] == [("raised", "model")]
     assert told[0].text.startswith("ALERT: outside the model: something has changed that no parameter describes")
     assert not book.update("e", 0.3, 0.01, 0, named=True, low_confidence=True)
     (event,) = book.update("e", 0.3, 0.01, 10**10, named=True, low_confidence=True)
@@ -72,7 +74,7 @@ def test_a_large_change_clears_no_alarm_however_uncertain_it_is(error: float) ->
     _, book, _ = play("xxx")
     for number in range(3, 10):
         assert not book.update("k_by", -0.2, error, number * 5_000_000_000, named=False)
-    assert book.alarms[0].state is AlarmState.ACTIVE
+    assert book.alarms[0].raised
 
 
 def test_events_carry_occurrence_sequence_severity_and_a_sentence() -> None:
@@ -103,7 +105,7 @@ def test_own_limits_of_a_parameter() -> None:
 def test_a_stepped_clock_restarts_the_delays() -> None:
     book = AlarmBook(SETTINGS)
     assert not book.update("k_by", -0.2, 0.01, 10**18, named=True)
-    book.clock_stepped(10**9)
+    book.clock_stepped(10**9, 10**9 - 10**18)
     assert not book.update("k_by", -0.2, 0.01, 2 * 10**9, named=True)
     assert book.update("k_by", -0.2, 0.01, 12 * 10**9, named=True)[0].kind == "raised"
 
@@ -114,3 +116,23 @@ def test_raised_and_cleared_alternate(story: str) -> None:
     kinds = [event.kind for event in events if event.kind != "escalated"]
     assert kinds == ["raised", "cleared"] * (len(kinds) // 2) + ["raised"] * (len(kinds) % 2)
     assert any(alarm.raised for alarm in book.alarms) == (len(kinds) % 2 == 1)
+
+
+def test_missing_data_and_data_health_are_alarms_of_their_own_and_not_of_the_machine() -> None:
+    _, book, _ = play("xxx")
+    (event,) = book.update_state(STREAM_LOST, True, 10**11, "no data for 5 s", at_once=True)
+    assert event.text == "ALERT: stream lost: no data for 5 s"
+    assert book.present("k_by")
+    assert not book.update_state(STREAM_LOST, True, 2 * 10**11, at_once=True)
+    (event,) = book.update_state(STREAM_LOST, False, 3 * 10**11, at_once=True)
+    assert event.text == "cleared: data come again"
+    empty = AlarmBook(SETTINGS)
+    empty.update_state("data-stuck", True, 0, "y1 stands still", at_once=True)
+    assert empty.severity is None
+    assert empty.alarms[0].raised
+
+
+def test_what_was_never_seen_makes_no_alarm() -> None:
+    book = AlarmBook(SETTINGS)
+    assert not book.update_state("data-gap", False, 0)
+    assert book.alarms == ()

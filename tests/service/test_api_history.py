@@ -7,13 +7,14 @@ import pytest
 
 from models.diagnosis.readings import EquationReading, ParameterReading
 from service import conversion
-from service.alarms import Alarm, AlarmEvent, AlarmState
+from service.alarms.alarm import Alarm, AlarmEvent
+from service.alarms.life_cycle import AlarmState
 from service.history import History
-from service.monitor import DataQuality, HealthState, MachineHealth, WindowReport
+from service.reports import DataQuality, HealthState, MachineHealth, WindowReport
 from service.schemas import AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report, StreamStatus, example
 from tests.service.live import LAB
 
-IDENTITY = conversion.Identity("demo", "lab", None, conversion.machine_hash(LAB))
+IDENTITY = Identity("demo", "lab", None, conversion.machine_hash(LAB))
 
 
 def window(end_ns: int) -> WindowReport:
@@ -123,8 +124,8 @@ def test_no_data_outranks_a_raised_alarm_and_hides_it_not() -> None:
 
 def test_event_identity_is_stable_and_differs_between_kinds_and_occurrences() -> None:
     alarm = Alarm("k_by", AlarmState.ACTIVE, occurrence=2)
-    same = [conversion.alarm_cloud_event(IDENTITY, AlarmEvent("raised", 77, 3, alarm)).id for _ in range(2)]
-    other = conversion.alarm_cloud_event(IDENTITY, AlarmEvent("escalated", 77, 4, alarm))
+    same = [alarm_cloud_event(IDENTITY, AlarmEvent("raised", 77, 3, alarm)).id for _ in range(2)]
+    other = alarm_cloud_event(IDENTITY, AlarmEvent("escalated", 77, 4, alarm))
     assert same == ["demo/lab/k_by/2/raised/77"] * 2
     assert other.id != same[0]
     assert other.sequence > "00000000000000000003"

@@ -11,9 +11,11 @@ from models.commissioning.installed import Installed
 from models.errors import BundleError
 from models.machine import AlarmSettings, MachineFile
 from models.signals.block import SampleBlock
-from service.alarms import AlarmEvent
-from service.conversion import Identity, report
-from service.monitor import HealthState, MachineMonitor, WindowReport
+from service.alarms.alarm import AlarmEvent
+from service.alarm_conversion import Identity
+from service.conversion import report
+from service.monitor import MachineMonitor
+from service.reports import HealthState, WindowReport
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
     LAB,

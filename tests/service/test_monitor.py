@@ -11,8 +11,9 @@ from models.ingest import Reason
 from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
-from service.alarms import AlarmEvent
-from service.monitor import HealthState, MachineMonitor, WindowReport
+from service.alarms.alarm import AlarmEvent
+from service.monitor import MachineMonitor
+from service.reports import HealthState, WindowReport
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 

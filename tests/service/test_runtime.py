@@ -16,7 +16,8 @@ from models.signals.link import LinkSettings
 from service import conversion
 from service.config import HttpSettings, MachineEntry, ServiceSettings
 from service.logs import Limiter
-from service.monitor import MachineMonitor, MonitorReport
+from service.monitor import MachineMonitor
+from service.reports import MonitorReport
 from service.runtime import HttpError, Runtime, running
 from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report
 from service.transport import LinkError, TopicMessage, follow
@@ -61,7 +62,7 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
             published = [Report.model_validate_json(text) for text in topics.texts("/report")]
             assert published == [conversion.report(worker.identity, window) for window in windows]
             (event,) = [AlarmCloudEvent.model_validate_json(text) for text in topics.texts("/alarm/event")]
-            assert event == conversion.alarm_cloud_event(worker.identity, events[0])
+            assert event == alarm_cloud_event(worker.identity, events[0])
             states = AlarmStates.model_validate_json(topics.texts("/alarm/state")[-1])
             assert [(alarm.parameter, alarm.state) for alarm in states.alarms] == [("c_bz", "active")]
 

@@ -2,13 +2,16 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from models.signals.channels import Channel, state_name
 
-__all__ = ["FaultKind", "Naming", "SensorFinding", "implicated"]
+__all__ = ["FAULT_KINDS", "FaultKind", "Naming", "SensorFinding", "implicated"]
 
 FaultKind = Literal["stuck", "clipped", "offset", "gain", "delay", "swapped", "incoherent"]
+
+FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
+"""All kinds of fault."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,215 @@
+"""JSON of alarms that leaves the monitor: what they are now, and what happened to them."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, Field
+
+from service.alarms.alarm import EventKind, Severity
+from service.alarms.life_cycle import AlarmState
+from service.window_schemas import JSON
+
+__all__ = [
+    "EXAMPLE_NS",
+    "Alarm",
+    "AlarmCloudEvent",
+    "AlarmEventData",
+    "AlarmStates",
+    "BundleIdentity",
+    "Evidence",
+    "MachineHash",
+    "Name",
+    "Shelf",
+    "Site",
+]
+
+EXAMPLE_NS = 1767225805000000000
+
+Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
+Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
+BundleIdentity = Annotated[
+    str | None,
+    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
+]
+MachineHash = Annotated[
+    str,
+    Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
+]
+
+_STATE_TEXT = (
+    "normal, unacknowledged, acknowledged, returned (cleared, not acknowledged), latched-unacknowledged or "
+    "latched-acknowledged (cleared, to be reset), shelved, suppressed (by a rule), out-of-service"
+)
+_AlarmName = Annotated[
+    str,
+    Field(
+        description="k_by, c_by, k_bz, c_bz, e, EI, model (outside the model), shape (vibration changed), data-... "
+        "(data health, by kind) or stream-lost",
+        examples=["k_by"],
+    ),
+]
+_AlarmChange = Annotated[
+    float | None, Field(description="relative change that decided; null for what is no parameter", examples=[-0.247])
+]
+_AlarmError = Annotated[float | None, Field(description="its standard error", examples=[0.0071])]
+_AlarmInterval = Annotated[
+    tuple[float, float] | None, Field(description="its 95 % interval", examples=[(-0.261, -0.233)])
+]
+_LowConfidence = Annotated[
+    bool,
+    Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
+]
+_Note = Annotated[str, Field(description="what is known of it, in a sentence; empty for a parameter", examples=[""])]
+
+
+class Evidence(BaseModel):
+    """The data an alarm was decided on."""
+
+    model_config = JSON
+
+    start_ns: int = Field(description="oldest data", examples=[EXAMPLE_NS - 20_000_000_000])
+    end_ns: int = Field(description="end of the newest data", examples=[EXAMPLE_NS])
+    confidence: float | None = Field(
+        description="probability that what is named changed and nothing else; null where none is computed",
+        examples=[0.996],
+    )
+
+
+_Evidence = Annotated[
+    Evidence | None, Field(description="the data that decided; null where it is no window or none has decided")
+]
+
+
+class Shelf(BaseModel):
+    """Why an alarm is shelved, and until when."""
+
+    model_config = JSON
+
+    until_ns: int = Field(
+        description="data time at which it ends at the latest", examples=[EXAMPLE_NS + 3_600_000_000_000]
+    )
+    one_shot: bool = Field(description="it ends when the condition clears, if that is earlier", examples=[False])
+    by: str = Field(description="who", examples=["anna"])
+    reason: str = Field(description="why", examples=["sensor cable is being replaced"])
+
+
+class Alarm(BaseModel):
+    """One alarm of a machine: of a parameter, the model, the data, or the stream."""
+
+    model_config = JSON
+
+    name: _AlarmName
+    text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
+    state: AlarmState = Field(description=_STATE_TEXT, examples=["unacknowledged"])
+    pending: bool = Field(
+        description="its condition has begun to show, and must last before it is raised", examples=[False]
+    )
+    clearing: bool = Field(
+        description="its condition no longer shows, which must last before it clears", examples=[False]
+    )
+    present: bool = Field(description="its condition is there, delays included", examples=[True])
+    raised: bool = Field(
+        description="its condition is there and operators are to see it: not shelved, suppressed or out of service",
+        examples=[True],
+    )
+    severity: Severity = Field(
+        description="of the present occurrence while its condition is there; otherwise of the last one",
+        examples=["alert"],
+    )
+    since_ns: int = Field(description="data time at which `state` was entered", examples=[EXAMPLE_NS])
+    raised_ns: int | None = Field(description="data time at which the present occurrence began", examples=[EXAMPLE_NS])
+    occurrence: int = Field(description="how often its condition began, across restarts", examples=[1])
+    relative_change: _AlarmChange
+    standard_error: _AlarmError
+    interval_95: _AlarmInterval
+    low_confidence: _LowConfidence
+    note: _Note
+    evidence: _Evidence
+    shelf: Shelf | None = Field(description="only while shelved", examples=[None])
+    suppressed_by: str = Field(description="rules that suppress it now, in words; empty if none", examples=[""])
+    out_of_service_by: str = Field(description="who took it out of service; empty otherwise", examples=[""])
+    out_of_service_reason: str = Field(description="and why", examples=[""])
+    version: int = Field(
+        description="sequence number of its latest event, -1 before the first; give it back with what you want done, "
+        "and it is done only if nothing has happened in between",
+        examples=[0],
+    )
+
+
+class AlarmStates(BaseModel):
+    """The alarms of one machine that are not normal (or all there have been, if asked for)."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    alarms: tuple[Alarm, ...] = Field(description="one entry per alarm")
+    sequence: int = Field(
+        description="sequence number of the machine's latest event; -1 before the first", examples=[0]
+    )
+    bundle: BundleIdentity
+    machine_hash: MachineHash
+
+
+class AlarmEventData(BaseModel):
+    """What happened to an alarm."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    name: _AlarmName
+    text: str = Field(
+        description="the event in a sentence",
+        examples=["ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%"],
+    )
+    kind: EventKind = Field(
+        description="raised, escalated (alert to danger), cleared; or what an operator or a rule did: acknowledged, "
+        "reset, shelved, unshelved, suppressed, unsuppressed, removed-from-service, returned-to-service",
+        examples=["raised"],
+    )
+    before: AlarmState = Field(description="state of the alarm before the event", examples=["normal"])
+    state: AlarmState = Field(description="state after it", examples=["unacknowledged"])
+    annunciated: bool = Field(
+        description="operators are to hear of it: the alarm is not shelved, suppressed or out of service",
+        examples=[True],
+    )
+    severity: Severity = Field(description="alert or danger", examples=["alert"])
+    time_ns: int = Field(description="data time of the event", examples=[EXAMPLE_NS])
+    raised_ns: int | None = Field(description="data time at which this occurrence began", examples=[EXAMPLE_NS])
+    occurrence: int = Field(description="how often the condition of the alarm began, across restarts", examples=[1])
+    sequence: int = Field(
+        description="counts the machine's events from 0, without a gap, across restarts", examples=[0]
+    )
+    relative_change: _AlarmChange
+    standard_error: _AlarmError
+    interval_95: _AlarmInterval
+    low_confidence: _LowConfidence
+    note: _Note
+    evidence: _Evidence
+    actor: str = Field(description="who did it; empty for the monitor itself", examples=[""])
+    reason: str = Field(description="why, in the words of the actor or the rule", examples=[""])
+    bundle: BundleIdentity
+    machine_hash: MachineHash
+    program_version: str = Field(description="version of the monitor that wrote the event", examples=["0.1.0"])
+
+
+class AlarmCloudEvent(BaseModel):
+    """An alarm event as a CloudEvent 1.0 in structured JSON form."""
+
+    model_config = JSON
+
+    specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
+    id: str = Field(
+        description="the same however often the event is delivered: machine, alarm, occurrence, kind, data time",
+        examples=[f"demo/lab/k_by/1/raised/{EXAMPLE_NS}"],
+    )
+    source: str = Field(description="the machine", examples=["/rotorwatch/demo/lab"])
+    type: str = Field(description="org.rotorwatch.alarm.<kind>", examples=["org.rotorwatch.alarm.raised"])
+    subject: str = Field(description="the alarm, by its name", examples=["k_by"])
+    time: str = Field(description="data time, RFC 3339, microseconds", examples=["2026-01-01T00:03:25.000000Z"])
+    datacontenttype: Literal["application/json"] = Field(description="of `data`", examples=["application/json"])
+    sequence: str = Field(
+        description="CloudEvents extension: counts the machine's events without a gap, across restarts; sorts as text",
+        examples=["00000000000000000000"],
+    )
+    data: AlarmEventData = Field(description="what happened")

@@ -1,0 +1,1 @@
+"""Alarms of one machine: life cycle, delays, shelving and suppression. Pure: time comes in as an argument."""

@@ -1,0 +1,124 @@
+"""Life cycle of an alarm after ISA-18.2 / IEC 62682, as a table; ``docs/alarms.md`` shows the same table.
+
+::
+
+                  condition                      acknowledge
+      NORMAL ------------------> UNACKNOWLEDGED -------------> ACKNOWLEDGED
+        ^  ^                       |   ^     ^ escalate             | |
+        |  |            clear      v   |     '---------------------'  |
+        |  '--- acknowledge --- RETURNED                              |
+        |                                       clear                 |
+        '-------------------------------------------------------------'
+
+A latching alarm goes to a latched state where others return, and leaves it by *reset*. From every state an alarm can be
+taken away from the operator's eyes: shelved, suppressed by design, out of service. It goes on following its condition
+there, and on leaving it is unacknowledged if the condition is there, normal if not.
+"""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+
+__all__ = ["REFUSED", "STAYS", "TABLE", "AlarmState", "Cell", "Happening", "follow"]
+
+
+class AlarmState(StrEnum):
+    """Where an alarm is."""
+
+    NORMAL = "normal"
+    UNACKNOWLEDGED = "unacknowledged"
+    ACKNOWLEDGED = "acknowledged"
+    RETURNED = "returned"
+    LATCHED_UNACKNOWLEDGED = "latched-unacknowledged"
+    LATCHED_ACKNOWLEDGED = "latched-acknowledged"
+    SHELVED = "shelved"
+    SUPPRESSED = "suppressed"
+    OUT_OF_SERVICE = "out-of-service"
+
+    @property
+    def annunciated(self) -> bool:
+        """Whether operators are told of what happens to the alarm."""
+        return self not in {AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE}
+
+
+class Happening(StrEnum):
+    """What can happen to an alarm."""
+
+    CONDITION = "condition"
+    CLEAR = "clear"
+    ESCALATE = "escalate"
+    ACKNOWLEDGE = "acknowledge"
+    RESET = "reset"
+    SHELVE = "shelve"
+    UNSHELVE = "unshelve"
+    SUPPRESS = "suppress"
+    UNSUPPRESS = "unsuppress"
+    REMOVE_FROM_SERVICE = "remove-from-service"
+    RETURN_TO_SERVICE = "return-to-service"
+
+
+STAYS = "stays"
+"""The happening is taken note of, and the state stays as it is."""
+
+REFUSED = "refused"
+"""Nobody may ask for this in this state."""
+
+Cell = str | tuple[AlarmState, AlarmState]
+"""A state, `STAYS`, `REFUSED`, or two states: for *clear* without and with latching, otherwise without and with the
+condition there."""
+
+_N, _U, _A, _R = AlarmState.NORMAL, AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED, AlarmState.RETURNED
+_LU, _LA = AlarmState.LATCHED_UNACKNOWLEDGED, AlarmState.LATCHED_ACKNOWLEDGED
+_SH, _SU, _OOS = AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE
+_ROWS: Mapping[Happening, tuple[Cell, ...]] = {
+    # from:              normal   unackn.   ackn.     returned  latched-u latched-a shelved  suppressed out of service
+    Happening.CONDITION: (_U,      STAYS,    STAYS,    _U,       _U,       _U,       STAYS,    STAYS,    STAYS),
+    Happening.CLEAR:     (STAYS,   (_R, _LU), (_N, _LA), STAYS,  STAYS,    STAYS,    STAYS,    STAYS,    STAYS),
+    Happening.ESCALATE:  (STAYS,   STAYS,    _U,       STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    STAYS),
+    Happening.ACKNOWLEDGE: (REFUSED, _A,     REFUSED,  _N,       _LA,      REFUSED,  REFUSED,  REFUSED,  REFUSED),
+    Happening.RESET:     (REFUSED, REFUSED,  REFUSED,  REFUSED,  _R,       _N,       REFUSED,  REFUSED,  REFUSED),
+    Happening.SHELVE:    (_SH,     _SH,      _SH,      _SH,      _SH,      _SH,      STAYS,    REFUSED,  REFUSED),
+    Happening.UNSHELVE:  (REFUSED, REFUSED,  REFUSED,  REFUSED,  REFUSED,  REFUSED,  (_N, _U), REFUSED,  REFUSED),
+    Happening.SUPPRESS:  (_SU,     _SU,      _SU,      _SU,      _SU,      _SU,      STAYS,    STAYS,    STAYS),
+    Happening.UNSUPPRESS: (STAYS,  STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    (_N, _U), STAYS),
+    Happening.REMOVE_FROM_SERVICE: (_OOS, _OOS, _OOS,  _OOS,     _OOS,     _OOS,     _OOS,     _OOS,     REFUSED),
+    Happening.RETURN_TO_SERVICE: (REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, (_N, _U)),
+}  # fmt: skip
+
+TABLE: Mapping[tuple[AlarmState, Happening], Cell] = MappingProxyType(
+    {(state, happening): row[at] for happening, row in _ROWS.items() for at, state in enumerate(AlarmState)}
+)
+"""What becomes of an alarm in a state when something happens."""
+
+
+def follow(state: AlarmState, happening: Happening, *, present: bool, latching: bool) -> AlarmState | None:
+    """The state an alarm goes to.
+
+    Parameters
+    ----------
+    state : AlarmState
+        Where it is.
+    happening : Happening
+        What happens.
+    present : bool
+        Whether the condition is there, after what happens.
+    latching : bool
+        Whether the alarm latches.
+
+    Returns
+    -------
+    AlarmState or None
+        None if that is refused in this state.
+
+    Examples
+    --------
+    >>> follow(AlarmState.UNACKNOWLEDGED, Happening.CLEAR, present=False, latching=False).value
+    'returned'
+    """
+    cell = TABLE[state, happening]
+    if isinstance(cell, tuple):
+        without, with_ = cell
+        return with_ if (latching if happening is Happening.CLEAR else present) else without
+    if cell == REFUSED:
+        return None
+    return state if cell == STAYS else AlarmState(cell)

@@ -1,0 +1,125 @@
+"""What of a monitor goes into the history with every hop, and how a monitor comes back from it."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+from models.errors import CheckpointError
+from service.alarm_conversion import PROGRAM_VERSION, Identity, alarm_cloud_event, rfc3339
+from service.alarms.alarm import AlarmEvent
+from service.alarms.book import NO_ALARMS
+from service.conversion import report as report_json
+from service.monitor import MachineMonitor
+from service.reports import MonitorState, WindowReport
+from service.store.records import Checkpoint, CheckpointHead, CheckpointStep, StoredEvent, StoredReading, StoredReport
+
+__all__ = ["FORMAT", "checkpoint_step", "restored", "stored_event", "stored_readings", "stored_report"]
+
+FORMAT = 1
+"""Goes up when what a monitor remembers changes its form."""
+
+
+def stored_report(identity: Identity, window: WindowReport) -> StoredReport:
+    """A window report as it is published."""
+    text = report_json(identity, window).model_dump_json()
+    return StoredReport(window.start_ns, window.end_ns, window.state.value, window.filled, text)
+
+
+def stored_readings(windows: Iterable[WindowReport]) -> tuple[StoredReading, ...]:
+    """Parameters, residuals of the equations, misfit and speed of each window, as points in time."""
+    found = []
+    for window in windows:
+        points: list[tuple[str, str, float | None, float | None]] = [
+            ("misfit", "misfit", window.misfit_z, None),
+            ("speed", "speed", window.speed_rad_s, None),
+        ]
+        points += [("parameter", one.name, one.change, one.standard_error) for one in window.parameters]
+        points += [("equation", one.equation, one.msd, None) for one in window.equations]
+        found += [
+            StoredReading(window.end_ns, quantity, name, value, error)
+            for quantity, name, value, error in points
+            if value is not None
+        ]
+    return tuple(found)
+
+
+def stored_event(identity: Identity, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
+    """An alarm event as it is published."""
+    said = alarm_cloud_event(identity, event)
+    return StoredEvent(
+        sequence=event.sequence,
+        id=said.id,
+        time_ns=event.time_ns,
+        recorded_ns=recorded_ns,
+        kind=event.kind.value,
+        alarm=event.alarm.name,
+        severity=event.alarm.severity.value,
+        state=event.alarm.state.value,
+        occurrence=event.alarm.occurrence,
+        actor=event.actor,
+        text=said.model_dump_json(),
+    )
+
+
+def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -> CheckpointStep:
+    """What a monitor remembers, for the history."""
+    head = CheckpointHead(
+        format=FORMAT,
+        bundle=identity.bundle,
+        machine_hash=identity.machine_hash,
+        code_version=PROGRAM_VERSION,
+        end_ns=state.end_ns or 0,
+        recorded_ns=recorded_ns,
+        alarms=state.alarms,
+        state=state.state,
+    )
+    return CheckpointStep(head, state.new_hops, state.hops)
+
+
+def restored(
+    build: Callable[[], MachineMonitor], identity: Identity, checkpoint: Checkpoint, next_sequence: int
+) -> tuple[MachineMonitor, str]:
+    """A monitor that goes on from what was remembered, as far as that fits.
+
+    Alarms are restored whatever else differs; windows and tests only if the files and the program are the same.
+
+    Parameters
+    ----------
+    build : callable
+        Gives a new monitor.
+    identity : Identity
+        Of the machine, as it is now.
+    checkpoint : Checkpoint
+        From the history.
+    next_sequence : int
+        Lowest number the next alarm event may have.
+
+    Returns
+    -------
+    MachineMonitor, str
+        The monitor, and what became of the past, in a sentence.
+    """
+    head, monitor = checkpoint.head, build()
+    at = rfc3339(head.end_ns) if head.end_ns else "the beginning, before any data"
+    differs = _differences(head, identity)
+    if not differs:
+        try:
+            monitor.restore(head.state, tuple(data for _, data in checkpoint.hops))
+        except CheckpointError as error:
+            monitor, differs = build(), [str(error)]
+    try:
+        monitor.restore_alarms(head.alarms, next_sequence)
+    except CheckpointError as error:
+        monitor.restore_alarms(NO_ALARMS, next_sequence)
+        return monitor, f"all alarms begin anew: {error}"
+    if differs:
+        return monitor, f"alarms are as they were at {at}; the window fills anew: {'; '.join(differs)}"
+    return monitor, f"went on where it stood at {at}"
+
+
+def _differences(head: CheckpointHead, identity: Identity) -> Sequence[str]:
+    pairs = {
+        "form of what is remembered": (head.format, FORMAT),
+        "machine file": (head.machine_hash, identity.machine_hash),
+        "bundle": (head.bundle, identity.bundle),
+        "program version": (head.code_version, PROGRAM_VERSION),
+    }
+    return [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]
