@@ -8,17 +8,27 @@
 
 Time comes from the blocks alone. A clock that was set (back, or far ahead) is believed after a number of consecutive
 blocks that agree with each other; until then its blocks are refused and counted.
+
+A repetition changes nothing but the count of refused blocks, whenever it comes: the gate remembers the courses of the
+stream, also those of earlier runs and from before a clock was set, and those it did not believe.
 """
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
 
+from models.checkpoint import checked
+from models.errors import CheckpointError
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 
-__all__ = ["Gate", "Reason", "Verdict"]
+__all__ = ["EARLIER_COURSES", "Course", "Gate", "Reason", "Verdict"]
+
+EARLIER_COURSES = 64
+"""Courses that are remembered, so that repetitions of their blocks are known as such."""
 
 
 _SURELY_S = 1.0
@@ -71,13 +81,41 @@ class Verdict:
         return self.accepted and not self.text
 
 
-@dataclass(slots=True)
-class _Expected:
-    """Where the stream is: what the next block should start with."""
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Blocks of one run in which sequence and time went on together: what was received, and what comes next.
+
+    Attributes
+    ----------
+    run : int
+    first, first_ns : int
+        Sequence and time of its first block.
+    sequence, start_ns : int
+        What the next block should start with.
+    """
 
     run: int
+    first: int
+    first_ns: int
     sequence: int
     start_ns: int
+
+    @classmethod
+    def beginning(cls, block: SampleBlock) -> "Course":
+        """A course of one block."""
+        return cls(block.run, block.sequence, block.start_ns, block.sequence + 1, block.end_ns)
+
+    def extended(self, block: SampleBlock) -> "Course":
+        """Return the same up to the end of a later block."""
+        return replace(self, sequence=block.sequence + 1, start_ns=block.end_ns)
+
+    def covers(self, block: SampleBlock) -> bool:
+        """Whether a block lies within: it was received, or its place has been passed over."""
+        return (
+            block.run == self.run
+            and self.first <= block.sequence < self.sequence
+            and self.first_ns <= block.start_ns < self.start_ns
+        )
 
 
 class Gate:
@@ -97,9 +135,15 @@ class Gate:
         self._names = tuple(channel.name for channel in machine.sensors)
         self._schema_hash = machine.descriptor.schema_hash
         self._tolerance_ns = round(machine.ingest.time_tolerance_s * 1e9)
-        self._expected: _Expected | None = None
-        self._candidate: _Expected | None = None
-        self._candidate_blocks = 0
+        self._expected: Course | None = None
+        self._candidate: Course | None = None
+        self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
+        self._refused: deque[Course] = deque(maxlen=EARLIER_COURSES)
+
+    @property
+    def courses(self) -> tuple[Course, ...]:
+        """What was accepted, the present course last; empty before the first block."""
+        return (*self._earlier, *(() if self._expected is None else (self._expected,)))
 
     def judge(self, block: SampleBlock, schema_hash: str = "") -> Verdict:
         """Accept or refuse a block.
@@ -112,6 +156,32 @@ class Gate:
             Schema hash the sender named, empty if it named none.
         """
         return self._form(block, schema_hash) or self._place(block)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything that is remembered, as named arrays."""
+        return {
+            "courses": _course_array(self.courses),
+            "candidate": _course_array(() if self._candidate is None else (self._candidate,)),
+            "refused": _course_array(tuple(self._refused)),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+
+        Raises
+        ------
+        CheckpointError
+            If they are not a gate's; nothing is changed then.
+        """
+        courses, candidates, refused = (_courses(arrays, name) for name in ("courses", "candidate", "refused"))
+        self._expected = courses[-1] if courses else None
+        self._earlier = deque(courses[:-1], maxlen=EARLIER_COURSES)
+        self._refused = deque(refused, maxlen=EARLIER_COURSES)
+        self._candidate = candidates[-1] if candidates else None
 
     def _refuse(self, reason: Reason, text: str) -> Verdict:
         return Verdict(reason, f"{self._name}: {text}")
@@ -159,6 +229,14 @@ class Gate:
             self._follow(block)
             return Verdict()
         late_ns = block.start_ns - expected.start_ns
+        if any(course.covers(block) for course in self._earlier):
+            return self._refuse(
+                Reason.OVERLAP,
+                f"block {block.sequence} of run {block.run} was there before the publisher restarted or its clock was "
+                "set: a repetition",
+            )
+        if any(course.covers(block) for course in self._refused):
+            return self._refuse(Reason.OVERLAP, f"block {block.sequence} was refused before: a repetition")
         if abs(late_ns) <= self._tolerance_ns:
             if block.run == expected.run and block.sequence != expected.sequence:
                 return self._resynchronise(
@@ -208,24 +286,59 @@ class Gate:
     def _resynchronise(self, block: SampleBlock, reason: Reason, text: str) -> Verdict:
         """Refuse, unless enough consecutive blocks agree that this is where the stream is now."""
         candidate = self._candidate
+        if candidate is not None and candidate.covers(block):
+            return self._refuse(reason, f"{text}; a repetition")
         if (
             candidate is None
             or block.run != candidate.run
             or block.sequence != candidate.sequence
             or abs(block.start_ns - candidate.start_ns) > self._tolerance_ns
         ):
-            self._candidate_blocks = 0
-        self._candidate = _Expected(block.run, block.sequence + 1, block.end_ns)
-        self._candidate_blocks += 1
-        if self._candidate_blocks < self._settings.resync_blocks:
+            self._disbelieve()
+            candidate = Course.beginning(block)
+        else:
+            candidate = candidate.extended(block)
+        self._candidate = candidate
+        if candidate.sequence - candidate.first < self._settings.resync_blocks:
             return self._refuse(reason, text)
         previous = self._expected
         step_s = 0.0 if previous is None else (block.start_ns - previous.start_ns) / 1e9
-        self._follow(block)
+        self._candidate = None
+        self._go_on(candidate)
         return Verdict(
             text=f"{self._name}: the stream's clock stepped by {step_s:.6g} s; following it", clock_step_s=step_s
         )
 
     def _follow(self, block: SampleBlock) -> None:
-        self._expected = _Expected(block.run, block.sequence + 1, block.end_ns)
-        self._candidate, self._candidate_blocks = None, 0
+        expected = self._expected
+        if expected is not None and block.run == expected.run and block.sequence >= expected.sequence:
+            self._expected = expected.extended(block)
+        else:
+            self._go_on(Course.beginning(block))
+        self._disbelieve()
+
+    def _disbelieve(self) -> None:
+        """Give up the course that the clock might have been set to."""
+        if self._candidate is not None:
+            self._refused.append(self._candidate)
+            self._candidate = None
+
+    def _go_on(self, course: Course) -> None:
+        """Follow another course than before."""
+        if self._expected is not None:
+            self._earlier.append(self._expected)
+        self._expected = course
+
+
+def _course_array(courses: tuple[Course, ...]) -> np.ndarray:
+    """Courses row by row, as text: a sequence may be any whole number."""
+    rows = [[str(one.run), str(one.first), str(one.first_ns), str(one.sequence), str(one.start_ns)] for one in courses]
+    return np.array(rows, dtype=np.str_).reshape(-1, 5)
+
+
+def _courses(arrays: Mapping[str, np.ndarray], name: str) -> tuple[Course, ...]:
+    rows: list[list[str]] = checked(arrays, name, np.str_, (None, 5)).tolist()
+    try:
+        return tuple(Course(*map(int, row)) for row in rows)
+    except ValueError as error:
+        raise CheckpointError(f"{name} of the gate: {error}") from error

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from scipy.special import ndtr
 
+from models.checkpoint import prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, IdentifiedRecord
 from models.commissioning.installed import Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
@@ -28,13 +29,13 @@ from models.diagnosis.verdict.calibration import month_thresholds
 from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.window import WindowStatistics
-from models.errors import BundleError, EstimationError
+from models.errors import BundleError, CheckpointError, EstimationError
 from models.machine import Machine, MachineFile
 from models.physics.parameters import PARAMETERS
 
 __all__ = ["Evaluation", "Opinion", "WindowEvaluator", "evaluator_for"]
 
-_SHAPE = "shape"
+_LIKELIHOOD, _SHAPE = "likelihood", "shape"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))
 _STEADY = 0.15
@@ -123,6 +124,18 @@ class WindowEvaluator(Protocol):
             If the window cannot be evaluated: outside the speed range, speed not steady, no fluctuation in a channel.
         """
 
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything that the next evaluations depend on, as named arrays; empty if each stands for itself."""
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called: the next evaluations are the same to the last bit.
+
+        Raises
+        ------
+        CheckpointError
+            If the arrays are not those of such an evaluator of this machine; nothing is changed then.
+        """
+
 
 def evaluator_for(installed: Installed) -> WindowEvaluator:
     """The evaluator that what is known of the machine allows."""
@@ -196,6 +209,14 @@ class KnownMachineEvaluator:
             equations = diagnosis.equations or equations
             opinions.append(_opinion(deciding, diagnosis))
         return Evaluation(deciding, evaluated, equations, tuple(opinions), speed)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Where the likelihood's maximum is followed from; networks remember nothing."""
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint())
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        self._likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""
@@ -274,6 +295,15 @@ class BaselineEvaluator:
             deciding = Diagnosis(_SHAPE, nothing, covariance=_EMPTY)
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
         return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Nothing: a baseline is what was commissioned, and every window is compared with it alone."""
+        return {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        if arrays:
+            raise CheckpointError(f"{self._place}: {', '.join(sorted(arrays))} is of another diagnostician")
 
     def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:
         """The baseline of these conditions."""

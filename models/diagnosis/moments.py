@@ -8,11 +8,13 @@ along as further channels, and the window takes out their part by algebra (`mode
 any window and needs no second pass over samples.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.pairs import MotionPair, motion_pairs, pair_powers
 from models.diagnosis.rotation import RotationLine, rotation_line
 from models.diagnosis.waveform import Waveform, waveform_of
@@ -165,6 +167,41 @@ class HopMoments:
     line: RotationLine | None
     waveform: Waveform
     pair_powers: ComplexArray
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        line = self.line
+        return {
+            "times_ns": np.array([self.start_ns, self.end_ns], dtype=np.int64),
+            "products": self.products,
+            "segments": self.segments,
+            "turned_rad": np.array(self.turned_rad, dtype=np.float64),
+            "line": np.array([] if line is None else [line.speed_rad_s, line.sweep_rad_s2, line.strength], np.float64),
+            "pair_powers": self.pair_powers,
+            **prefixed("waveform", self.waveform.checkpoint()),
+        }
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopMoments":
+        """Moments from what `checkpoint` gave.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        start_ns, end_ns = checked(arrays, "times_ns", np.int64, (2,)).tolist()
+        line = checked(arrays, "line", np.float64, (None,)).tolist()
+        return cls(
+            start_ns=start_ns,
+            end_ns=end_ns,
+            products=checked(arrays, "products", np.float64, (None, None, None)),
+            segments=checked(arrays, "segments", np.complex128, (None, None, None)),
+            turned_rad=float(checked(arrays, "turned_rad", np.float64, ())),
+            line=RotationLine(*line) if line else None,
+            waveform=Waveform.restored(unprefixed("waveform", arrays)),
+            pair_powers=checked(arrays, "pair_powers", np.complex128, (None, None, 3)),
+        )
 
 
 def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: int) -> HopMoments:

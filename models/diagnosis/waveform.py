@@ -4,12 +4,13 @@ A stuck or clipped sensor shows in single samples, not in correlations. What is 
 the window beside the moments.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from models.checkpoint import checked
 from models.signals.block import FloatArray
 
 __all__ = ["CountArray", "Waveform", "combined_waveform", "stacked_waveform", "waveform_of"]
@@ -47,6 +48,37 @@ class Waveform:
     at_maximum: CountArray
     longest_run: CountArray
     step: FloatArray
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        return {
+            "n_samples": np.array(self.n_samples, dtype=np.int64),
+            "levels": np.stack([self.mean, self.rms, self.minimum, self.maximum, self.step]),
+            "counts": np.stack([self.at_minimum, self.at_maximum, self.longest_run]),
+        }
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, np.ndarray]) -> "Waveform":
+        """Waveform of one hop from what `checkpoint` gave.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        mean, rms, minimum, maximum, step = checked(arrays, "levels", np.float64, (5, None))
+        at_minimum, at_maximum, longest_run = checked(arrays, "counts", np.int64, (3, mean.size))
+        return cls(
+            n_samples=int(checked(arrays, "n_samples", np.int64, ())),
+            mean=mean,
+            rms=rms,
+            minimum=minimum,
+            maximum=maximum,
+            at_minimum=at_minimum,
+            at_maximum=at_maximum,
+            longest_run=longest_run,
+            step=step,
+        )
 
 
 def waveform_of(samples: FloatArray) -> Waveform:

@@ -1,11 +1,12 @@
 """The sliding window: a ring of hop moments, and the statistics of the window they make."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
+from models.checkpoint import checked
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan, hop_moments
 from models.diagnosis.synchronous import (
     Rotation,
@@ -16,6 +17,7 @@ from models.diagnosis.synchronous import (
     rotation_of,
 )
 from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
+from models.errors import CheckpointError
 from models.signals.block import FloatArray
 
 __all__ = ["SlidingWindow", "WindowStatistics", "window_statistics"]
@@ -232,6 +234,11 @@ class SlidingWindow:
         return len(self._hops) / self.plan.hops
 
     @property
+    def hops(self) -> tuple[HopMoments, ...]:
+        """The hops that are in the window, oldest first."""
+        return tuple(self._hops)
+
+    @property
     def latest_hop(self) -> HopMoments | None:
         """The hop that was completed last."""
         return self._hops[-1] if self._hops else None
@@ -254,7 +261,8 @@ class SlidingWindow:
         """
         # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
         self._pending_start_ns = start_ns - round(self._pending_samples * 1e9 / self.plan.rate_hz)
-        self._pending.append(samples)
+        # Rows first, whatever the caller has: sums must not depend on how samples lie in memory.
+        self._pending.append(np.ascontiguousarray(samples))
         self._pending_samples += samples.shape[0]
         need = self.plan.preamble + self.plan.hop
         while self._pending_samples >= need:
@@ -285,6 +293,68 @@ class SlidingWindow:
         """Forget everything."""
         self.gap()
         self._hops.clear()
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything but the hops themselves, as named arrays, between two blocks."""
+        pending = np.concatenate(self._pending) if self._pending else np.empty((0, self._columns))
+        return {
+            "pending": pending,
+            "pending_start_ns": np.array(self._pending_start_ns, dtype=np.int64),
+            "level": np.array([] if self._level is None else self._level, dtype=np.float64),
+            "hop_times_ns": np.array([(hop.start_ns, hop.end_ns) for hop in self._hops], np.int64).reshape(-1, 2),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray], hops: Iterable[HopMoments]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+            What `checkpoint` gave.
+        hops : iterable of HopMoments
+            Those that were in the window then, in the order in which they were completed; there may be more. Of two
+            with the same times the later one counts.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form, a hop is missing, or it does not fit the plan; nothing is
+            changed then.
+        """
+        pending = checked(arrays, "pending", np.float64, (None, self._columns))
+        pending_start_ns = int(checked(arrays, "pending_start_ns", np.int64, ()))
+        level = checked(arrays, "level", np.float64, (None,))
+        if level.size not in (0, len(self.plan.states)):
+            raise CheckpointError(f"level has {level.size} values, expected {len(self.plan.states)} or none")
+        there = {(hop.start_ns, hop.end_ns): hop for hop in hops}
+        ring = []
+        for start_ns, end_ns in checked(arrays, "hop_times_ns", np.int64, (None, 2)).tolist():
+            hop = there.get((start_ns, end_ns))
+            if hop is None:
+                raise CheckpointError(f"the hop from start_ns {start_ns} to {end_ns} is missing")
+            self._check_fits(hop)
+            ring.append(hop)
+        self._hops = deque(ring, maxlen=self.plan.hops)
+        self._pending, self._pending_samples = ([pending] if pending.size else []), pending.shape[0]
+        self._pending_start_ns = pending_start_ns
+        self._level = level if level.size else None
+
+    @property
+    def _columns(self) -> int:
+        """Columns of the samples: states and, if there is one, the shaft angle."""
+        return len(self.plan.states) + (self.plan.angle_column is not None)
+
+    def _check_fits(self, hop: HopMoments) -> None:
+        """Raise CheckpointError for a hop of other channels, lags or frequencies."""
+        plan = self.plan
+        turning = plan.angle_column is not None or plan.speed_rad_s is not None
+        n = len(plan.states) + (3 if turning else 1)
+        products, segments = (plan.lags.size, n, n), (plan.hop // (plan.segment // 2), plan.bins.size, n)
+        if hop.products.shape != products or hop.segments.shape != segments:
+            raise CheckpointError(
+                f"the hop of start_ns {hop.start_ns} has moments of shape {hop.products.shape} and "
+                f"{hop.segments.shape}, expected {products} and {segments}: it is that of other channels or settings"
+            )
 
     def statistics(self, hops: int | None = None) -> WindowStatistics | None:
         """Statistics of the window, or of its latest hops, or None while there are not so many.

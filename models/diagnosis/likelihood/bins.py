@@ -74,6 +74,10 @@ class BinGroups:
         sums = np.add.reduceat(spectrum, places[: -1 if places[-1] == spectrum.shape[0] else None], axis=0)[::2]
         return np.asarray(sums / self.bins[:, None, None], dtype=np.complex128)
 
+    def same_as(self, other: "BinGroups") -> bool:
+        """Whether other groups hold the same bins at the same frequencies."""
+        return self.edges == other.edges and np.array_equal(self.centre_hz, other.centre_hz)
+
 
 def natural_frequencies(machine: Machine) -> tuple[FloatArray, FloatArray]:
     """Natural frequencies (Hz) and damping ratios of the nominal rotor at nominal speed."""

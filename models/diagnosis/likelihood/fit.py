@@ -7,25 +7,28 @@ the paper's: the theory compared with is Eqs. (1)-(12) and (17)-(18).
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.diagnosis.likelihood.bins import BinGroups, group_bins
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import goodness_of_fit
 from models.diagnosis.likelihood.integrated import integrated
 from models.diagnosis.likelihood.motions import Motions
-from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Workspace
+from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Workspace
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
-from models.errors import EstimationError
+from models.errors import CheckpointError, EstimationError
 from models.machine import Machine
+from models.physics.matrices import STATE_INDEX
 from models.signals.block import FloatArray
 
 __all__ = ["LikelihoodFit"]
@@ -68,6 +71,7 @@ class LikelihoodFit:
         self._strength: float | None = None
         self._line: Linearised | None = None
         self._line_segments = self._followed = 0
+        self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
         self._groups: dict[bytes, BinGroups] = {}
         self._workspace = Workspace()
 
@@ -83,6 +87,76 @@ class LikelihoodFit:
     def start_near(self, other: "LikelihoodFit") -> None:
         """Start the next window where another fit of the same machine has ended."""
         self._last, self._strength, self._line = other._last, other._strength, None
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything that the next windows' readings depend on, as named arrays."""
+        found = {
+            "last": np.array([] if self._last is None else self._last, dtype=np.float64),
+            "strength": np.array([] if self._strength is None else [self._strength], dtype=np.float64),
+            "followed": np.array([self._line_segments, self._followed], dtype=np.int64),
+        }
+        line = self._line
+        if line is not None and self._line_band is not None:
+            motions = line.model.motions
+            frequencies_hz, excluded = self._line_band
+            found |= prefixed("line", line.checkpoint())
+            found |= {
+                "states": np.array(motions.states, dtype=np.str_),
+                "scale": motions.scale,
+                "force_scale": np.array(line.model.force_unit[0], dtype=np.float64),
+                "line_strength": np.array(line.weights.strength, dtype=np.float64),
+                "frequencies_hz": frequencies_hz,
+                "excluded": excluded,
+            }
+        return found
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called: the next readings are the same to the last bit.
+
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+
+        Raises
+        ------
+        CheckpointError
+            If they are not those of a fit of this machine; nothing is changed then.
+        """
+        last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
+        segments, followed = checked(arrays, "followed", np.int64, (2,)).tolist()
+        line = band = None
+        if "states" in arrays:
+            frequencies_hz = checked(arrays, "frequencies_hz", np.float64, (None,))
+            band = frequencies_hz, checked(arrays, "excluded", np.bool_, frequencies_hz.shape)
+            try:
+                with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                    line = self._restored_line(arrays, segments, *band)
+            except np.linalg.LinAlgError as error:
+                raise CheckpointError(f"{self._machine.name}: the remembered maximum makes no valid spectra") from error
+        self._last = last if last.size else None
+        self._strength = float(strength[0]) if strength.size else None
+        self._line, self._line_band, self._line_segments, self._followed = line, band, segments, followed
+
+    def _restored_line(
+        self,
+        arrays: Mapping[str, np.ndarray],
+        segments: int,
+        frequencies_hz: FloatArray,
+        excluded: npt.NDArray[np.bool_],
+    ) -> Linearised:
+        states = texts(arrays, "states")
+        unknown = [name for name in states if name not in STATE_INDEX]
+        if unknown or frequencies_hz.size < 2 or excluded.all():
+            raise CheckpointError(
+                f"{self._machine.name}: the remembered maximum is that of states {', '.join(states)} at "
+                f"{frequencies_hz.size} frequencies, {np.count_nonzero(excluded)} of them excluded"
+            )
+        motions = Motions(states, checked(arrays, "scale", np.float64, (len(states),)))
+        force_scale = float(checked(arrays, "force_scale", np.float64, ()))
+        model = SpectralModel(self._machine, motions, self._grouped(frequencies_hz, excluded, 1.0), force_scale)
+        strength = float(checked(arrays, "line_strength", np.float64, ()))
+        weights = Weights(model, segments, self._usual_cutoff_hz, strength)
+        return Linearised.restored(model, weights, unprefixed("line", arrays))
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
@@ -101,7 +175,7 @@ class LikelihoodFit:
         try:
             # Trial points may lie far out; what comes of them is checked, not warned of.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-                model, search, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed)
+                model, weights, found = self._followed_or_searched(window, excluded, np.sqrt(power), speed)
             covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
@@ -109,13 +183,13 @@ class LikelihoodFit:
         if not (np.all(np.isfinite(found.theta)) and np.all(np.diag(covariance) > 0)):
             self.reset()
             raise EstimationError(nowhere)
-        self._last, self._strength = found.theta, search.strength
-        self._check_explained(model, search, found)
+        self._last, self._strength = found.theta, weights.strength
+        self._check_explained(model, weights, found)
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
         states = model.groups.average(window.spectrum)
-        goodness = goodness_of_fit(self._machine, model, search, found, states)
+        goodness = goodness_of_fit(self._machine, model, weights, found, states)
         read = self._read(window, model, found.whitened.point, structural, speed)
         return replace(read, misfit_z=goodness.misfit_z, suspect=goodness.suspect, steps=found.steps)
 
@@ -138,7 +212,7 @@ class LikelihoodFit:
         if line is None:
             return None
         groups = self._grouped(stretch.frequencies_hz, _near_rotation(stretch.frequencies_hz, speed), 1.0)
-        if groups is not line.model.groups or stretch.states != line.model.motions.states:
+        if not groups.same_as(line.model.groups) or stretch.states != line.model.motions.states:
             return None
         seen = line.glance(_observed(line.model, stretch), stretch.n_segments / self._line_segments)
         if seen is None:
@@ -183,7 +257,7 @@ class LikelihoodFit:
 
     def _followed_or_searched(
         self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float
-    ) -> tuple[SpectralModel, FisherScoring, Maximum]:
+    ) -> tuple[SpectralModel, Weights, Maximum]:
         found = None
         line, self._line = self._line, None
         if line is not None and self._followed < _FOLLOWED and self._alike(line, window, excluded):
@@ -191,7 +265,7 @@ class LikelihoodFit:
             found = line.follow(_observed(line.model, window), speed, _NEAR, _GAIN)
             if found is not None:
                 self._line = line
-                return line.model, line.search, found
+                return line.model, line.weights, found
             search = self._search(line.model, window, speed, self._strength)
             # The same units, and the first step's derivatives are those at which the last search ended.
             model, found = line.model, _searched(search, line)
@@ -199,15 +273,16 @@ class LikelihoodFit:
             model, search, found = self._maximise(window, excluded, scale, speed)
             self._followed = 0
         if self._follow:
-            self._line, self._line_segments = Linearised(model, search, found), window.n_segments
-        return model, search, found
+            self._line, self._line_segments = Linearised.around(model, search.weights, found), window.n_segments
+            self._line_band = window.frequencies_hz, excluded
+        return model, search.weights, found
 
     def _alike(self, line: Linearised, window: WindowStatistics, excluded: npt.NDArray[np.bool_]) -> bool:
         """Whether a window has the size, the channels and the frequencies of the last search."""
         return (
             window.n_segments == self._line_segments
             and window.states == line.model.motions.states
-            and self._grouped(window.frequencies_hz, excluded, 1.0) is line.model.groups
+            and self._grouped(window.frequencies_hz, excluded, 1.0).same_as(line.model.groups)
         )
 
     def _checked_power(self, window: WindowStatistics, used: npt.NDArray[np.bool_]) -> FloatArray:
@@ -281,10 +356,10 @@ class LikelihoodFit:
         explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
         return float(explained**-0.5)
 
-    def _check_explained(self, model: SpectralModel, search: FisherScoring, found: Maximum) -> None:
+    def _check_explained(self, model: SpectralModel, weights: Weights, found: Maximum) -> None:
         """Raise EstimationError for windows that nothing within the model comes near."""
         excess = np.einsum("fij,fij->f", found.whitened.excess, found.whitened.excess.conj()).real
-        times = float(search.averages @ excess) / (model.n**2 * search.averages.size)
+        times = float(weights.averages @ excess) / (model.n**2 * weights.averages.size)
         if times > _MOST_EXCESS or np.any(np.abs(found.theta[: len(STRUCTURAL)]) > _MOST_LOG_RATIO):
             self.reset()
             raise EstimationError(

@@ -10,11 +10,13 @@ Godambe, Annals of Mathematical Statistics 31 (1960)); near the last maximum the
 worth speaking of is lost. Levels move as the elements of C, in which the spectra are linear.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, whitened_at
+from models.checkpoint import checked
+from models.diagnosis.likelihood.scoring import Derivatives, Maximum, Weights, inverse_factor, whitened_at
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, factor_of, packed
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
@@ -53,30 +55,94 @@ class Linearised:
     Parameters
     ----------
     model : SpectralModel
-    search : FisherScoring
-        The search that ended there; its averages and pulls are used.
-    found : Maximum
-        Its slopes are copied.
+    weights : Weights
+        Those of the search that ended there.
+    searched : ModelPoint
+        Where it ended.
+    point : ModelPoint
+        Where the maximum is now.
+    derivatives : Derivatives
+        At the search's end.
+    left : ndarray, shape (n_levels,)
+        What the search left of the data's gradient by the levels.
+    fitted : float
+        Parameters that its window determined.
     """
 
-    def __init__(self, model: SpectralModel, search: FisherScoring, found: Maximum) -> None:
-        self.model, self.search = model, search
-        self.theta = found.theta
-        self._slopes = found.slopes.copy()
-        self._L_inverse = found.whitened.L_inverse
-        self._S = np.einsum("fii->fi", found.whitened.point.S).real.copy()
-        self._pull = search.pull
-        self._data_information: FloatArray = found.information - np.diag(self._pull)
+    def __init__(
+        self,
+        model: SpectralModel,
+        weights: Weights,
+        searched: ModelPoint,
+        point: ModelPoint,
+        derivatives: Derivatives,
+        left: FloatArray,
+        fitted: float,
+    ) -> None:
+        self.model, self.weights, self.derivatives = model, weights, derivatives
+        self.theta = searched.theta
+        self._searched, self._point, self._left, self._fitted = searched, point, left, fitted
+        self._L_inverse = inverse_factor(searched.S)
+        self._S = np.einsum("fii->fi", searched.S).real.copy()
+        self._pull = weights.pull
         self._inverses: dict[float, FloatArray] = {}
-        self._fitted = found.fitted
-        self._point = found.whitened.point
-        # In directions that the data leave to the pulls on T the equation is solved as the search left it.
-        self._left: FloatArray = self._gradient(packed(found.whitened.excess))[model.level_at]
 
-    @property
-    def derivatives(self) -> tuple[FloatArray, FloatArray]:
-        """Slopes, and information of the data by C, where the last search ended."""
-        return self._slopes, self._data_information
+    @classmethod
+    def around(cls, model: SpectralModel, weights: Weights, found: Maximum) -> "Linearised":
+        """The spectra around the maximum of a search that has just ended; its slopes are copied."""
+        point, slopes = found.whitened.point, found.slopes.copy()
+        information = np.asarray(found.information - np.diag(weights.pull), dtype=np.float64)
+        derivatives = Derivatives(slopes, information, found.slopes_rad_s)
+        # In directions that the data leave to the pulls on T the equation is solved as the search left it.
+        left = _gradient(slopes, packed(found.whitened.excess), weights)[model.level_at]
+        return cls(model, weights, point, point, derivatives, left, found.fitted)
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything that is neither the model's nor the weights', as named arrays.
+
+        Spectra and slopes, megabytes, are computed again at the points where they were computed.
+        """
+        return {
+            "searched": self.theta,
+            "point": self._point.theta,
+            "point_levels": self._point.C,
+            "speeds_rad_s": np.array(
+                [self._searched.speed_rad_s, self._point.speed_rad_s, self.derivatives.speed_rad_s], dtype=np.float64
+            ),
+            "information": self.derivatives.information,
+            "left": self._left,
+            "fitted": np.array(self._fitted, dtype=np.float64),
+        }
+
+    @classmethod
+    def restored(cls, model: SpectralModel, weights: Weights, arrays: Mapping[str, np.ndarray]) -> "Linearised":
+        """The same from what `checkpoint` gave.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        numpy.linalg.LinAlgError
+            If the point makes no valid spectra.
+        """
+        size = (model.size,)
+        theta = checked(arrays, "searched", np.float64, size)
+        of_searched, of_point, of_slopes = checked(arrays, "speeds_rad_s", np.float64, (3,)).tolist()
+        levels = checked(arrays, "point_levels", np.float64, (6, 6))
+        at_slopes = model.at(theta, of_slopes)
+        return cls(
+            model,
+            weights,
+            model.at(theta, of_searched),
+            model.at(checked(arrays, "point", np.float64, size), of_point, levels),
+            Derivatives(
+                model.slopes(at_slopes, inverse_factor(at_slopes.S)),
+                checked(arrays, "information", np.float64, size * 2),
+                of_slopes,
+            ),
+            checked(arrays, "left", np.float64, (COLUMNS.size,)),
+            float(checked(arrays, "fitted", np.float64, ())),
+        )
 
     def follow(self, observed: ComplexArray, speed_rad_s: float, near: float, gain: float) -> Maximum | None:
         """Solve for the next window's estimated spectra; None where a new search is due.
@@ -103,8 +169,12 @@ class Linearised:
                 if whitened is None:
                     return None
                 self._point = point
-                information = self._data_information + np.diag(self._pull)
-                return Maximum(point.theta, information, self._slopes, whitened, steps, self._fitted, step[diagnosed])
+                own = self.derivatives
+                information = own.information + np.diag(self._pull)
+                left_over = step[diagnosed]
+                return Maximum(
+                    point.theta, information, own.slopes, own.speed_rad_s, whitened, steps, self._fitted, left_over
+                )
             if steps == _MOST_STEPS or left > before:
                 break
             before = left
@@ -135,8 +205,8 @@ class Linearised:
             return None
         theta = point.theta.copy()
         theta[diagnosed] += step[diagnosed]
-        left = rest - np.tensordot(step, self._slopes, axes=1)
-        total = share * float(self.search.averages @ np.sum(left**2, axis=1))
+        left = rest - np.tensordot(step, self.derivatives.slopes, axes=1)
+        total = share * float(self.weights.averages @ np.sum(left**2, axis=1))
         usual = model.n**2 * float(np.trace(model.groups.shared))
         scatter = model.n * float(np.sqrt(2 * np.sum(model.groups.shared**2)))
         if total > _EXCESS_MARGIN * usual + _LEAST_EXCESS_Z * scatter:
@@ -149,19 +219,18 @@ class Linearised:
 
     def _gradient(self, rest: FloatArray) -> FloatArray:
         """What the data say about every parameter, levels by C."""
-        weighted = (rest * self.search.averages[:, None]).ravel()
-        return np.asarray(self._slopes.reshape(self.model.size, -1) @ weighted, dtype=np.float64)
+        return _gradient(self.derivatives.slopes, rest, self.weights)
 
     def _pulled(self, gradient: FloatArray, point: ModelPoint, share: float) -> FloatArray:
         """The gradient of a share of the data with the pulls."""
         levels = self.model.level_at
-        pulled = share * gradient - self.search.ridge * (point.theta - self.search.centre)
+        pulled = share * gradient - self.weights.ridge * (point.theta - self.weights.centre)
         pulled[levels] = share * (gradient[levels] - self._left)
         return pulled
 
     def _inverse(self, share: float) -> FloatArray:
         if share not in self._inverses:
-            information = share * self._data_information + np.diag(self._pull)
+            information = share * self.derivatives.information + np.diag(self._pull)
             self._inverses[share] = np.asarray(np.linalg.inv(information), dtype=np.float64)
         return self._inverses[share]
 
@@ -177,3 +246,8 @@ class Linearised:
         C[COLUMNS, ROWS] = C[ROWS, COLUMNS]
         theta[model.level_at] = factor_of(C)[ROWS, COLUMNS]
         return model.at(theta, speed_rad_s, C)
+
+
+def _gradient(slopes: FloatArray, rest: FloatArray, weights: Weights) -> FloatArray:
+    weighted = (rest * weights.averages[:, None]).ravel()
+    return np.asarray(slopes.reshape(slopes.shape[0], -1) @ weighted, dtype=np.float64)

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.stats
 
 from models.diagnosis.likelihood.motions import Mismatch
-from models.diagnosis.likelihood.scoring import FisherScoring, Maximum
+from models.diagnosis.likelihood.scoring import Maximum, Weights
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, SpectralModel, packed, twice_packed
 from models.diagnosis.moments import ComplexArray
 from models.machine import Machine
@@ -86,7 +86,7 @@ def _two_sided(z: float) -> float:
 
 
 def goodness_of_fit(
-    machine: Machine, model: SpectralModel, search: FisherScoring, found: Maximum, states: ComplexArray
+    machine: Machine, model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray
 ) -> Goodness:
     """Try the alternatives at the maximum of one window.
 
@@ -94,14 +94,14 @@ def goodness_of_fit(
     ----------
     machine : Machine
     model : SpectralModel
-    search : FisherScoring
+    weights : Weights
     found : Maximum
     states : ndarray, shape (n_groups, n_states, n_states)
         Estimated cross-spectra of the states, SI: displacement and velocity are compared with each other, too.
     """
     names, slopes = _alternatives(machine, model, found)
     excess = packed(found.whitened.excess)
-    weight = search.averages[:, None]
+    weight = weights.averages[:, None]
     flat = found.slopes.reshape(model.size, -1)
     weighted = (slopes * weight).reshape(len(names), -1)
     cross = weighted @ flat.T
@@ -115,11 +115,11 @@ def goodness_of_fit(
         for name, s, i, a in zip(names, score, left, alone, strict=True)
         if i > _LEAST_INFORMATION * a
     )
-    mismatches = model.motions.mismatches(states, model.centre, search.averages)
+    mismatches = model.motions.mismatches(states, model.centre, weights.averages)
     pairs = [_named(mismatch, {one.name: one for one in alternatives}) for mismatch in mismatches]
     # The gains of a pair are nearly one test, and how far the pair disagrees is hardly random.
     tests = len(alternatives) - len(pairs) + 1
-    return Goodness(_excess_z(model, search, found), (*alternatives, *pairs), tests)
+    return Goodness(_excess_z(model, weights, found), (*alternatives, *pairs), tests)
 
 
 def _named(mismatch: Mismatch, alternatives: dict[str, Alternative]) -> Alternative:
@@ -131,13 +131,13 @@ def _named(mismatch: Mismatch, alternatives: dict[str, Alternative]) -> Alternat
     return Alternative(v, mismatch.z, mismatch.change)
 
 
-def _excess_z(model: SpectralModel, search: FisherScoring, found: Maximum) -> float:
+def _excess_z(model: SpectralModel, weights: Weights, found: Maximum) -> float:
     """Σ ν ‖L⁻¹ŜL⁻ᴴ - I‖² over its expectation, in its standard deviations.
 
     Where the model holds every element scatters as the groups say, less one for every parameter that was fitted.
     """
     shared, excess = model.groups.shared, found.whitened.excess
-    total = float(search.averages @ np.einsum("fij,fji->f", excess, excess).real)
+    total = float(weights.averages @ np.einsum("fij,fji->f", excess, excess).real)
     expected = model.n**2 * float(np.trace(shared)) - found.fitted
     return float((total - expected) / (model.n * np.sqrt(2 * np.sum(shared**2))))
 

@@ -9,7 +9,17 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
-__all__ = ["LOG_NOISE", "FisherScoring", "Maximum", "Whitened", "Workspace", "whitened_at"]
+__all__ = [
+    "LOG_NOISE",
+    "Derivatives",
+    "FisherScoring",
+    "Maximum",
+    "Weights",
+    "Whitened",
+    "Workspace",
+    "inverse_factor",
+    "whitened_at",
+]
 
 LOG_NOISE = float(np.log(1e-3))
 """Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
@@ -47,6 +57,24 @@ class Whitened:
 
 
 @dataclass(frozen=True, slots=True)
+class Derivatives:
+    """Derivatives at the end of an earlier search: most of the first step of a search that starts there.
+
+    Attributes
+    ----------
+    slopes : ndarray, shape (size, n_groups, n²)
+    information : ndarray, shape (size, size)
+        Of the data alone, by C.
+    speed_rad_s : float
+        Speed for which they were computed.
+    """
+
+    slopes: FloatArray
+    information: FloatArray
+    speed_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Maximum:
     """Where a search ended.
 
@@ -58,6 +86,8 @@ class Maximum:
         Fisher information there, on the elements of C (not of T).
     slopes : ndarray, shape (size, n_groups, n²)
         Whitened slopes it is made of.
+    slopes_rad_s : float
+        Speed for which they were computed: that of the window, or of the search whose slopes were taken over.
     whitened : Whitened
         Theory and estimate there.
     steps : int
@@ -72,6 +102,7 @@ class Maximum:
     theta: FloatArray
     information: FloatArray
     slopes: FloatArray
+    slopes_rad_s: float
     whitened: Whitened
     steps: int
     fitted: float
@@ -91,6 +122,50 @@ class Workspace:
                 self._arrays.clear()
             self._arrays[shape] = np.empty(shape), np.empty(shape)
         return self._arrays[shape]
+
+
+class Weights:
+    """How much a window's data count, and how strongly usual values pull at what they leave undetermined.
+
+    Parameters
+    ----------
+    model : SpectralModel
+    n_segments : int
+        Segments the estimated spectra are averaged over.
+    usual_cutoff_hz : float
+        Where the cutoff is pulled, weakly, if the band does not show it.
+    strength : float, optional
+        How strongly the forces' own colours are pulled towards none; the weakest pull without it.
+    """
+
+    def __init__(
+        self, model: SpectralModel, n_segments: int, usual_cutoff_hz: float, strength: float | None = None
+    ) -> None:
+        self._shape_at, self._level_at = model.shape_at, model.level_at
+        self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
+        self.ridge = np.full(model.size, _WEAK)
+        self.ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
+        self.ridge[model.colour_at] = _COLOUR
+        self.strength = float(_STRENGTHS[0]) if strength is None else strength
+        self.ridge[model.shape_at] = self.strength
+        self.ridge[model.cutoff_at] = _CUTOFF
+        self.ridge[model.order_at] = _ORDER if model.shapes else _FIXED
+        self.centre = np.zeros(model.size)
+        self.centre[model.noise_at] = LOG_NOISE
+        self.centre[model.cutoff_at] = np.log(usual_cutoff_hz)
+        self.centre[model.order_at] = np.log(2)
+
+    @property
+    def pull(self) -> FloatArray:
+        """The pulls as they enter the information on C: next to nothing there, to keep it invertible."""
+        pull = self.ridge.copy()
+        pull[self._level_at] = 1e-3
+        return pull
+
+    def pull_colours(self, strength: float) -> None:
+        """Pull the forces' own colours with another strength."""
+        self.strength = strength
+        self.ridge[self._shape_at] = strength
 
 
 class FisherScoring:
@@ -129,26 +204,13 @@ class FisherScoring:
     ) -> None:
         workspace = Workspace() if workspace is None else workspace
         self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
-        self.averages: FloatArray = AVERAGES_PER_BIN * n_segments * model.groups.bins
-        self._slopes, self._weighted = workspace.arrays((model.size, self.averages.size, model.n * model.n))
-        self.ridge = np.full(model.size, _WEAK)
-        self.ridge[: model.cutoff_at] = 0.0  # what is diagnosed is pulled nowhere
-        self.ridge[model.colour_at] = _COLOUR
-        self.strength = float(_STRENGTHS[0]) if strength is None else strength
-        self.ridge[model.shape_at] = self.strength
-        self.ridge[model.cutoff_at] = _CUTOFF
-        self.ridge[model.order_at] = _ORDER if model.shapes else _FIXED
-        self.centre = np.zeros(model.size)
-        self.centre[model.noise_at] = LOG_NOISE
-        self.centre[model.cutoff_at] = np.log(usual_cutoff_hz)
-        self.centre[model.order_at] = np.log(2)
+        self.weights = Weights(model, n_segments, usual_cutoff_hz, strength)
+        self._slopes, self._weighted = workspace.arrays((model.size, model.groups.bins.size, model.n * model.n))
 
     @property
-    def pull(self) -> FloatArray:
-        """The pulls as they enter the information on C: next to nothing there, to keep it invertible."""
-        pull = self.ridge.copy()
-        pull[self._model.level_at] = 1e-3
-        return pull
+    def centre(self) -> FloatArray:
+        """Usual values of all parameters."""
+        return self.weights.centre
 
     def maximise(
         self,
@@ -156,7 +218,7 @@ class FisherScoring:
         most_steps: int,
         near: float,
         gain: float,
-        derivatives: tuple[FloatArray, FloatArray] | None = None,
+        derivatives: Derivatives | None = None,
     ) -> Maximum:
         """Search from a starting point.
 
@@ -167,8 +229,8 @@ class FisherScoring:
         near, gain : float
             Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
             gain less than `gain` in log-likelihood.
-        derivatives : tuple of ndarray, optional
-            Slopes and information of the data by C at `theta` if an earlier search has ended there: most of a step.
+        derivatives : Derivatives, optional
+            Those at `theta` if an earlier search has ended there.
 
         Raises
         ------
@@ -182,6 +244,7 @@ class FisherScoring:
         if whitened is None:
             raise np.linalg.LinAlgError("the starting point makes no valid spectrum")
         gradient, information, slopes, on_levels = self._scores(theta, whitened, derivatives)
+        slopes_rad_s = self._speed_rad_s if derivatives is None else derivatives.speed_rad_s
         while True:
             covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
             full_step = np.asarray(covariance @ gradient, dtype=np.float64)
@@ -196,6 +259,7 @@ class FisherScoring:
                 if whitened is None:
                     raise AssertionError("a point that made a valid spectrum still makes one")
                 gradient, information, slopes, on_levels = self._scores(theta, whitened)
+                slopes_rad_s = self._speed_rad_s
                 continue
             steps += 1
             step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
@@ -208,11 +272,12 @@ class FisherScoring:
             if trial_whitened is not None and trial_value > value:
                 theta, value, whitened = trial, trial_value, trial_whitened
                 gradient, information, slopes, on_levels = self._scores(theta, whitened)
+                slopes_rad_s = self._speed_rad_s
                 damping = max(damping / 8, 1e-7)
             else:
                 damping *= 8
-        fitted = model.size - float(self.ridge @ np.diag(covariance))
-        return Maximum(theta, on_levels, slopes, whitened, steps, fitted, full_step[diagnosed])
+        fitted = model.size - float(self.weights.ridge @ np.diag(covariance))
+        return Maximum(theta, on_levels, slopes, slopes_rad_s, whitened, steps, fitted, full_step[diagnosed])
 
     def _learn_strength(self, theta: FloatArray, covariance: FloatArray) -> bool:
         """Pull the colours as strongly as is likeliest for the ones found; False if that is as before.
@@ -220,15 +285,14 @@ class FisherScoring:
         Around the present maximum the log-likelihood of the colours, everything else maximised, is quadratic, so the
         evidence of every strength is known at once.
         """
-        at, old = self._model.shape_at, self.strength
+        at, old = self._model.shape_at, self.weights.strength
         precision = np.linalg.inv(covariance[at, at])
         eigenvalues, vectors = np.linalg.eigh(precision)
         left = np.maximum(eigenvalues - old, 0)[:, None] + _STRENGTHS
         slope = vectors.T @ (precision @ theta[at])
         evidence = np.sum(np.log(_STRENGTHS / left) + slope[:, None] ** 2 / left, axis=0)
         new = float(_STRENGTHS[np.argmax(evidence)])
-        self.strength = new
-        self.ridge[at] = new
+        self.weights.pull_colours(new)
         return bool(abs(np.log(new / old)) > _SAME_STRENGTH)
 
     def _value(self, theta: FloatArray) -> tuple[float, Whitened | None]:
@@ -238,22 +302,22 @@ class FisherScoring:
             return -np.inf, None
         log_determinant = -2 * np.log(np.einsum("fii->fi", whitened.L_inverse).real).sum(axis=1)
         trace = np.einsum("fii->f", whitened.excess).real  # and n, a constant
-        pull = self.ridge @ (theta - self.centre) ** 2 / 2
-        return float(-self.averages @ (log_determinant + trace) - pull), whitened
+        pull = self.weights.ridge @ (theta - self.weights.centre) ** 2 / 2
+        return float(-self.weights.averages @ (log_determinant + trace) - pull), whitened
 
     def _scores(
-        self, theta: FloatArray, whitened: Whitened, derivatives: tuple[FloatArray, FloatArray] | None = None
+        self, theta: FloatArray, whitened: Whitened, derivatives: Derivatives | None = None
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Gradient, information for the step (both by T), packed slopes, and information by C."""
-        model = self._model
+        model, averages = self._model, self.weights.averages
         if derivatives is None:
             slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
-            root = np.sqrt(self.averages)[:, None]
+            root = np.sqrt(averages)[:, None]
             weighted = np.multiply(slopes, root, out=self._weighted).reshape(model.size, -1)
             on_levels: FloatArray = weighted @ weighted.T
         else:
-            slopes, on_levels = derivatives[0], derivatives[1].copy()
-        excess = packed(whitened.excess) * self.averages[:, None]
+            slopes, on_levels = derivatives.slopes, derivatives.information.copy()
+        excess = packed(whitened.excess) * averages[:, None]
         gradient: FloatArray = slopes.reshape(model.size, -1) @ excess.ravel()
         levels = model.level_at
         chain = _levels_by_factor(model.factor(theta))
@@ -262,23 +326,33 @@ class FisherScoring:
         information[:, levels] = information[:, levels] @ chain
         information[levels, levels] += _curvature(gradient[levels])
         gradient[levels] = chain.T @ gradient[levels]
-        gradient -= self.ridge * (theta - self.centre)
-        information[np.diag_indices(model.size)] += self.ridge
-        on_levels[np.diag_indices(model.size)] += self.pull
+        gradient -= self.weights.ridge * (theta - self.weights.centre)
+        information[np.diag_indices(model.size)] += self.weights.ridge
+        on_levels[np.diag_indices(model.size)] += self.weights.pull
         return gradient, information, slopes, on_levels
 
 
 def whitened_at(point: ModelPoint, observed: ComplexArray) -> Whitened | None:
     """See estimated spectra through the Cholesky factors of expected ones; None if those are no valid spectra."""
     try:
-        L = np.linalg.cholesky(point.S)
+        L_inverse = inverse_factor(point.S)
     except np.linalg.LinAlgError:
         return None
-    L_inverse = np.asarray(np.linalg.inv(L), dtype=np.complex128)
     excess = L_inverse @ observed @ L_inverse.conj().swapaxes(1, 2)
     diagonal = np.arange(excess.shape[-1])
     excess[:, diagonal, diagonal] -= 1
     return Whitened(point, L_inverse, excess)
+
+
+def inverse_factor(S: ComplexArray) -> ComplexArray:
+    """L⁻¹ of S = L Lᴴ, shape (n_groups, n, n).
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If those are no valid spectra.
+    """
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(S)), dtype=np.complex128)
 
 
 def _levels_by_factor(T: FloatArray) -> FloatArray:

@@ -74,6 +74,8 @@ class ModelPoint:
         D.
     C : ndarray, shape (6, 6)
         Level matrix.
+    speed_rad_s : float
+        Speed of the gyroscopic terms.
     """
 
     theta: FloatArray
@@ -82,6 +84,7 @@ class ModelPoint:
     H: ComplexArray
     colour: FloatArray
     C: FloatArray
+    speed_rad_s: float
 
 
 class SpectralModel:
@@ -195,7 +198,7 @@ class SpectralModel:
         S = _summed(G @ C, G)
         diagonal = np.arange(self.n)
         S[:, diagonal, diagonal] += self.noise(theta)
-        return ModelPoint(theta, S, G, H.reshape(*shape, 6, 6) * unit, colour, C)
+        return ModelPoint(theta, S, G, H.reshape(*shape, 6, 6) * unit, colour, C, speed_rad_s)
 
     def filter(self, theta: FloatArray) -> tuple[float, float]:
         """Cutoff (Hz) and order of the low-pass."""

@@ -20,10 +20,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from models.checkpoint import checked
 from models.diagnosis.readings import ParameterReading
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
 from models.diagnosis.verdict.isolation import Isolation, isolate, restricted
 from models.diagnosis.verdict.stretch import Stretch, added, from_scale, slope
+from models.errors import CheckpointError
 from models.machine import MachineFile
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
@@ -36,6 +38,8 @@ on 150 healthy stretches of each length and either layout of sources (rotor kit,
 by more than 1.04."""
 
 _DOUBLINGS = 6
+_LOWER = np.tril_indices(len(PARAMETERS))
+"""Elements of an information matrix that are remembered: it is symmetric."""
 _CONTRADICTION_RATE = 1e-7
 """Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data."""
 
@@ -156,7 +160,8 @@ class SequentialState:
     Attributes
     ----------
     sums : dict of int to list of Stretch
-        Latest stretches of one window (key 1) and of the sums of 2, 4, … windows, oldest first.
+        Latest stretches of one window (key 1) and of the sums of 2, 4, … windows that longer sums may be made of,
+        oldest first.
     change_ns : int or None
         Data before this belongs to another condition of the machine.
     before : tuple of float
@@ -172,52 +177,75 @@ class SequentialState:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays of numbers and text, for any array file format."""
+        n = len(PARAMETERS)
+        rows = [(PARAMETERS.index(one.name), one.since_ns, one.found_ns) for one in self.findings]
         found: dict[str, np.ndarray] = {
             "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
-            "before": np.array(self.before),
-            "findings": np.array([(PARAMETERS.index(f.name), f.since_ns, f.found_ns) for f in self.findings], np.int64),
-            "finding_stretch_s": np.array([f.stretch_s for f in self.findings]),
+            "before": np.array(self.before, dtype=np.float64),
+            "findings": np.array(rows, dtype=np.int64).reshape(-1, 3),
+            "finding_stretch_s": np.array([one.stretch_s for one in self.findings], dtype=np.float64),
         }
         for windows, ring in self.sums.items():
-            found[f"times_{windows}"] = np.array([(one.start_ns, one.end_ns) for one in ring], dtype=np.int64)
-            found[f"vector_{windows}"] = np.array([one.vector for one in ring])
-            found[f"information_{windows}"] = np.array([one.information for one in ring])
-            misfits = [np.nan if one.misfit_z is None else one.misfit_z for one in ring]
-            found[f"misfit_z_{windows}"] = np.array(misfits)
+            misfits = [one.misfit_z for one in ring if one.misfit_z is not None]
             shared = [one.common for one in ring if one.common is not None]
-            if shared:
-                found[f"common_{windows}"] = np.array(shared)
+            found[f"times_{windows}"] = np.array([(one.start_ns, one.end_ns) for one in ring], dtype=np.int64)
+            found[f"has_{windows}"] = np.array([(one.misfit_z is not None, one.common is not None) for one in ring])
+            found[f"vector_{windows}"] = np.array([one.vector for one in ring])
+            found[f"information_{windows}"] = np.array([one.information[_LOWER] for one in ring])
+            found[f"misfit_z_{windows}"] = np.array(misfits, dtype=np.float64)
+            found[f"common_{windows}"] = np.array(shared, dtype=np.float64).reshape(-1, n, n)
         return found
 
     @classmethod
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "SequentialState":
-        """State from what `checkpoint` gave."""
-        state = cls(before=tuple(arrays["before"].tolist()))
-        if arrays["change_ns"].size:
-            state.change_ns = int(arrays["change_ns"][0])
+        """State from what `checkpoint` gave.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        state = cls(before=tuple(checked(arrays, "before", np.float64, (len(PARAMETERS),)).tolist()))
+        change_ns = checked(arrays, "change_ns", np.int64, (None,))
+        state.change_ns = int(change_ns[0]) if change_ns.size else None
+        findings = checked(arrays, "findings", np.int64, (None, 3))
+        lengths = checked(arrays, "finding_stretch_s", np.float64, (len(findings),))
+        if np.any((findings[:, 0] < 0) | (findings[:, 0] >= len(PARAMETERS))):
+            raise CheckpointError(f"findings are of parameters {findings[:, 0].tolist()}, there are {len(PARAMETERS)}")
         state.findings = tuple(
             Finding(PARAMETERS[number], since, found, length)
-            for (number, since, found), length in zip(
-                arrays["findings"].reshape(-1, 3).tolist(), arrays["finding_stretch_s"].tolist(), strict=True
-            )
+            for (number, since, found), length in zip(findings.tolist(), lengths.tolist(), strict=True)
         )
-        for name in arrays:
-            if name.startswith("times_"):
-                windows = int(name.removeprefix("times_"))
-                times = arrays[name].reshape(-1, 2).tolist()
-                columns = zip(
-                    times,
-                    arrays[f"vector_{windows}"],
-                    arrays[f"information_{windows}"],
-                    arrays[f"misfit_z_{windows}"].tolist(),
-                    arrays.get(f"common_{windows}", [None] * len(times)),
-                    strict=True,
-                )
-                state.sums[windows] = [
-                    Stretch(start, end, vector, information, None if np.isnan(misfit) else misfit, common)
-                    for (start, end), vector, information, misfit, common in columns
-                ]
+        for windows in (2**power for power in range(_DOUBLINGS)):
+            if f"times_{windows}" in arrays:
+                state.sums[windows] = _restored_ring(arrays, windows)
         return state
+
+
+def _restored_ring(arrays: Mapping[str, np.ndarray], windows: int) -> list[Stretch]:
+    n = len(PARAMETERS)
+    times = checked(arrays, f"times_{windows}", np.int64, (None, 2))
+    has = checked(arrays, f"has_{windows}", np.bool_, times.shape)
+    vectors = checked(arrays, f"vector_{windows}", np.float64, (len(times), n))
+    lower = checked(arrays, f"information_{windows}", np.float64, (len(times), _LOWER[0].size))
+    information = np.zeros((len(times), n, n))
+    information[:, _LOWER[0], _LOWER[1]] = information[:, _LOWER[1], _LOWER[0]] = lower
+    n_misfits, n_shared = np.count_nonzero(has, axis=0).tolist()
+    misfits = iter(checked(arrays, f"misfit_z_{windows}", np.float64, (n_misfits,)).tolist())
+    shared = iter(checked(arrays, f"common_{windows}", np.float64, (n_shared, n, n)))
+    return [
+        Stretch(
+            start_ns,
+            end_ns,
+            vectors[at],
+            information[at],
+            next(misfits) if has_misfit else None,
+            next(shared) if has_common else None,
+        )
+        for at, ((start_ns, end_ns), (has_misfit, has_common)) in enumerate(
+            zip(times.tolist(), has.tolist(), strict=True)
+        )
+    ]
 
 
 class SequentialTest:
@@ -325,19 +353,19 @@ class SequentialTest:
         """Add the window to what is remembered; returns it and the sums of windows that end with it."""
         sums, length_ns = self.state.sums, round(self.settings.window_hops * self.settings.hop_s * 1e9)
         found, windows, total = {1: window}, 1, window
-        while True:
+        while windows < 2**_DOUBLINGS:
             ring = sums.setdefault(windows, [])
             ring.append(total)
             while ring[0].end_ns < total.start_ns - windows * length_ns:
                 ring.pop(0)
-            if windows == 2**_DOUBLINGS:
-                return found
             before = bisect_right(ring, total.start_ns + self._slack_ns, key=lambda one: one.end_ns)
             if not before:
                 return found
-            total = added([ring[before - 1], total])
+            del ring[: before - 1]  # nothing that comes will reach further back
+            total = added([ring[0], total])
             windows *= 2
             found[windows] = total
+        return found
 
     def _is_clean(self, look: Stretch) -> bool:
         change_ns = self.state.change_ns

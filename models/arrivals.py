@@ -1,0 +1,196 @@
+"""Blocks in the order in which they were sent, where the network delivered them in another one.
+
+::
+
+    arrive   0 1 3 4 2 5        a block that leaves a hole waits ...
+    go on    0 1     2 3 4 5    ... until the missing one is there
+
+    arrive   0 1 3 4 5 6 7      ... or until more than `bound` blocks wait (here 4): then the hole is given up,
+    go on    0 1         3…7    and the gate (`models.ingest`) states the gap
+
+Nothing is lost here and nothing is refused: that is the gate's work. It only has to see every block in its place, with
+repetitions behind their originals, where they change nothing.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from models.ingest import EARLIER_COURSES, Course
+from models.signals.block import SampleBlock
+
+__all__ = ["Arrivals", "Arrived"]
+
+_ALWAYS_NS = 2**63
+"""Later than any time of a block."""
+
+
+@dataclass(frozen=True, slots=True)
+class Arrived:
+    """A block and the schema hash that its sender named, empty if none."""
+
+    block: SampleBlock
+    schema_hash: str = ""
+
+
+class Arrivals:
+    """Puts the blocks of one machine in the order of their sequence, run by run.
+
+    A run begins at sequence 0: where its first blocks are overtaken, they are waited for. Where a stream that has run
+    for longer is joined, the first block that arrives is the first.
+
+    Parameters
+    ----------
+    bound : int
+        How many blocks may wait for a missing one; 0 hands on everything as it comes.
+
+    Raises
+    ------
+    ValueError
+        If the bound is negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> arrivals = Arrivals(20)
+    >>> blocks = [SampleBlock(n, n, 1, 1e9, np.zeros((1, 1))) for n in range(4)]
+    >>> [[one.block.sequence for one in arrivals.take(blocks[n])] for n in (0, 2, 3, 1)]
+    [[0], [], [], [1, 2, 3]]
+    """
+
+    def __init__(self, bound: int) -> None:
+        if bound < 0:
+            raise ValueError(f"bound is {bound}, expected 0 or more")
+        self._bound = bound
+        self._run: int | None = None
+        self._next = 0
+        self._waiting: dict[int, list[Arrived]] = {}
+        self._course: Course | None = None
+        self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
+
+    @property
+    def waiting(self) -> int:
+        """How many blocks wait, repetitions not counted."""
+        return len(self._waiting)
+
+    def take(self, block: SampleBlock, schema_hash: str = "") -> tuple[Arrived, ...]:
+        """Take a block as it arrives.
+
+        Parameters
+        ----------
+        block : SampleBlock
+            As decoded, of whatever form.
+        schema_hash : str
+            Schema hash the sender named, empty if it named none.
+
+        Returns
+        -------
+        tuple of Arrived
+            What may go to the gate now, in order. Repetitions of blocks that have gone on go at once and change nothing
+            here; those of waiting blocks follow their originals.
+        """
+        arrived = Arrived(block, schema_hash)
+        if self._bound == 0 or self._is_repetition(block):
+            return (arrived,)
+        if block.run == self._run and block.sequence >= self._next:
+            return self._place(arrived)
+        # Another run, or a count that began anew: nothing of the old one will come in its place any more.
+        gone_on = self.flush()
+        known = 0 if block.run == self._run else self._known(block.run)
+        self._run = block.run
+        self._next = known if known <= block.sequence <= known + self._bound else block.sequence
+        return gone_on + self._place(arrived)
+
+    def flush(self) -> tuple[Arrived, ...]:
+        """Hand on everything that waits: the stream is silent, or the recording has ended."""
+        found: list[Arrived] = []
+        while self._waiting:
+            self._next = min(self._waiting)
+            found += self._continued()
+        return tuple(found)
+
+    def expect(self, run: int, sequence: int) -> None:
+        """Go on in a stream of which everything before a block is there already.
+
+        Parameters
+        ----------
+        run : int
+        sequence : int
+            Of the next block.
+        """
+        self.resume((Course(run, 0, -_ALWAYS_NS, sequence, _ALWAYS_NS),))
+
+    def resume(self, courses: Iterable[Course]) -> None:
+        """Go on where a restored gate stands.
+
+        Parameters
+        ----------
+        courses : iterable of Course
+            `Gate.courses`.
+        """
+        self._waiting.clear()
+        self._earlier.clear()
+        self._earlier.extend(courses)
+        self._course = self._earlier.pop() if self._earlier else None
+        self._run = None if self._course is None else self._course.run
+        self._next = 0 if self._course is None else self._course.sequence
+
+    def _is_repetition(self, block: SampleBlock) -> bool:
+        """Whether the block has gone on, or its place has been passed over."""
+        if self._course is not None and self._course.covers(block):
+            return True
+        return any(course.covers(block) for course in self._earlier)
+
+    def _known(self, run: int) -> int:
+        """What comes next in a run that was left for another one; 0 if it is new."""
+        courses = (*self._earlier, *(() if self._course is None else (self._course,)))
+        return max((course.sequence for course in courses if course.run == run), default=0)
+
+    def _place(self, arrived: Arrived) -> tuple[Arrived, ...]:
+        """Put a block of the present run in its place, and hand on what is complete."""
+        copies = self._waiting.setdefault(arrived.block.sequence, [])
+        if not copies or not _same(copies[0], arrived):
+            copies.append(arrived)
+        elif len(copies) <= self._bound:
+            copies.append(copies[0])  # takes no memory, and the gate can count it
+        found = self._continued()
+        if self._held() > self._bound:
+            self._next = min(self._waiting)
+            found += self._continued()
+        return tuple(found)
+
+    def _held(self) -> int:
+        """Blocks in memory."""
+        return sum(len({id(one) for one in copies}) for copies in self._waiting.values())
+
+    def _continued(self) -> list[Arrived]:
+        """Hand on blocks from the next one up to a hole."""
+        found: list[Arrived] = []
+        while (copies := self._waiting.pop(self._next, None)) is not None:
+            found += copies
+            self._note(copies[0].block)
+            self._next += 1
+        return found
+
+    def _note(self, block: SampleBlock) -> None:
+        """Remember a block that goes on, so that its repetitions are known."""
+        course = self._course
+        if course is None:
+            self._course = Course.beginning(block)
+        elif block.run == course.run and block.sequence >= course.sequence and block.end_ns > course.start_ns:
+            self._course = course.extended(block)
+        else:
+            self._earlier.append(course)
+            self._course = Course.beginning(block)
+
+
+def _same(one: Arrived, other: Arrived) -> bool:
+    """Whether two blocks are the same to the last bit."""
+    a, b = one.block, other.block
+    return (
+        one.schema_hash == other.schema_hash
+        and (a.start_ns, a.sequence, a.run, a.rate_hz) == (b.start_ns, b.sequence, b.run, b.rate_hz)
+        and a.samples.dtype == b.samples.dtype
+        and a.samples.shape == b.samples.shape
+        and a.samples.tobytes() == b.samples.tobytes()
+    )

@@ -1,0 +1,160 @@
+"""Remembered state as bytes: named arrays in, the same arrays out, to the last bit.
+
+::
+
+    RWCP | version | BLAKE2b of the rest | npz archive, uncompressed
+
+The digest is looked at first, so that damaged bytes are refused before anything is read from them. Arrays of Python
+objects are refused on either side: nothing in stored bytes is ever executed.
+"""
+
+import hashlib
+import io
+import struct
+import zipfile
+from collections.abc import Mapping
+from typing import TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from models.errors import CheckpointError
+
+__all__ = ["checked", "from_bytes", "prefixed", "texts", "to_bytes", "unprefixed"]
+
+_MAGIC = b"RWCP"
+_VERSION = 1
+_HEADER = struct.Struct("<4sH16s")
+_SUFFIX = ".npy"
+
+_Scalar = TypeVar("_Scalar", bound=np.generic)
+
+
+def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Put named arrays of numbers, truth values and text into bytes; the same arrays give the same bytes.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        Of any shape; the order of elements in memory (rows or columns first) is kept.
+
+    Raises
+    ------
+    CheckpointError
+        If an array holds Python objects.
+
+    Examples
+    --------
+    >>> from_bytes(to_bytes({"speed_rad_s": np.array([138.2])}))
+    {'speed_rad_s': array([138.2])}
+    """
+    body = io.BytesIO()
+    with zipfile.ZipFile(body, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            if array.dtype.hasobject:
+                raise CheckpointError(f"{name}: an array of type {array.dtype}, expected numbers, truth values or text")
+            # An entry made from a bare name would be given the time of day.
+            with archive.open(zipfile.ZipInfo(name + _SUFFIX), "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+    payload = body.getvalue()
+    return _HEADER.pack(_MAGIC, _VERSION, _digest(payload)) + payload
+
+
+def from_bytes(data: bytes) -> dict[str, np.ndarray]:
+    """Named arrays from what `to_bytes` gave.
+
+    Parameters
+    ----------
+    data : bytes
+
+    Raises
+    ------
+    CheckpointError
+        If the bytes are damaged, cut short, or something else, or were written by another version of the format.
+    """
+    if len(data) < _HEADER.size or not data.startswith(_MAGIC):
+        raise CheckpointError(f"{len(data)} bytes that begin with {data[:4]!r}, expected a checkpoint ({_MAGIC!r})")
+    _, version, digest = _HEADER.unpack_from(data)
+    if version != _VERSION:
+        raise CheckpointError(f"a checkpoint of format {version}, expected format {_VERSION}")
+    payload = data[_HEADER.size :]
+    if _digest(payload) != digest:
+        raise CheckpointError(f"a checkpoint of {len(data)} bytes is damaged: its checksum does not fit its contents")
+    found = {}
+    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+        for name in archive.namelist():
+            with archive.open(name) as entry:
+                found[name.removesuffix(_SUFFIX)] = np.lib.format.read_array(entry, allow_pickle=False)
+    return found
+
+
+def prefixed(part: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of one part under names that several parts may share a mapping with.
+
+    Examples
+    --------
+    >>> prefixed("gate", {"start_ns": np.array(5)})
+    {'gate/start_ns': array(5)}
+    """
+    return {f"{part}/{name}": array for name, array in arrays.items()}
+
+
+def unprefixed(part: str, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of one part under their own names; empty if there is no such part.
+
+    Examples
+    --------
+    >>> unprefixed("gate", {"gate/start_ns": np.array(5), "window/level": np.array(1.0)})
+    {'start_ns': array(5)}
+    """
+    start = f"{part}/"
+    return {name.removeprefix(start): array for name, array in arrays.items() if name.startswith(start)}
+
+
+def checked(
+    arrays: Mapping[str, np.ndarray], name: str, kind: type[_Scalar], shape: tuple[int | None, ...]
+) -> npt.NDArray[_Scalar]:
+    """Return one array if it is what it should be.
+
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+    name : str
+    kind : type
+        Element type.
+    shape : tuple of int or None
+        Expected shape; None where any size will do.
+
+    Raises
+    ------
+    CheckpointError
+        If there is no such array, or it has another type or shape: the state is that of another machine or program.
+    """
+    array = arrays.get(name)
+    if array is None:
+        raise CheckpointError(f"{name} is missing; there are {', '.join(sorted(arrays)) or 'no arrays at all'}")
+    fits = len(array.shape) == len(shape) and all(
+        size in (None, found) for size, found in zip(shape, array.shape, strict=True)
+    )
+    if not fits or array.dtype.type is not kind:
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise CheckpointError(
+            f"{name} has type {array.dtype} and shape {array.shape}, expected {kind.__name__} and ({wanted})"
+        )
+    return array
+
+
+def texts(arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
+    """Return the texts in one array of any length.
+
+    Raises
+    ------
+    CheckpointError
+        As `checked`.
+    """
+    found: list[str] = checked(arrays, name, np.str_, (None,)).tolist()
+    return tuple(found)
+
+
+def _digest(payload: bytes) -> bytes:
+    return hashlib.blake2b(payload, digest_size=16).digest()
