@@ -1,4 +1,4 @@
-"""The HTTP API over what the service knows; ``docs/api.md`` lists the routes. All but the replays is read only."""
+"""The HTTP API over what the service knows; ``docs/api.md`` lists the routes."""
 
 from collections.abc import Sequence
 from typing import Annotated, Protocol
@@ -7,6 +7,7 @@ from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 
+from service.access.guard import Guard
 from service.page import front_page
 from service.problems import add_problems, problem_answer, responses
 from service.recordings_api import RecordingIndex, add_recording_routes
@@ -20,6 +21,7 @@ from service.schemas import (
     Readiness,
     Report,
 )
+from service.store.machine import MachineStore
 
 __all__ = ["AlarmEventList", "Alive", "MachineList", "MachineView", "ReportList", "ServiceView", "create_app"]
 
@@ -42,11 +44,9 @@ class MachineView(Protocol):
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
 
-    def reports(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[Report, ...]:
-        """Window reports with since_ns ≤ end_ns < until_ns, newest first."""
-
-    def alarm_events(self, since_ns: int | None, until_ns: int | None, limit: int) -> tuple[AlarmCloudEvent, ...]:
-        """Alarm events with since_ns ≤ time_ns < until_ns, newest first."""
+    @property
+    def history(self) -> MachineStore:
+        """What is kept of the machine."""
 
 
 class ServiceView(Protocol):
@@ -112,47 +112,67 @@ _Change = Annotated[
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many, the newest")]
 
 
-def create_app(service: ServiceView) -> FastAPI:
+def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     """Build the application.
 
     Parameters
     ----------
     service : ServiceView
         Where the answers come from; called from the server's worker threads.
+    guard : Guard
+        Who may call what.
     """
     app = FastAPI(
         title="rotorwatch",
-        description="Health of rotating machines: which parameter changed, by how much, how sure. Read only, "
-        "but for replays of recordings, which are kept apart from what is live. Errors are problem details (RFC 9457).",
+        description="Health of rotating machines: which parameter changed, by how much, how sure. "
+        "Errors are problem details (RFC 9457).",
+        dependencies=[guard.gate],
+        openapi_url=None,  # the guard serves it
         docs_url=None,  # the usual pages load their scripts from elsewhere
         redoc_url=None,
     )
     add_problems(app)
-    _add_machine_routes(app, service)
-    _add_history_routes(app, service)
-    add_recording_routes(app, service.catalogue)
-    add_replay_routes(app, service.replays)
-    _add_service_routes(app, service)
+    _add_machine_routes(app, service, guard)
+    _add_history_routes(app, service, guard)
+    add_recording_routes(app, service.catalogue, guard)
+    add_replay_routes(app, service.replays, guard)
+    _add_service_routes(app, service, guard)
+    guard.protect(app)
     return app
 
 
-def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
-    @app.get("/api/v1/machines", tags=["machines"], responses=responses(MachineList))
+def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    @app.get("/api/v1/machines", tags=["machines"], dependencies=[guard.read], responses=responses(MachineList))
     def machines() -> MachineList:
         """Every monitored machine with its state."""
         return MachineList(machines=tuple(machine.description() for machine in service.machines()))
 
-    @app.get("/api/v1/machines/{site}/{machine}", tags=["machines"], responses=responses(MachineDescription, 404, 422))
+    @app.get(
+        "/api/v1/machines/{site}/{machine}",
+        tags=["machines"],
+        dependencies=[guard.read],
+        responses=responses(MachineDescription, 404, 422),
+    )
     def machine(site: str, machine: str) -> MachineDescription:
         """One machine: stream, channels, keys, state."""
         return _find(service, site, machine).description()
 
-    @app.get("/api/v1/machines/{site}/{machine}/health", tags=["machines"], responses=responses(Health, 404, 422))
+    @app.get(
+        "/api/v1/machines/{site}/{machine}/health",
+        tags=["machines"],
+        dependencies=[guard.read],
+        responses=responses(Health, 404, 422),
+    )
     def health(site: str, machine: str) -> Health:
         """Where a machine stands: state, parameters with intervals, equations, alarms, quality of the data."""
         return _find(service, site, machine).health()
 
-    @app.get("/api/v1/machines/{site}/{machine}/alarms", tags=["machines"], responses=responses(AlarmStates, 404, 422))
+    @app.get(
+        "/api/v1/machines/{site}/{machine}/alarms",
+        tags=["machines"],
+        dependencies=[guard.read],
+        responses=responses(AlarmStates, 404, 422),
+    )
     def alarms(
         site: str,
         machine: str,
@@ -164,6 +184,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
     @app.get(
         "/api/v1/machines/{site}/{machine}/detectable",
         tags=["machines"],
+        dependencies=[guard.read],
         responses=responses(DetectableChanges, 404, 422),
     )
     def detectable(site: str, machine: str, change: _Change = None) -> DetectableChanges:
@@ -171,35 +192,51 @@ def _add_machine_routes(app: FastAPI, service: ServiceView) -> None:
         return _find(service, site, machine).detectable(change or None)
 
 
-def _add_history_routes(app: FastAPI, service: ServiceView) -> None:
-    @app.get("/api/v1/machines/{site}/{machine}/reports", tags=["history"], responses=responses(ReportList, 404, 422))
+def _add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    @app.get(
+        "/api/v1/machines/{site}/{machine}/reports",
+        tags=["history"],
+        dependencies=[guard.read],
+        responses=responses(ReportList, 404, 422),
+    )
     def reports(
         site: str, machine: str, since_ns: _SinceNs = None, until_ns: _UntilNs = None, limit: _Limit = 100
     ) -> ReportList:
         """Window reports by the time of the window's end, newest first: the history of residuals."""
-        found = _find(service, site, machine).reports(since_ns, until_ns, limit)
+        history = _find(service, site, machine).history
+        stored = history.reports(since_ns=since_ns, until_ns=until_ns, limit=limit)
+        found = tuple(Report.model_validate_json(one.text) for _, one in stored)
         return ReportList(reports=found, next_until_ns=found[-1].end_ns if len(found) == limit else None)
 
     @app.get(
         "/api/v1/machines/{site}/{machine}/alarms/events",
         tags=["history"],
+        dependencies=[guard.read],
         responses=responses(AlarmEventList, 404, 422),
     )
     def alarm_events(
         site: str, machine: str, since_ns: _SinceNs = None, until_ns: _UntilNs = None, limit: _Limit = 100
     ) -> AlarmEventList:
         """Raised, escalated and cleared alarms by their time, newest first, as CloudEvents."""
-        found = _find(service, site, machine).alarm_events(since_ns, until_ns, limit)
+        history = _find(service, site, machine).history
+        stored = history.events(since_ns=since_ns, until_ns=until_ns, limit=limit, newest_first=True)
+        found = tuple(AlarmCloudEvent.model_validate_json(one.text) for one in stored)
         return AlarmEventList(events=found, next_until_ns=found[-1].data.time_ns if len(found) == limit else None)
 
 
-def _add_service_routes(app: FastAPI, service: ServiceView) -> None:
+def _add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     @app.get("/healthz", tags=["service"], responses=responses(Alive))
     def healthz() -> Alive:
         """Whether the process answers."""
         return Alive(alive=True)
 
-    @app.get("/readyz", tags=["service"], responses=responses(Readiness, 503), response_model=Readiness)
+    @app.get(
+        "/readyz",
+        tags=["service"],
+        dependencies=[guard.read],
+        responses=responses(Readiness, 503),
+        response_model=Readiness,
+    )
     def readyz(request: Request) -> Readiness | JSONResponse:
         """Whether the session is open and every worker runs; a machine without data is listed, not counted."""
         readiness = service.readiness()
@@ -209,7 +246,7 @@ def _add_service_routes(app: FastAPI, service: ServiceView) -> None:
             request, 503, "the session is closed or a worker has stopped", readiness.model_dump(mode="json")
         )
 
-    @app.get("/", include_in_schema=False, response_class=HTMLResponse)
+    @app.get("/", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
     def page() -> str:
         """Serve a plain page for people."""
         return front_page(tuple(machine.health() for machine in service.machines()))

@@ -8,6 +8,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from models.signals.recording import summarize_recording
+from service.access.guard import Guard
 from service.problems import problem_responses, responses
 from service.recording.catalogue import Recording
 
@@ -79,10 +80,15 @@ _SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this
 _UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
 
 
-def add_recording_routes(app: FastAPI, index: RecordingIndex | None) -> None:
+def add_recording_routes(app: FastAPI, index: RecordingIndex | None, guard: Guard) -> None:
     """Add the routes; without an index they answer with a problem that names the setting."""
 
-    @app.get("/api/v1/recordings", tags=["recordings"], responses=responses(RecordingList, 404, 422))
+    @app.get(
+        "/api/v1/recordings",
+        tags=["recordings"],
+        dependencies=[guard.read],
+        responses=responses(RecordingList, 404, 422),
+    )
     def recordings(
         site: _Site = None, machine: _Machine = None, since_ns: _SinceNs = None, until_ns: _UntilNs = None
     ) -> RecordingList:
@@ -98,6 +104,7 @@ def add_recording_routes(app: FastAPI, index: RecordingIndex | None) -> None:
     @app.get(
         "/api/v1/recordings/{site}/{machine}/{name}",
         tags=["recordings"],
+        dependencies=[guard.read],
         responses=responses(RecordingDetail, 404, 422),
     )
     def recording(site: str, machine: str, name: str) -> RecordingDetail:
@@ -110,6 +117,7 @@ def add_recording_routes(app: FastAPI, index: RecordingIndex | None) -> None:
     @app.get(
         "/api/v1/recordings/{site}/{machine}/{name}/download",
         tags=["recordings"],
+        dependencies=[guard.read],
         response_class=FileResponse,
         responses={200: {"content": {"application/octet-stream": {}}}, **problem_responses(404, 409, 422)},
     )

@@ -1,22 +1,18 @@
-"""Replays over HTTP: start, watch, steer and stop them, and read what they found.
-
-The only routes that change anything. There is no password, so what a browser sends on behalf of a page from elsewhere
-is refused.
-"""
+"""Replays over HTTP: start, watch, steer and stop them, and read what they found."""
 
 import asyncio
-import ipaddress
 import json
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import urlsplit
 
-from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query, Request
+from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from models.signals.link import LinkSettings
+from service.access.guard import Guard
+from service.access_settings import is_loopback
 from service.config import MachineEntry, ServiceSettings
 from service.problems import problem_responses, responses
 from service.recordings_api import RecordingIndex, found_recording
@@ -87,11 +83,7 @@ class ReplayDesk:
     def enabled(self) -> bool:
         """Whether replays may be started."""
         wish = self._settings.replay.enabled
-        return _on_loopback(self._settings.http.host) if wish is None else wish
-
-    def hosts(self) -> frozenset[str]:
-        """Names, other than addresses, under which browsers may reach the API."""
-        return frozenset(("localhost", self._settings.http.host, *self._settings.replay.hosts))
+        return is_loopback(self._settings.http.host) if wish is None else wish
 
     def start(self, request: ReplayRequest) -> ReplayJob:
         """Start a replay.
@@ -177,11 +169,11 @@ class ReplayDesk:
         return self._entries
 
 
-def add_replay_routes(app: FastAPI, desk: ReplayDesk) -> None:
+def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     """Add the routes."""
     router = APIRouter(prefix=_PLACE, tags=["replays"])
-    _add_reading_routes(router, desk)
-    _add_changing_routes(router, desk)
+    _add_reading_routes(router, desk, guard)
+    _add_changing_routes(router, desk, guard)
     app.include_router(router)
 
 
@@ -189,24 +181,24 @@ _Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldes
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
-def _add_reading_routes(router: APIRouter, desk: ReplayDesk) -> None:
-    @router.get("", responses=responses(ReplayList))
+def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
+    @router.get("", dependencies=[guard.read], responses=responses(ReplayList))
     def replays() -> ReplayList:
         """Replays since the service started, the latest first."""
         return ReplayList(replays=() if desk.jobs is None else desk.jobs.jobs())
 
-    @router.get("/{replay_id}", responses=responses(ReplayJob, 404, 422))
+    @router.get("/{replay_id}", dependencies=[guard.read], responses=responses(ReplayJob, 404, 422))
     def replay(replay_id: str) -> ReplayJob:
         """How far a replay is, and in the end what it found."""
         return _job(desk, replay_id)
 
-    @router.get("/{replay_id}/reports", responses=responses(ReplayReportList, 404, 422))
+    @router.get("/{replay_id}/reports", dependencies=[guard.read], responses=responses(ReplayReportList, 404, 422))
     def reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayReportList:
         """Window reports of an offline replay; the history of the live machine has none of them."""
         found, following = _results(desk, replay_id, "/report", offset, limit)
         return ReplayReportList(reports=tuple(Report.model_validate_json(one) for one in found), next_offset=following)
 
-    @router.get("/{replay_id}/alarms", responses=responses(ReplayAlarmList, 404, 422))
+    @router.get("/{replay_id}/alarms", dependencies=[guard.read], responses=responses(ReplayAlarmList, 404, 422))
     def alarms(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayAlarmList:
         """Alarm events of an offline replay; nobody else hears of them."""
         found, following = _results(desk, replay_id, "/alarm/event", offset, limit)
@@ -215,6 +207,7 @@ def _add_reading_routes(router: APIRouter, desk: ReplayDesk) -> None:
 
     @router.get(
         "/{replay_id}/events",
+        dependencies=[guard.stream],
         response_class=StreamingResponse,
         responses={200: {"content": {"text/event-stream": {}}}, **problem_responses(404, 422)},
     )
@@ -228,8 +221,8 @@ def _add_reading_routes(router: APIRouter, desk: ReplayDesk) -> None:
         )
 
 
-def _add_changing_routes(router: APIRouter, desk: ReplayDesk) -> None:
-    guarded = [Depends(_guard(desk))]
+def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
+    guarded = [guard.operate, Depends(_switch(desk))]
     problems = (403, 404, 415, 422)
 
     @router.post(
@@ -264,26 +257,12 @@ def _add_changing_routes(router: APIRouter, desk: ReplayDesk) -> None:
         return _order(desk, replay_id, f"seek {place.to_ns if place.by_s is None else f'{place.by_s:+f}'}")
 
 
-def _guard(desk: ReplayDesk) -> Callable[[Request], None]:
-    """Refuse what a page from elsewhere could make a browser send, and everything if replays are switched off."""
+def _switch(desk: ReplayDesk) -> Callable[[], None]:
+    """Refuse everything if replays are switched off."""
 
-    def check(request: Request) -> None:
+    def check() -> None:
         if not desk.enabled:
             raise HTTPException(403, "replays over HTTP are switched off in the settings ([replay] enabled)")
-        host = request.headers.get("host", "")
-        name = urlsplit(f"//{host}").hostname or ""
-        if not _is_address(name) and name not in desk.hosts():
-            # A name of somebody else's that leads here would make their page one of ours.
-            raise HTTPException(403, f"host {host!r} is not one of this service; see [replay] hosts in the settings")
-        origin = request.headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
-            raise HTTPException(403, f"a page from {origin} may not do this")
-        if request.headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
-            raise HTTPException(403, "a page from elsewhere may not do this")
-        # A form can send neither this type nor the method DELETE; a script from elsewhere would have to ask first.
-        kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-        if request.method == "POST" and kind != "application/json":
-            raise HTTPException(415, f"content type is {kind or 'missing'}, expected application/json")
 
     return check
 
@@ -368,15 +347,3 @@ def _endpoints(link: LinkSettings) -> tuple[str, ...]:
             end = end.replace(f"/{unspecified}:", f"/{here}:")  # noqa: PLW2901  # the same endpoint, nearer
         found.append(end)
     return tuple(found[:1]) or link.connect
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
-def _on_loopback(host: str) -> bool:
-    return host == "localhost" or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
