@@ -1,0 +1,316 @@
+"""Settings of a link: what contradicts, what is secret, and what is said when something cannot be used."""
+
+import json
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trustme
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
+
+from models.errors import MachineFileError
+from models.link_file import load_link
+from models.signals.keys import MachineKeys
+from models.signals.link import LinkSettings, TlsSettings
+from models.signals.link_access import Grant, access_control
+
+ROOT = Path(__file__).parents[2]
+ENDPOINT = ("tcp/127.0.0.1:7447",)
+TLS_ENDPOINT = ("tls/127.0.0.1:7447",)
+GRANT = {"who": ["lab"], "publishes": ["demo/lab"]}
+BY_VARIABLE = {"connect": ENDPOINT, "user": "lab", "password_variable": "LAB_PASSWORD"}
+HIDDEN = "correct-horse-battery"
+
+
+def secret_file(path: Path, text: str, mode: int = 0o600) -> Path:
+    path.write_text(text, encoding="utf-8")
+    path.chmod(mode)
+    return path
+
+
+def certificate(folder: Path) -> TlsSettings:
+    authority = trustme.CA()
+    issued = authority.issue_cert("localhost", common_name="lab")
+    authority.cert_pem.write_to_path(str(folder / "ca.pem"))
+    issued.cert_chain_pems[0].write_to_path(str(folder / "lab.pem"))
+    secret_file(folder / "lab.key", issued.private_key_pem.bytes().decode())
+    return TlsSettings(
+        root_certificate=folder / "ca.pem", certificate=folder / "lab.pem", key=folder / "lab.key", mutual=True
+    )
+
+
+def inserted(link: LinkSettings) -> zenoh.Config:
+    """The configuration Zenoh makes of the settings; it refuses unknown paths and wrong types."""
+    config = zenoh.Config()
+    for path, value in link.zenoh_items().items():
+        config.insert_json5(path, value)
+    return config
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"user": "lab"}, "expected its password by one of password_file and password_variable"),
+        ({"user": "lab", "password_file": "a", "password_variable": "B"}, "by one of password_file"),
+        ({"password_file": "a"}, "a password is given, but no user"),
+        ({"user": "a:b", "password_file": "a"}, "user"),
+        ({"passwords_file": "a", "connect": ENDPOINT}, "no listen endpoint"),
+        ({"listen": TLS_ENDPOINT}, r"expected \[link.tls\] with certificate and key"),
+        ({"connect": TLS_ENDPOINT}, r"expected \[link.tls\] with root_certificate"),
+        ({"connect": TLS_ENDPOINT, "tls": {"certificate": "a", "key": "b"}}, "with root_certificate"),
+        ({"tls": {"certificate": "a"}}, "certificate and key belong together"),
+        ({"tls": {"root_certificate": "a", "mutual": True}}, "mutual needs"),
+        ({"grants": [GRANT], "connect": ENDPOINT}, "no listen endpoint"),
+        ({"grants": [GRANT], "listen": ENDPOINT}, "expected passwords_file or tls.mutual"),
+        (
+            {"grants": [GRANT], "listen": ENDPOINT, "connect": ENDPOINT, "passwords_file": "a"},
+            "do not go together",
+        ),
+        (
+            {
+                "grants": [GRANT],
+                "listen": (*TLS_ENDPOINT, *ENDPOINT),
+                "tls": {"root_certificate": "a", "certificate": "b", "key": "c", "mutual": True},
+            },
+            "nobody shows one to tcp/127.0.0.1:7447",
+        ),
+        ({"grants": [{"who": ["lab"]}]}, "the grant allows nothing"),
+        ({"grants": [{"who": [], "views": ["demo/*"]}]}, "who"),
+        ({"grants": [{"who": ["a b"], "views": ["demo/*"]}]}, "without spaces and colons"),
+        ({"grants": [{"who": ["lab"], "views": ["demo"]}]}, 'expected "site/machine"'),
+        ({"grants": [{"who": ["lab"], "views": ["demo/**"]}]}, 'expected "site/machine"'),
+        ({"grants": [{"who": ["lab"], "views": ["demo/pump*"]}]}, 'expected "site/machine"'),
+        ({"grants": [{"who": ["lab"], "reads": ["demo/*"]}]}, "Extra inputs"),
+    ],
+)
+def test_what_contradicts_is_said(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        LinkSettings.model_validate(fields)
+
+
+def test_contradictions_that_a_command_line_brings_are_found_at_opening(tmp_path: Path) -> None:
+    link = LinkSettings(listen=ENDPOINT).model_copy(update={"listen": (), "connect": TLS_ENDPOINT})
+    with pytest.raises(MachineFileError, match=r"^link: connect is tls/127.0.0.1:7447: expected \[link.tls\]"):
+        link.zenoh_items()
+
+
+@pytest.mark.parametrize("name", ["password", "passwords"])
+def test_a_password_in_the_settings_is_refused_and_not_repeated(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "link.toml"
+    path.write_text(f'[link]\nconnect = ["tcp/127.0.0.1:7447"]\nuser = "lab"\n{name} = "{HIDDEN}"\n', encoding="utf-8")
+    with pytest.raises(MachineFileError, match=f"{name} does not belong into settings.*{name}_file") as caught:
+        load_link(path)
+    assert HIDDEN not in f"{caught.value} {caught.value.__cause__}"
+
+
+def test_secrets_are_in_what_goes_to_zenoh_and_nowhere_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LAB_PASSWORD", HIDDEN)
+    by_variable = LinkSettings.model_validate(BY_VARIABLE)
+    secret_file(tmp_path / "p", f"{HIDDEN}\n")
+    by_file = LinkSettings(connect=ENDPOINT, user="lab", password_file=Path("p")).beside(tmp_path)
+    for link in (by_variable, by_file):
+        assert json.loads(inserted(link).get_json("transport/auth/usrpwd/password")) == HIDDEN
+        for shown in (repr(link), str(link), repr(link.model_dump()), link.model_dump_json(), link.refusal()):
+            assert HIDDEN not in shown
+        assert LinkSettings.model_validate(link.model_dump()) == link
+
+
+def test_a_missing_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LAB_PASSWORD", raising=False)
+    link = LinkSettings.model_validate(BY_VARIABLE)
+    with pytest.raises(MachineFileError, match="LAB_PASSWORD is empty or not there, expected the password of user lab"):
+        link.zenoh_items()
+
+
+@pytest.mark.parametrize("mode", [0o604, 0o644, 0o602, 0o777])
+def test_secrets_that_everybody_may_read_are_refused(tmp_path: Path, mode: int) -> None:
+    password = secret_file(tmp_path / "p", HIDDEN, mode)
+    passwords = secret_file(tmp_path / "all", f"lab:{HIDDEN}", mode)
+    tls = certificate(tmp_path)
+    assert tls.key is not None
+    tls.key.chmod(mode)
+    for link, path in (
+        (LinkSettings(connect=ENDPOINT, user="lab", password_file=password), password),
+        (LinkSettings(listen=ENDPOINT, passwords_file=passwords), passwords),
+        (LinkSettings(listen=TLS_ENDPOINT, tls=tls), tls.key),
+    ):
+        with pytest.raises(MachineFileError, match=f"chmod 600 {path}") as caught:
+            link.zenoh_items()
+        assert HIDDEN not in str(caught.value)
+        path.chmod(0o640)
+        inserted(link)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "no users"),
+        ("lab", "line 1: expected name:password"),
+        (f"lab:{HIDDEN}\n\npump:x", "line 2: expected name:password"),
+        (f"lab:{HIDDEN}\n# pump:x", "line 2"),
+        (f"lab:{HIDDEN}\n:x", "line 2"),
+        (f"lab:{HIDDEN}\npump:", "line 2"),
+        (f"lab:{HIDDEN}\nlab:{HIDDEN}", "line 2: the user lab has a line already"),
+        (f"pump:{HIDDEN}", "who: lab has no line in"),
+    ],
+)
+def test_a_file_of_passwords_that_cannot_be_used_is_refused_without_showing_one(
+    tmp_path: Path, text: str, said: str
+) -> None:
+    passwords = secret_file(tmp_path / "all", text)
+    link = LinkSettings.model_validate({"listen": ENDPOINT, "passwords_file": passwords, "grants": [GRANT]})
+    with pytest.raises(MachineFileError, match=said) as caught:
+        link.zenoh_items()
+    assert HIDDEN not in str(caught.value)
+    assert str(passwords) in str(caught.value)
+
+
+@pytest.mark.parametrize(("text", "said"), [("", "found 0 lines"), (f"{HIDDEN}\n{HIDDEN}\n", "found 2 lines")])
+def test_a_password_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+    link = LinkSettings(connect=ENDPOINT, user="lab", password_file=secret_file(tmp_path / "p", text))
+    with pytest.raises(MachineFileError, match=said) as caught:
+        link.zenoh_items()
+    assert HIDDEN not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "said"),
+    [
+        ("ca.pem", None, "tls.root_certificate: .*ca.pem: cannot be read"),
+        ("lab.key", None, "tls.key: .*lab.key: cannot be read"),
+        ("lab.pem", "nonsense", "tls.certificate: .*lab.pem: expected a certificate in PEM"),
+        ("lab.key", "nonsense", "tls.key: .*lab.key: expected a private key in PEM"),
+        ("lab.key", "-----BEGIN ENCRYPTED PRIVATE KEY-----", "needs a passphrase"),
+    ],
+)
+def test_certificates_that_cannot_be_used_are_named(tmp_path: Path, file: str, text: str | None, said: str) -> None:
+    link = LinkSettings(listen=TLS_ENDPOINT, tls=certificate(tmp_path))
+    inserted(link)
+    (tmp_path / file).unlink()
+    if text is not None:
+        secret_file(tmp_path / file, text)
+    with pytest.raises(MachineFileError, match=said):
+        link.zenoh_items()
+
+
+def test_a_certificate_serves_the_role_of_the_endpoint(tmp_path: Path) -> None:
+    tls = certificate(tmp_path)
+    one_sided = tls.model_copy(update={"mutual": False})
+    for link, roles in (
+        (LinkSettings(listen=TLS_ENDPOINT, tls=tls), {"listen"}),
+        (LinkSettings(listen=TLS_ENDPOINT, tls=one_sided), {"listen"}),
+        (LinkSettings(connect=TLS_ENDPOINT, tls=tls), {"connect"}),
+        (LinkSettings(connect=TLS_ENDPOINT, tls=one_sided), set()),
+        (LinkSettings(listen=TLS_ENDPOINT, connect=TLS_ENDPOINT, tls=tls), {"listen", "connect"}),
+    ):
+        found = json.loads(inserted(link).get_json("transport/link/tls"))
+        assert {role for role in ("listen", "connect") if found[f"{role}_certificate"]} == roles
+        assert {role for role in ("listen", "connect") if found[f"{role}_private_key"]} == roles
+        assert link.tls is not None
+        assert found["enable_mtls"] is link.tls.mutual
+        assert found["verify_name_on_connect"] is True
+
+
+def test_refusals_name_every_reason_the_settings_leave_open(tmp_path: Path) -> None:
+    error = "Unable to connect to any of [tcp/127.0.0.1:7447]. Timeout! at /x/orchestrator.rs:388."
+    plain = LinkSettings(connect=ENDPOINT).explain(error)
+    assert plain.startswith("nobody answers there; or ")
+    assert "wants a user name" in plain
+    assert "only tls/" in plain
+    user = LinkSettings(connect=ENDPOINT, user="lab", password_file=tmp_path / "p").explain(error)
+    assert f"does not know the user lab with the password in {tmp_path / 'p'}" in user
+    tls = certificate(tmp_path)
+    assert "lab.pem is not issued by" in LinkSettings(connect=TLS_ENDPOINT, tls=tls).explain(error)
+    one_sided = tls.model_copy(update={"mutual": False})
+    assert "mutual is false" in LinkSettings(connect=TLS_ENDPOINT, tls=one_sided).explain(error)
+    assert "another program" in LinkSettings(listen=ENDPOINT).explain("Address already in use (os error 98)")
+    assert LinkSettings().explain("Bad thing at /x/a.rs:3.") == "Bad thing"
+
+
+def allowed(control: dict[str, Any], name: str, flow: str, message: str, key: str) -> bool:
+    """Zenoh's decision, made again from the configuration: some rule of the subject includes the key."""
+    policies = [policy for policy in control["policies"] if name in policy["subjects"]]
+    names = {rule for policy in policies for rule in policy["rules"]}
+    return any(
+        zenoh.KeyExpr(pattern).includes(zenoh.KeyExpr(key))
+        for rule in control["rules"]
+        if rule["id"] in names and flow in rule["flows"] and message in rule["messages"]
+        for pattern in rule["key_exprs"]
+    )
+
+
+MESSAGES = (
+    "put", "delete", "reply", "query", "declare_subscriber", "declare_queryable", "liveliness_token",
+    "liveliness_query", "declare_liveliness_subscriber",
+)  # fmt: skip
+_PLACES = st.sampled_from(["demo/lab", "demo/pump", "demo/*", "plant/lab", "*/lab", "*/*"])
+
+
+@given(publishes=st.lists(_PLACES), views=st.lists(_PLACES), monitors=st.lists(_PLACES))
+def test_nobody_sends_what_no_grant_allows(publishes: list[str], views: list[str], monitors: list[str]) -> None:
+    if not (publishes or views or monitors):
+        return
+    fields = {"who": ["lab"], "publishes": publishes, "views": views, "monitors": monitors}
+    control: Any = access_control([Grant.model_validate(fields)], "usernames")
+    for site, machine in product(("demo", "plant"), ("lab", "pump")):
+        keys = MachineKeys(site, machine)
+
+        def covers(places: list[str], site: str = site, machine: str = machine) -> bool:
+            return any(s in {"*", site} and m in {"*", machine} for s, m in (place.split("/") for place in places))
+
+        sent = (keys.stream, keys.descriptor, keys.truth)
+        found = (keys.report, keys.health, keys.alarm_event, keys.alarm_state)
+        for keys_of, send, read in (
+            (sent, covers(publishes), covers(monitors)),
+            (found, covers(monitors), covers(monitors) or covers(views)),
+        ):
+            for key in (*keys_of, *(f"{key}/@adv/pub/1a/2/_" for key in keys_of)):
+                assert allowed(control, "lab", "ingress", "put", key) is send
+                assert allowed(control, "lab", "ingress", "reply", key) is send
+                assert allowed(control, "lab", "egress", "put", key) is read
+                assert allowed(control, "lab", "ingress", "declare_subscriber", key) is read
+                assert not allowed(control, "lab", "ingress", "delete", key)
+        for token, may in ((keys.publisher_alive, covers(publishes)), (keys.monitor_alive, covers(monitors))):
+            assert allowed(control, "lab", "ingress", "liveliness_token", token) is may
+        assert not allowed(control, "lab", "ingress", "liveliness_token", keys.replay_alive)
+    for flow, message in product(("ingress", "egress"), MESSAGES):
+        assert not allowed(control, "lab", flow, message, "other/demo/lab/stream")
+        assert not allowed(control, "stranger", flow, message, "rotorwatch/demo/lab/stream")
+
+
+def test_grants_of_one_name_add_up(tmp_path: Path) -> None:
+    grants = [Grant(who=("a", "b"), views=("demo/*",)), Grant(who=("b",), publishes=("demo/lab",))]
+    control: Any = access_control(grants, "usernames")
+    assert control["default_permission"] == "deny"
+    assert [subject["usernames"] for subject in control["subjects"]] == [["a"], ["b"]]
+    for name, may in (("a", False), ("b", True)):
+        assert allowed(control, name, "ingress", "put", "rotorwatch/demo/lab/stream") is may
+        assert allowed(control, name, "egress", "put", "rotorwatch/demo/pump/health")
+
+
+def test_a_link_file_is_read_with_files_beside_it(tmp_path: Path) -> None:
+    path = tmp_path / "link.toml"
+    path.write_text('[link]\nconnect = ["tcp/127.0.0.1:1"]\nuser = "lab"\npassword_file = "p"\n', encoding="utf-8")
+    assert load_link(path).password_file == tmp_path / "p"
+    for text, said in (
+        ("", "link.toml: link: Field required"),
+        ("[link]\n", "link.toml: link: expected endpoints in listen or connect"),
+        ('[link]\nlisten = "x"\n', "link.toml: link.listen: .*found 'x'"),
+        ("[link]\n[http]\nport = 1\n", "link.toml: http: Extra inputs"),
+        ("link = ", "not a TOML file"),
+    ):
+        path.write_text(text, encoding="utf-8")
+        with pytest.raises(MachineFileError, match=said):
+            load_link(path)
+
+
+def test_every_field_of_access_is_documented() -> None:
+    page = (ROOT / "docs" / "zenoh-security.md").read_text(encoding="utf-8")
+    elsewhere = {"mode", "listen", "connect", "shared_memory", "namespace"}
+    models: tuple[type[BaseModel], ...] = (LinkSettings, TlsSettings, Grant)
+    for name in {name for model in models for name in model.model_fields} - elsewhere:
+        assert f"`{name}`" in page, f"docs/zenoh-security.md does not mention {name}"
