@@ -1,7 +1,8 @@
 """Turns alarms and what happened to them into the JSON models of `service.alarm_schemas`."""
 
+import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from importlib.metadata import version
@@ -13,7 +14,16 @@ from service.alarm_schemas import Evidence as EvidenceJson
 from service.alarm_schemas import Shelf as ShelfJson
 from service.alarms.alarm import Alarm, AlarmEvent, Evidence
 
-__all__ = ["PROGRAM_VERSION", "Identity", "alarm_cloud_event", "alarm_entries", "alarm_states", "finite", "rfc3339"]
+__all__ = [
+    "PROGRAM_VERSION",
+    "Identity",
+    "alarm_cloud_event",
+    "alarm_entries",
+    "alarm_log_page",
+    "alarm_states",
+    "finite",
+    "rfc3339",
+]
 
 PROGRAM_VERSION = version("rotorwatch")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -48,6 +58,12 @@ def alarm_states(
     )
 
 
+def alarm_log_page(identity: Identity, texts: Sequence[str], latest: int) -> str:
+    """Join events, each the exact JSON text that was published, into the JSON of an `AlarmLogPage`."""
+    begin = json.dumps({"site": identity.site, "machine": identity.machine})
+    return f'{begin[:-1]}, "events": [{",".join(texts)}], "latest": {latest}}}'
+
+
 def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     """Convert an alarm event."""
     alarm = event.alarm
@@ -80,7 +96,7 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     )
     return AlarmCloudEvent(
         specversion="1.0",
-        id=f"{place}/{alarm.name}/{alarm.occurrence}/{event.kind}/{event.time_ns}",
+        id=f"{place}/{event.sequence}/{alarm.name}/{event.kind}",
         source=f"/rotorwatch/{place}",
         type=f"org.rotorwatch.alarm.{event.kind}",
         subject=alarm.name,

@@ -13,6 +13,7 @@ __all__ = [
     "Alarm",
     "AlarmCloudEvent",
     "AlarmEventData",
+    "AlarmLogPage",
     "AlarmStates",
     "BundleIdentity",
     "Evidence",
@@ -200,8 +201,8 @@ class AlarmCloudEvent(BaseModel):
 
     specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
     id: str = Field(
-        description="the same however often the event is delivered: machine, alarm, occurrence, kind, data time",
-        examples=[f"demo/lab/k_by/1/raised/{EXAMPLE_NS}"],
+        description="the same however often the event is delivered: machine, sequence, alarm, kind",
+        examples=["demo/lab/0/k_by/raised"],
     )
     source: str = Field(description="the machine", examples=["/rotorwatch/demo/lab"])
     type: str = Field(description="org.rotorwatch.alarm.<kind>", examples=["org.rotorwatch.alarm.raised"])
@@ -213,3 +214,18 @@ class AlarmCloudEvent(BaseModel):
         examples=["00000000000000000000"],
     )
     data: AlarmEventData = Field(description="what happened")
+
+
+class AlarmLogPage(BaseModel):
+    """Part of a machine's alarm log, from a given sequence number on: the answer to a query on ``alarm/event``."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    events: tuple[AlarmCloudEvent, ...] = Field(description="events after the one asked for, in order, without a hole")
+    latest: int = Field(
+        description="sequence number of the machine's latest event; -1 before the first. Ask again from the last event "
+        "as long as it is smaller",
+        examples=[0],
+    )

@@ -14,7 +14,7 @@ from typing import Protocol
 from models.commissioning.installed import Installed
 from models.errors import RotorwatchError
 from service import conversion
-from service.alarm_conversion import Identity, alarm_states
+from service.alarm_conversion import Identity, alarm_log_page, alarm_states
 from service.alarm_schemas import AlarmCloudEvent, AlarmStates
 from service.alarms.alarm import AlarmEvent
 from service.alarms.book import NO_ALARMS
@@ -27,6 +27,7 @@ from service.monitor import MachineMonitor
 from service.remembered import checkpoint_step, restored, stored_event, stored_readings, stored_report
 from service.reports import MachineHealth, MonitorReport, WindowReport
 from service.schemas import DetectableChanges, Health, MachineDescription, StreamStatus
+from service.store.errors import StoreError
 from service.store.machine import MachineStore
 from service.store.records import Step, StoredEvent
 
@@ -240,6 +241,25 @@ class MachineWorker:
         snapshot = self._snapshot
         return alarm_states(self.identity, snapshot.alarms, snapshot.sequence, include_normal=include_normal)
 
+    def alarm_log(self, after: int, limit: int) -> str:
+        """Alarm events after a sequence number, as the JSON of an `AlarmLogPage`; from any thread.
+
+        Parameters
+        ----------
+        after : int
+            -1 for the beginning.
+        limit : int
+            At most so many events.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        latest = self.history.last_sequence()
+        events = self.history.events(after=after, limit=limit)
+        return alarm_log_page(self.identity, [event.text for event in events], latest)
+
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
         return conversion.detectable_changes(self.identity, self.machine, self._snapshot, change)
@@ -323,10 +343,13 @@ class MachineWorker:
                 else:
                     item()
             except Exception as error:  # one bad block must not end the monitoring of the machine
-                self.errors += 1
-                self.last_error = f"{type(error).__name__}: {error}"
-                if (withheld := self._limiter.admit("error")) is not None:
-                    self._log.exception("a block was lost to an error in the monitor", withheld=withheld)
+                self._failed(error)
+
+    def _failed(self, error: Exception) -> None:
+        self.errors += 1
+        self.last_error = f"{type(error).__name__}: {error}"
+        if (withheld := self._limiter.admit("error")) is not None:
+            self._log.error("something was lost to an error in the monitor", withheld=withheld, exc_info=error)
 
     def _take(self, block: RawBlock) -> None:
         begin_s = self._clocks.monotonic_s()
@@ -359,8 +382,11 @@ class MachineWorker:
             checkpoint=checkpoint_step(self.identity, state, recorded_ns),
         )
         begin_s = self._clocks.monotonic_s()
-        if not self.history.commit(step):
-            self._warn("history", "the history cannot be written; what happened waits in memory and is published")
+        try:
+            if not self.history.commit(step):
+                self._warn("history", "the history cannot be written; what happened waits in memory and is published")
+        except StoreError as error:  # refused for good; operators must hear of it all the same
+            self._failed(error)
         self._kept = state.hops
         tally = self.tally
         self.tally = replace(

@@ -21,7 +21,7 @@ from models.machine import MachineFile, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
-from service.access_settings import AccessSettings
+from service.access_settings import AccessSettings, LimitSettings
 from service.config import HistorySettings, HttpSettings, MachineEntry, QueueSettings, ServiceSettings
 from service.runtime import Runtime, running
 from service.schemas import Health
@@ -31,7 +31,9 @@ from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 
 __all__ = [
+    "IN_MEMORY",
     "LAB",
+    "OPEN",
     "ROOT",
     "START_NS",
     "Feed",
@@ -52,7 +54,13 @@ ROOT = Path(__file__).parents[2]
 LAB = load_machine("lab")
 START_NS = 1_767_225_600_000_000_000
 _USED_PORTS: set[int] = set()
-_ALONE = {"ROTORWATCH_HISTORY__URL": "sqlite:///:memory:", "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true"}
+IN_MEMORY = HistorySettings(url="sqlite:///:memory:")
+OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
+_ALONE = {
+    "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
+    "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
+    "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
+}
 """Unless a test says otherwise, programs leave nothing behind and are open to everybody on this computer."""
 
 
@@ -105,8 +113,8 @@ def settings(
     return ServiceSettings(
         link=LinkSettings(listen=(listen,)),
         http=HttpSettings(port=0),
-        history=HistorySettings(url="sqlite:///:memory:"),
-        access=AccessSettings(open_on_loopback=True),
+        history=IN_MEMORY,
+        access=OPEN,
         machines=(MachineEntry(file=machine, bundle=bundle),),
         queue=QueueSettings.model_validate({"blocks": bound, "when_full": when_full}),
     )

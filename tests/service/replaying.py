@@ -5,10 +5,10 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from models.alarm_names import STREAM_LOST
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
-from service import conversion
 from service.worker import MachineWorker
 from simulator.recorder import record
 from tests.service.live import LAB
@@ -40,13 +40,11 @@ def split(source: Path, folder: Path, at: int) -> list[Path]:
 def lines_of(worker: MachineWorker) -> list[str]:
     """What a live monitor published, as lines: topic and message in the order of time, reports before alarms."""
     keys, most = worker.machine.keys, 1000
-    timed = [
-        (window.end_ns, 0, keys.report, conversion.report(worker.identity, window).model_dump_json())
-        for window in reversed(worker.history.reports(limit=most))
-    ]
+    timed = [(one.end_ns, 0, keys.report, one.text) for _, one in reversed(worker.history.reports(limit=most))]
     timed += [
-        (event.time_ns, 1, keys.alarm_event, alarm_cloud_event(worker.identity, event).model_dump_json())
-        for event in reversed(worker.history.alarm_events(limit=most))
+        (event.time_ns, 1, keys.alarm_event, event.text)
+        for event in worker.history.events(limit=most)
+        if event.alarm != STREAM_LOST  # the silence after the end is part of no recording
     ]
     timed.sort(key=lambda entry: entry[:2])
     return [f'{{"topic": {json.dumps(topic)}, "message": {text}}}' for _, _, topic, text in timed]

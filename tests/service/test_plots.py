@@ -271,7 +271,7 @@ def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[
     assert found.limits == LAB.alarms
     alarms = [AlarmCloudEvent.model_validate(line["message"]) for line in lines if "alarm" in str(line["topic"])]
     assert [alarm.time_ns for alarm in found.alarms] == [alarm.data.time_ns for alarm in alarms]
-    assert found.alarms[0].parameter == "c_bz"
+    assert found.alarms[0].name == "c_bz"
     for trend in found.parameters:
         for number, report in enumerate(reports):
             verdict = report.verdict

@@ -113,7 +113,7 @@ def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) ->
         assert found.returncode == 0, found.stderr
         assert "801 messages replayed" in found.stderr
         until(lambda: monitor.health().state == "danger", "alarm")
-        assert [alarm.parameter for alarm in monitor.health().alarms if alarm.raised] == ["c_bz"]
+        assert [alarm.name for alarm in monitor.health().alarms if alarm.raised] == ["c_bz"]
         assert monitor.stop() == 0
     assert not (tmp_path / "recordings").exists()
 

@@ -188,11 +188,11 @@ def test_an_offline_replay_over_http_finds_what_it_finds_on_the_command_line(
     some = get(client, f"{REPLAYS}/{job.id}/reports", ReplayReportList, offset=2, limit=5)
     assert (some.reports, some.next_offset) == (reports.reports[2:7], 7)
     (event,) = get(client, f"{REPLAYS}/{job.id}/alarms", ReplayAlarmList).events
-    assert event.data.parameter == "c_bz"
+    assert event.data.name == "c_bz"
 
     worker = runtime.machines()[0]
-    assert worker.history.reports() == ()
-    assert worker.history.alarm_events() == ()
+    assert worker.history.reports(limit=10) == ()
+    assert worker.history.events(limit=10) == ()
     assert worker.health().alarms == ()
 
 

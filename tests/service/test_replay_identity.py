@@ -74,8 +74,9 @@ def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> I
 def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSummary) -> None:
     monitor = MachineMonitor(install(LAB, "lab"))
     reports = [
-        monitor.step_payload(message.payload, message.attachment, message.encoding)
+        report
         for message in read_recording(faulty, keys={LAB.keys.stream})
+        for report in monitor.step_payload(message.payload, message.attachment, message.encoding)
     ]
     assert expected.windows == sum(len(report.windows) for report in reports) > 10
     assert expected.alarms == sum(len(report.events) for report in reports) == 1

@@ -1,6 +1,7 @@
 """The running service: what it says equals what the monitor says offline, silence, errors, start and stop."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -9,20 +10,35 @@ import httpx
 import numpy as np
 import pytest
 
+from models.alarm_names import STREAM_LOST
 from models.commissioning.installed import install
 from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.link import LinkSettings
 from service import conversion
+from service.alarm_conversion import alarm_cloud_event
 from service.config import HttpSettings, MachineEntry, ServiceSettings
 from service.logs import Limiter
 from service.monitor import MachineMonitor
+from service.remembered import stored_event, stored_report
 from service.reports import MonitorReport
 from service.runtime import HttpError, Runtime, running
 from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report
 from service.transport import LinkError, TopicMessage, follow
 from simulator.scenario import parse_fault
-from tests.service.live import Feed, endpoint, machine_file, open_session, scenario_blocks, send, service, until
+from tests.service.live import (
+    IN_MEMORY,
+    OPEN,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    send,
+    service,
+    settings,
+    until,
+)
 
 SHORT_SILENCE = ("[operation]", "[ingest]\nno_data_after_s = 0.5\n\n[operation]")
 
@@ -45,7 +61,7 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
     reports = [offline.step(block) for block in stream]
     windows = tuple(window for report in reports for window in report.windows)
     events = tuple(event for report in reports for event in report.events)
-    assert [event.alarm.parameter for event in events] == ["c_bz"]
+    assert [event.alarm.name for event in events] == ["c_bz"]
 
     address, topics = endpoint(), Topics()
     with service(address, file, bundle="lab", when_full="wait") as (_, worker):
@@ -55,16 +71,28 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
             until(lambda: bool(topics.texts("/health")), "first health")
             send(address, stream, machine)
             until(lambda: worker.health().quality.accepted_blocks == len(stream), "all blocks")
-            assert tuple(reversed(worker.history.reports())) == windows
-            assert tuple(reversed(worker.history.alarm_events())) == events
+            kept = [one for _, one in reversed(worker.history.reports(limit=1000))]
+            assert kept == [stored_report(worker.identity, window) for window in windows]
+            (told,) = (one for one in worker.history.events(limit=1000) if one.alarm != STREAM_LOST)
+            assert told == replace(stored_event(worker.identity, events[0], 0), recorded_ns=told.recorded_ns)
 
             until(lambda: len(topics.texts("/report")) == len(windows), "reports on the topic")
             published = [Report.model_validate_json(text) for text in topics.texts("/report")]
             assert published == [conversion.report(worker.identity, window) for window in windows]
-            (event,) = [AlarmCloudEvent.model_validate_json(text) for text in topics.texts("/alarm/event")]
-            assert event == alarm_cloud_event(worker.identity, events[0])
+            until(lambda: "stream-lost" in "".join(topics.texts("/alarm/event")), "alarm on the silence")
+            heard = [AlarmCloudEvent.model_validate_json(text) for text in topics.texts("/alarm/event")]
+            assert heard[0] == alarm_cloud_event(worker.identity, events[0])
+            assert [(one.data.kind, one.data.name, one.data.sequence) for one in heard[1:]] == [
+                ("raised", "stream-lost", 1)
+            ]
+            assert heard[1].data.time_ns == stream[-1].end_ns + 500_000_000
+            until(lambda: '"stream-lost"' in topics.texts("/alarm/state")[-1], "alarms with the silence among them")
             states = AlarmStates.model_validate_json(topics.texts("/alarm/state")[-1])
-            assert [(alarm.parameter, alarm.state) for alarm in states.alarms] == [("c_bz", "active")]
+            assert [(alarm.name, alarm.state) for alarm in states.alarms] == [
+                ("c_bz", "unacknowledged"),
+                ("stream-lost", "unacknowledged"),
+            ]
+            assert states.sequence == 1
 
             def latest() -> Health:
                 return Health.model_validate_json(topics.texts("/health")[-1])
@@ -72,7 +100,7 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
             until(lambda: latest().state == "no-data", "silence on the topic")
             silent = latest()
             assert silent.reason == "no usable block for more than 0.5 s"
-            assert [alarm.parameter for alarm in silent.alarms if alarm.raised] == ["c_bz"]
+            assert [alarm.name for alarm in silent.alarms if alarm.raised and alarm.name != STREAM_LOST] == ["c_bz"]
             assert silent.parameters == published[-1].parameters
             said = [Health.model_validate_json(text).state.value for text in topics.texts("/health")]
             assert "danger" in said
@@ -111,7 +139,7 @@ def test_data_after_silence_end_it(tmp_path: Path) -> None:
 class _Poisoned(MachineMonitor):
     """A monitor with a defect that one payload brings to light."""
 
-    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> MonitorReport:
+    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> tuple[MonitorReport, ...]:
         if encoding == "poison":
             raise ZeroDivisionError("defect in the monitor")
         return super().step_payload(payload, attachment, encoding)
@@ -141,6 +169,8 @@ def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> 
         link=LinkSettings(listen=(address,)),
         http=HttpSettings(port=0),
         machines=(MachineEntry(file="lab"), MachineEntry(file=other)),
+        history=IN_MEMORY,
+        access=OPEN,
     )
     with running(two) as runtime, open_session(address) as session:
         first, second = runtime.machines()
@@ -162,15 +192,11 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
     address = endpoint()
     with service(address) as (runtime, _):
         port = int(runtime.http_url.rsplit(":", 1)[1])
-        clash = ServiceSettings(
-            link=LinkSettings(listen=(endpoint(),)), http=HttpSettings(port=port), machines=(MachineEntry(file="lab"),)
-        )
+        clash = settings(endpoint()).model_copy(update={"http": HttpSettings(port=port)})
         with pytest.raises(HttpError) as http:
             Runtime(clash).start()
         assert f"HTTP cannot listen on 127.0.0.1 port {port}: Address already in use" in str(http.value)
-        second = ServiceSettings(
-            link=LinkSettings(listen=(address,)), http=HttpSettings(port=0), machines=(MachineEntry(file="lab"),)
-        )
+        second = settings(address)
         failed = Runtime(second)
         with pytest.raises(LinkError) as link:
             failed.start()
