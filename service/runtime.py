@@ -10,6 +10,7 @@
                                   '--> Store (one thread, commits) <----------------- /api/.../reports, alarms/events
                                          '--> then report, alarm topics
     queries on health, alarm/state <-------------------- snapshot
+    queries on alarm/event <-- Store
 
 The main thread waits for a signal. Only a machine's own thread touches its monitor; everybody else reads immutable
 snapshots, or asks it to do something between two blocks (operators; the passing of time, four times a second). Silence
@@ -189,6 +190,7 @@ class Runtime:
             on_publisher=worker.publisher,
             health=lambda: worker.health().model_dump_json(),
             alarm_state=lambda: worker.alarms().model_dump_json(),
+            alarm_events=worker.alarm_log,
         )
         machine_link = MachineLink(link, keys, callbacks, wait_when_full=self.settings.queue.when_full == "wait")
         undo.callback(machine_link.close)

@@ -4,7 +4,8 @@
 
     stream ------------> on_block          descriptor, publisher_alive ---> on_descriptor, on_publisher
     report <------------ publish_report            (dropped under congestion)
-    alarm/event <------- publish_alarm_event       (waits under congestion, the latest are kept for late joiners)
+    alarm/event <------- publish_alarm_event       (waits under congestion, the latest are kept for late joiners;
+                                                   the whole log is there by query)
     alarm/state, health <- publish_...             (latest kept; also answered by query)
 
 Callbacks run on Zenoh's threads. An exception in one is logged and counted here, because Zenoh would only print it.
@@ -26,6 +27,7 @@ from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
 from service.inbox import RawBlock
+from service.log_query import read_log_query
 from service.logs import logger
 
 __all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap", "TopicMessage", "follow", "route"]
@@ -68,6 +70,9 @@ class MachineCallbacks:
         Takes whether a publisher is alive.
     health, alarm_state : callable
         Return the present answer (JSON) to a query.
+    alarm_events : callable
+        Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
+        time; what it raises is told to whoever asked.
     """
 
     on_block: Callable[[RawBlock], None]
@@ -76,6 +81,7 @@ class MachineCallbacks:
     on_publisher: Callable[[bool], None]
     health: Callable[[], str]
     alarm_state: Callable[[], str]
+    alarm_events: Callable[[int, int], str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +197,9 @@ class MachineLink:
             keep(publisher)
         for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
             keep(session.declare_queryable(key, guarded(_answering(key, answer))))
+        log = _answering_from_log(keys.alarm_event, self._callbacks.alarm_events)
+        # A thread of its own, because it waits for the database: the others, and Zenoh, go on.
+        keep(session.declare_queryable(keys.alarm_event, zenoh.handlers.Callback(guarded(log), indirect=True)))
         # What is replayed on a machine's own keys is not of the machine, whoever was there first.
         keep(session.liveliness().declare_subscriber(keys.replay_alive, guarded(self._take_replay), history=True))
         self._replayed = self._replayed or any(
@@ -449,6 +458,19 @@ def _answering(key: str, answer: Callable[[], str]) -> Callable[[zenoh.Query], N
     def reply(query: zenoh.Query) -> None:
         with query:
             query.reply(key, answer(), encoding=_JSON)
+
+    return reply
+
+
+def _answering_from_log(key: str, answer: Callable[[int, int], str]) -> Callable[[zenoh.Query], None]:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            try:
+                text = answer(*read_log_query(str(query.selector.parameters)))
+            except RotorwatchError as error:
+                query.reply_err(json.dumps({"error": f"{key}: {error}"}), encoding=_JSON)
+            else:
+                query.reply(key, text, encoding=_JSON)
 
     return reply
 

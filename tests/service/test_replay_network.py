@@ -168,7 +168,7 @@ def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_o
         except LiveMachineError as error:
             errors.append(str(error))
 
-    callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}")
+    callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}", lambda *_: "[]")
     with route((address,)):
         heard = Heard()
         other = Link(LinkSettings(mode="client", connect=(address,)))

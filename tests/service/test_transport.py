@@ -4,20 +4,24 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 import zenoh
 import zenoh.ext
 
 from models.signals.link import LinkSettings
+from service.alarm_schemas import AlarmLogPage
 from service.inbox import Inbox, RawBlock
 from service.schemas import AlarmStates, Health
+from service.store.errors import StoreError
 from service.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
 from tests.service.live import (
     LAB,
     Feed,
     endpoint,
     open_session,
+    program,
     scenario_blocks,
     send,
     service,
@@ -32,11 +36,22 @@ def ignore(*_: object) -> None:
     """Take anything."""
 
 
+def no_events(after: int, limit: int) -> str:
+    """The log of a machine on which nothing has happened."""
+    return "[]"
+
+
 @contextmanager
 def machine_link(
-    address: str, on_block: Callable[[RawBlock], None], *, wait: bool = False
+    address: str,
+    on_block: Callable[[RawBlock], None],
+    *,
+    wait: bool = False,
+    alarm_events: Callable[[int, int], str] | None = None,
 ) -> Iterator[tuple[Link, MachineLink]]:
-    callbacks = MachineCallbacks(on_block, ignore, ignore, ignore, lambda: '{"h": 1}', lambda: '{"a": 1}')
+    callbacks = MachineCallbacks(
+        on_block, ignore, ignore, ignore, lambda: '{"h": 1}', lambda: '{"a": 1}', alarm_events or no_events
+    )
     link = Link(LinkSettings(listen=(address,)))
     declared = MachineLink(link, KEYS, callbacks, wait_when_full=wait)
     try:
@@ -146,7 +161,7 @@ def test_nothing_is_delivered_or_published_after_close() -> None:
     first: list[RawBlock] = []
     second: list[RawBlock] = []
     healths: list[str] = []
-    callbacks = MachineCallbacks(second.append, ignore, ignore, ignore, lambda: "{}", lambda: "{}")
+    callbacks = MachineCallbacks(second.append, ignore, ignore, ignore, lambda: "{}", lambda: "{}", no_events)
     with machine_link(address, first.append) as (link, declared), open_session(address) as session:
         listening = session.declare_subscriber(KEYS.health, lambda sample: healths.append(sample.payload.to_string()))
         feed = Feed(session)
@@ -237,6 +252,71 @@ def test_follower_gets_the_latest_state_at_once_and_then_what_happens() -> None:
             assert connected()
 
 
+def test_alarm_log_is_answered_from_a_number_on() -> None:
+    address = endpoint()
+
+    def alarm_events(after: int, limit: int) -> str:
+        if after == 99:
+            raise StoreError("history: the disk is full")
+        return json.dumps([after, limit])
+
+    with machine_link(address, ignore, alarm_events=alarm_events) as (link, _), open_session(address) as session:
+        assert query(session, KEYS.alarm_event) == "[-1, 100]"
+        assert query(session, f"{KEYS.alarm_event}?after=17;limit=5") == "[17, 5]"
+        assert query(session, f"{KEYS.alarm_event}?after=17;_time=[now(-1h)..]") == "[17, 100]"
+        for parameters, told in (
+            ("after=x", "after is 'x', expected a whole number from -1 to"),
+            ("after=-2", "after is '-2', expected a whole number from -1 to"),
+            ("limit=0", "limit is '0', expected a whole number from 1 to 1000"),
+            ("limit=1001", "limit is '1001', expected a whole number from 1 to 1000"),
+            ("since=4", "no parameter since, expected after or limit"),
+            ("after=99", "history: the disk is full"),
+        ):
+            (reply,) = session.get(f"{KEYS.alarm_event}?{parameters}", timeout=5.0)
+            assert reply.err is not None
+            assert told in json.loads(reply.err.payload.to_string())["error"]
+        assert link.errors == 0
+
+
+def test_alarm_log_is_answered_while_the_machine_is_busy() -> None:
+    """An operator's request waits for the machine's thread; the log, and health beside a slow log, do not."""
+    address, gate = endpoint(), threading.Event()
+    with service(address) as (_, worker), open_session(address) as session:
+        worker.inbox.call(gate.wait)  # the thread is stuck in the middle of something
+        page = AlarmLogPage.model_validate_json(query(session, KEYS.alarm_event))
+        assert page == AlarmLogPage(site="demo", machine="lab", events=(), latest=-1)
+        gate.set()
+    address, gate = endpoint(), threading.Event()
+
+    def slow(after: int, limit: int) -> str:
+        gate.wait(20.0)
+        return "[]"
+
+    with machine_link(address, ignore, alarm_events=slow), open_session(address) as session:
+        waiting = session.get(KEYS.alarm_event, timeout=20.0)
+        assert query(session, KEYS.health) == '{"h": 1}'
+        gate.set()
+        assert [reply.ok.payload.to_string() for reply in waiting if reply.ok is not None] == ["[]"]
+
+
+def test_killed_monitor_is_seen_to_be_gone(tmp_path: Path) -> None:
+    address = endpoint()
+    changes: list[tuple[str, bool]] = []
+    command = ("service.rotorwatch", "run", "--machine", "lab", "--listen", address, "--http-port", "0")
+    with program(tmp_path, *command) as monitor:
+        monitor.wait_for("HTTP API")
+        with open_session(address) as session:
+            listening = session.liveliness().declare_subscriber(
+                KEYS.monitor_alive,
+                lambda sample: changes.append((str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)),
+                history=True,
+            )
+            until(lambda: changes == [(KEYS.monitor_alive, True)], "monitor's token")
+            monitor.kill()
+            until(lambda: changes[1:] == [(KEYS.monitor_alive, False)], "token gone")
+            listening.undeclare()
+
+
 def test_publisher_is_seen_to_come_and_go_and_its_descriptor_is_asked_for() -> None:
     address = endpoint()
     wrong = LAB.descriptor.model_copy(update={"rate_hz": 1000.0}).model_dump_json()
@@ -270,7 +350,7 @@ class Linked:
 
     def __init__(self, address: str) -> None:
         self._link = Link(LinkSettings(connect=(address,)))
-        callbacks = MachineCallbacks(ignore, ignore, ignore, ignore, lambda: "{}", lambda: "{}")
+        callbacks = MachineCallbacks(ignore, ignore, ignore, ignore, lambda: "{}", lambda: "{}", no_events)
         self._declared = MachineLink(self._link, KEYS, callbacks, wait_when_full=False)
 
     def __enter__(self) -> MachineLink:

@@ -1,0 +1,52 @@
+"""What may be asked of an alarm log by a query on the network: ``after=17;limit=500``."""
+
+import re
+
+from models.errors import RotorwatchError
+
+__all__ = ["MOST_EVENTS", "QueryError", "read_log_query"]
+
+MOST_EVENTS = 1000
+_DEFAULT_EVENTS = 100
+_LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}
+
+
+class QueryError(RotorwatchError):
+    """What was asked makes no sense; the message says which parameter."""
+
+
+def read_log_query(parameters: str) -> tuple[int, int]:
+    """Read the parameters of a query: after which sequence number, and at most how many events.
+
+    Parameters
+    ----------
+    parameters : str
+        As they stand behind the question mark; names that begin with an underscore are Zenoh's own.
+
+    Returns
+    -------
+    tuple of int
+        `after`, -1 for the beginning if left out, and `limit`, 100 if left out.
+
+    Raises
+    ------
+    QueryError
+        Naming what was found and what was expected.
+
+    Examples
+    --------
+    >>> read_log_query("after=17")
+    (17, 100)
+    """
+    found = {"after": -1, "limit": _DEFAULT_EVENTS}
+    for part in filter(None, parameters.split(";")):
+        name, _, value = part.partition("=")
+        if name.startswith("_"):
+            continue
+        if name not in found:
+            raise QueryError(f"no parameter {name}, expected after or limit")
+        least, most = _LIMITS[name]
+        if not re.fullmatch(r"-?[0-9]{1,18}", value) or not least <= int(value) <= most:
+            raise QueryError(f"{name} is {value!r}, expected a whole number from {least} to {most}")
+        found[name] = int(value)
+    return found["after"], found["limit"]
