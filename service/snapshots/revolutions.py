@@ -48,20 +48,17 @@ class NewestBlocks:
     def __init__(self, length_s: float = 10.0) -> None:
         self._length_s = length_s
         self._held: deque[SampleBlock] = deque()
-        self._held_s = 0.0
+        self._n_samples = 0
         self.blocks: tuple[SampleBlock, ...] = ()
 
     def add(self, block: SampleBlock, *, continuous: bool) -> None:
         """Add the next accepted block; one that does not continue the others takes their place."""
         if not continuous:
             self._held.clear()
-            self._held_s = 0.0
+            self._n_samples = 0
         self._held.append(block)
-        self._held_s += _seconds(block)
-        while len(self._held) > 1 and self._held_s - _seconds(self._held[0]) >= self._length_s:
-            self._held_s -= _seconds(self._held.popleft())
+        self._n_samples += block.samples.shape[0]
+        kept = round(self._length_s * block.rate_hz)
+        while len(self._held) > 1 and self._n_samples - self._held[0].samples.shape[0] >= kept:
+            self._n_samples -= self._held.popleft().samples.shape[0]
         self.blocks = tuple(self._held)
-
-
-def _seconds(block: SampleBlock) -> float:
-    return float(block.samples.shape[0] / block.rate_hz)

@@ -2,8 +2,8 @@
 
 The likelihood knows the noise of motions, which a displacement and a velocity sensor make together: where one of them
 is the better one, the other's noise hardly counts, and is not determined. Here every sensor is looked at alone. The
-density is d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of the band's end, as there, by Fisher scoring of the Whittle
-likelihood with the theory held.
+density is d(f) = d₀ (1 + (f/f_r)²)^b with f_r two thirds of the band's end, as there, by damped Fisher scoring of the
+Whittle likelihood with the theory held.
 """
 
 import numpy as np
@@ -12,8 +12,8 @@ from models.signals.block import FloatArray
 
 __all__ = ["noise_density", "sensor_noise"]
 
-_STEPS = 12
-_CLOSE = 0.01
+_STEPS, _LONGEST, _CLOSE = 30, 1.5, 0.01
+_STEEPEST = 4.0
 _LEAST, _USUAL = 1e-7, 1e-3
 """Density over the channel's mean density: the least that is looked for, and where the search begins."""
 _PULL = np.array([0.05, 1.0])
@@ -57,17 +57,28 @@ def sensor_noise(
     shape = np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)
     level = float(np.log(averages @ measured / averages.sum()))
     usual = np.array([level + np.log(_USUAL), 0.0])
-    found = usual.copy()
-    for _ in range(_STEPS):
-        noise = noise_density(found, frequencies_hz, high_hz)
+
+    def seen(point: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Noise, expected density, and the log-likelihood with the pulls."""
+        noise = np.exp(point[0] + point[1] * shape)
         expected = theory + noise
+        fits = -float(averages @ (np.log(expected) + measured / expected))
+        return noise, expected, fits - float(_PULL @ (point - usual) ** 2) / 2
+
+    found, damping = usual, 1e-3
+    noise, expected, value = seen(found)
+    for _ in range(_STEPS):
         slopes = np.stack([noise / expected, shape * noise / expected])
         gradient = slopes @ (averages * (measured / expected - 1)) - _PULL * (found - usual)
         information = (slopes * averages) @ slopes.T + np.diag(_PULL)
-        step = np.clip(np.linalg.solve(information, gradient), -1.5, 1.5)
-        found = found + step
-        found[0] = np.clip(found[0], level + np.log(_LEAST), level)
-        found[1] = np.clip(found[1], -4.0, 4.0)
-        if np.all(np.abs(step) < _CLOSE):
-            break
+        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        step = np.clip(step, -_LONGEST, _LONGEST)
+        trial = np.clip(found + step, (level + np.log(_LEAST), -_STEEPEST), (level, _STEEPEST))
+        there = seen(trial)
+        if there[2] > value:
+            found, (noise, expected, value), damping = trial, there, damping / 8
+            if np.all(np.abs(step) < _CLOSE):
+                break
+        else:
+            damping *= 8
     return found

@@ -1,0 +1,568 @@
+"""Snapshots of a live machine: what was measured beside what theory predicts, and orbits."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from models.commissioning.installed import Installed
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.moments import plan_for
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import Machine, MachineFile
+from models.physics.excitation import Source, expanded_A, expanded_B
+from models.physics.lyapunov import correlation, stationary_covariance
+from models.physics.matrices import STATE_INDEX, H_matrix, M_matrix, P_matrix, Q_matrix
+from models.physics.parameters import changed
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.channels import state_name
+from service.schemas import example
+from service.snapshots import desk as desk_module
+from service.snapshots.choice import SnapshotError
+from service.snapshots.desk import LatestData, SnapshotDesk
+from service.snapshots.path import MOST_REVOLUTIONS
+from service.snapshots.prediction import Prediction, predict
+from service.snapshots.revolutions import NewestBlocks
+from service.snapshots.schemas import CorrelationPair, CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from simulator.scenario import Event, load_scenario
+from simulator.stream import blocks
+from tests.commissioning.rotor_kit import LAB, NOTHING, stream
+
+SEED = 7_700_011
+SECONDS = 70.0
+S = 10**9
+K_BY = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
+NAMES = [channel.name for channel in LAB.sensors]
+
+
+@dataclass(frozen=True)
+class Speaker:
+    """Who speaks in these tests."""
+
+    site: str = "demo"
+    machine: str = "lab"
+    bundle: str | None = None
+    machine_hash: str = "9a0c41d27be8"
+
+
+def desk_of(machine: MachineFile) -> SnapshotDesk:
+    return SnapshotDesk(Installed(machine), Speaker())
+
+
+def window_of(machine: MachineFile, stream_: Sequence[SampleBlock], *, lagged: bool = True) -> WindowStatistics:
+    """The latest full window, as a monitor has it; columns are those of `machine`, by name."""
+    window = SlidingWindow(plan_for(machine, lagged=lagged))
+    columns = [NAMES.index(channel.name) for channel in machine.sensors]
+    latest: WindowStatistics | None = None
+    for block in stream_:
+        for _ in window.feed(window.plan.to_si(block.samples[:, columns]), block.start_ns):
+            latest = window.statistics() or latest
+    assert latest is not None
+    return latest
+
+
+@cache
+def latest(*faults: Event, lagged: bool = True) -> LatestData:
+    """What a monitor of the rotor kit holds after 70 s."""
+    stream_ = stream(SECONDS, SEED, *faults)
+    window = window_of(LAB, stream_, lagged=lagged)
+    return LatestData(window, 1.0, LikelihoodFit(LAB).diagnose(window).parameters, "", stream_[-20:])
+
+
+def numbers(series: Sequence[float | None] | None) -> FloatArray:
+    assert series is not None
+    return np.array([np.nan if value is None else value for value in series], dtype=np.float64)
+
+
+def by_plane(snapshot: CorrelationSnapshot, plane: str) -> list[CorrelationPair]:
+    return [pair for pair in snapshot.pairs if pair.first[0] == plane and pair.second[0] == plane]
+
+
+def synthetic(signals: dict[str, FloatArray]) -> list[SampleBlock]:
+    """Blocks of 0.1 s of the rotor kit with these samples, and nothing in other channels."""
+    n_samples = next(iter(signals.values())).size
+    samples = np.zeros((n_samples, len(NAMES)))
+    for name, values in signals.items():
+        samples[:, NAMES.index(name)] = values
+    size = round(0.1 * LAB.rate_hz)
+    return [
+        SampleBlock(k * S // 10, k, 1, LAB.rate_hz, samples[k * size : (k + 1) * size])
+        for k in range(n_samples // size)
+    ]
+
+
+@pytest.mark.parametrize("lagged", [True, False])
+def test_theory_is_within_the_errors_of_a_healthy_machine(lagged: bool) -> None:
+    snapshot = desk_of(LAB).correlations(latest(lagged=lagged))
+    assert (snapshot.reason, snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", "", "")
+    assert snapshot.method == ("samples" if lagged else "spectrum")
+    assert len(snapshot.lags_s) == 126
+    assert [(pair.first, pair.second) for pair in snapshot.pairs] == [
+        *((name, name) for name in ("y1", "z1", "y2", "z2")),
+        *(("y1", "y2"), ("z1", "z2"), ("y1", "z1"), ("y2", "z2")),
+    ]
+    for pair in snapshot.pairs:
+        assert pair.unit == "um^2"
+        assert pair.nominal_z is not None
+        assert pair.estimated_z is not None
+        assert max(pair.nominal_z, pair.estimated_z) < 2.5
+        z = (numbers(pair.measured) - numbers(pair.nominal)) / numbers(pair.standard_error)
+        assert np.abs(z).max() < 5
+        assert np.sqrt(np.mean(z**2)) == pytest.approx(pair.nominal_z, rel=1e-3)
+
+
+@pytest.mark.parametrize("lagged", [True, False])
+def test_a_fault_parts_the_nominal_prediction_from_what_is_measured(lagged: bool) -> None:
+    snapshot = desk_of(LAB).correlations(latest(K_BY, lagged=lagged))
+    changes = {change.name: change.relative_change for change in snapshot.theory.changes}
+    assert changes["k_by"] == pytest.approx(-0.3, abs=0.02)
+    for pair in by_plane(snapshot, "y"):
+        assert pair.nominal_z is not None
+        assert pair.nominal_z > 8
+        assert pair.estimated_z is not None
+        assert pair.estimated_z < 2.5
+    for pair in by_plane(snapshot, "z"):
+        assert pair.nominal_z is not None
+        assert pair.nominal_z < 2.5
+
+
+@pytest.mark.parametrize("faults", [(), (K_BY,)])
+def test_predicted_correlations_are_those_of_the_ljapunov_equation(faults: tuple[Event, ...]) -> None:
+    """All quantities at all lags, with the sources that the simulator really had: what is left is their estimation."""
+    data = latest(*faults)
+    assert data.window is not None
+    window = data.window
+    sources = tuple(Source(cutoff_hz=90.0, direction=tuple(np.eye(6)[dof]), force_rms_N=0.47) for dof in (0, 1, 3, 4))
+    rotor = changed(LAB.rotor, {"k_by": -0.3} if faults else {})
+    A = expanded_A(rotor, window.speed_rad_s, sources)
+    covariance = stationary_covariance(A, expanded_B(sources))
+    names = [channel.name for channel in LAB.sensors if channel.name != "theta"]
+    first, second = (list(column) for column in zip(*[(one, other) for one in names for other in names], strict=True))
+    snapshot = desk_of(LAB).correlations(data, first, second, units="SI")
+    row = {channel.name: STATE_INDEX[state_name(channel)] for channel in LAB.sensors if channel.name != "theta"}
+    exact = np.stack([correlation(A, covariance, lag_s) for lag_s in snapshot.lags_s])
+    rms = np.sqrt(np.diag(covariance))
+    for pair in snapshot.pairs:
+        i, j = row[pair.first], row[pair.second]
+        predicted = numbers(pair.estimated if faults else pair.nominal)
+        assert predicted == pytest.approx(exact[:, i, j], abs=0.05 * rms[i] * rms[j]), (pair.first, pair.second)
+    assert {pair.unit for pair in snapshot.pairs} == {"m^2", "m*m/s", "m/s*m", "(m/s)^2"}
+
+
+def test_correlations_from_spectra_lack_what_lies_outside_the_band() -> None:
+    """At lag zero by as much as is stated, at no lag by more than a few per cent; their errors are of the same size."""
+    desk = desk_of(LAB)
+    whole, band = (desk.correlations(latest(lagged=lagged)) for lagged in (True, False))
+    assert whole.lags_s == band.lags_s
+    assert whole.band_hz is None
+    assert band.band_hz == pytest.approx((2.9, 150.1))
+    power = {pair.first: numbers(pair.measured)[0] for pair in whole.pairs if pair.first == pair.second}
+    for one, other in zip(whole.pairs, band.pairs, strict=True):
+        rms2 = np.sqrt(power[one.first] * power[one.second])
+        difference = (numbers(one.measured) - numbers(other.measured)) / rms2
+        assert other.outside_band == pytest.approx(difference[0], abs=1e-4)
+        assert one.outside_band is None
+        assert np.abs(difference).max() < 0.03
+        ratio = numbers(other.standard_error) / numbers(one.standard_error)
+        assert 0.6 < np.median(ratio) < 1.7
+
+
+def test_short_segments_weaken_no_correlation() -> None:
+    """Segments of half a second, lags up to a quarter of them: the taper alone would take a third away."""
+    window = LAB.window.model_copy(update={"segment_s": 0.5})
+    machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:2], "window": window})
+    desk = desk_of(machine)
+    whole, band = (
+        desk.correlations(LatestData(window_of(machine, stream(SECONDS, SEED), lagged=lagged), 1.0))
+        for lagged in (True, False)
+    )
+    late = np.array(whole.lags_s) > 0.08
+    for one, other in zip(whole.pairs[:2], band.pairs[:2], strict=True):
+        measured, from_spectra = numbers(one.measured)[late], numbers(other.measured)[late]
+        slope = float(measured @ from_spectra / (measured @ measured))
+        assert slope == pytest.approx(1.0, abs=0.06)
+
+
+def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
+    """Coloured noise in 60 windows: the scatter of the estimates against the error stated for each."""
+    machine = LAB.model_copy(update={"sensors": (LAB.sensors[0], LAB.sensors[1])})
+    rng = np.random.default_rng(3)
+    values, errors = [], []
+    for _ in range(60):
+        white = rng.standard_normal((round(71 * LAB.rate_hz), 2))
+        smooth = np.apply_along_axis(np.convolve, 0, white, np.hanning(40), "same")
+        blocks_ = synthetic({"y1": smooth[:, 0], "z1": smooth[:, 0] + smooth[:, 1]})
+        window = window_of(machine, blocks_[:710], lagged=False)
+        (pair,) = desk_of(NOTHING).correlations(LatestData(window, 1.0), ["y1"], ["z1"]).pairs
+        values.append(numbers(pair.measured))
+        errors.append(numbers(pair.standard_error))
+    ratio = np.std(values, axis=0, ddof=1) / np.mean(errors, axis=0)
+    assert np.sqrt(np.mean(ratio**2)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> None:
+    snapshot = desk_of(LAB).spectra(latest(K_BY), [name for name in NAMES if name != "theta"])
+    assert snapshot.degrees_of_freedom is not None
+    assert snapshot.interval_95 is not None
+    assert snapshot.left_out_hz is not None
+    frequencies_hz = np.array(snapshot.frequencies_hz)
+    assert (frequencies_hz[0], frequencies_hz[-1], frequencies_hz.size) == (3.0, 150.0, 736)
+    assert snapshot.rotation_hz == pytest.approx(22.0, abs=1e-3)
+    compared = (frequencies_hz < snapshot.left_out_hz[0]) | (frequencies_hz > snapshot.left_out_hz[1])
+    for density in snapshot.densities:
+        measured, expected = numbers(density.measured)[compared], numbers(density.estimated)[compared]
+        ratio = measured / expected
+        assert ratio.mean() == pytest.approx(1.0, abs=0.03)
+        assert ratio.var() * snapshot.degrees_of_freedom / 2 == pytest.approx(1.0, abs=0.25)
+        low, high = snapshot.interval_95
+        assert np.mean((measured * low < expected) & (expected < measured * high)) == pytest.approx(0.95, abs=0.03)
+        whole = numbers(density.measured).sum() * 0.2
+        assert density.rms == pytest.approx(np.sqrt(whole), rel=1e-5)
+    of = {density.channel: density for density in snapshot.densities}
+    near_mode = (frequencies_hz > 20) & (frequencies_hz < 28) & compared
+    excess = numbers(of["y1"].measured)[near_mode] / numbers(of["y1"].nominal)[near_mode]
+    assert excess.mean() > 1.5  # the resonance has come down
+    unmoved = numbers(of["z1"].measured)[near_mode] / numbers(of["z1"].nominal)[near_mode]
+    assert unmoved.mean() == pytest.approx(1.0, abs=0.1)
+
+
+def test_units_of_densities() -> None:
+    desk, data = desk_of(LAB), latest()
+    own, si = (desk.spectra(data, ["y1", "y1_dot"], ["y1"], ["y1_dot"], units=units) for units in ("channel", "SI"))
+    assert [density.unit for density in own.densities] == ["um^2/Hz", "(mm/s)^2/Hz"]
+    assert [density.unit for density in si.densities] == ["m^2/Hz", "(m/s)^2/Hz"]
+    assert numbers(own.densities[0].measured) == pytest.approx(1e12 * numbers(si.densities[0].measured), rel=1e-5)
+    assert numbers(own.densities[1].nominal) == pytest.approx(1e6 * numbers(si.densities[1].nominal), rel=1e-5)
+    assert (own.cross[0].unit, si.cross[0].unit) == ("um*mm/s/Hz", "m*m/s/Hz")
+    # A velocity leads its displacement by a quarter of a turn, and is the same motion.
+    assert np.median(numbers(own.cross[0].phase_deg)) == pytest.approx(90, abs=1)
+    assert np.median(numbers(own.cross[0].coherence)) > 0.9
+
+
+def test_coherence_and_phase_of_a_delayed_channel() -> None:
+    """z1 is y1 two samples later; y2 has nothing in common with it."""
+    rng = np.random.default_rng(8)
+    white = rng.standard_normal((round(71 * LAB.rate_hz), 2))
+    stream_ = synthetic({"y1": white[:, 0], "z1": np.roll(white[:, 0], 2), "y2": white[:, 1]})
+    machine = NOTHING.model_copy(update={"sensors": tuple(c for c in LAB.sensors if c.name in ("y1", "z1", "y2"))})
+    snapshot = desk_of(machine).spectra(LatestData(window_of(machine, stream_), 1.0), (), ["y1", "y1"], ["z1", "y2"])
+    late, foreign = snapshot.cross
+    frequencies_hz = np.array(snapshot.frequencies_hz)
+    assert numbers(late.phase_deg) == pytest.approx(-360 * frequencies_hz * 2 / LAB.rate_hz, abs=1.0)
+    assert numbers(late.coherence).min() > 0.99
+    assert snapshot.coherence_95 is not None
+    beyond = np.mean(numbers(foreign.coherence) > snapshot.coherence_95)
+    assert beyond == pytest.approx(0.05, abs=0.03)
+    # One-sided density of white noise of unit variance, in the band and everywhere: 2 / rate.
+    assert numbers(snapshot.densities[0].measured).mean() == pytest.approx(2 / LAB.rate_hz, rel=0.03)
+    assert late.nominal_magnitude is None
+
+
+def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
+    window = LAB.window.model_copy(update={"band_hz": (3.0, 500.0)})
+    machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:1], "window": window})
+    rng = np.random.default_rng(4)
+    stream_ = synthetic({"y1": rng.standard_normal(round(71 * LAB.rate_hz))})
+    snapshot = desk_of(machine).spectra(LatestData(window_of(machine, stream_), 1.0))
+    assert snapshot.averaged_lines == 3
+    assert snapshot.line_spacing_hz == pytest.approx(0.6)
+    assert len(snapshot.frequencies_hz) == 828
+    assert np.diff(snapshot.frequencies_hz) == pytest.approx(0.6, abs=1e-3)
+    measured = numbers(snapshot.densities[0].measured)
+    assert snapshot.degrees_of_freedom is not None
+    assert measured.var() / measured.mean() ** 2 * snapshot.degrees_of_freedom / 2 == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_part_of_the_band() -> None:
+    desk = desk_of(LAB)
+    part, whole = desk.spectra(latest(), ["y2"], band_hz=(25.0, 35.0)), desk.spectra(latest(), ["y2"])
+    assert (part.frequencies_hz[0], part.frequencies_hz[-1]) == (25.0, 35.0)
+    at = whole.frequencies_hz.index(25.0)
+    count = len(part.frequencies_hz)
+    assert part.densities[0].measured == whole.densities[0].measured[at : at + count]
+    assert numbers(part.densities[0].nominal) == pytest.approx(
+        numbers(whole.densities[0].nominal)[at : at + count], rel=1e-4
+    )
+    with pytest.raises(
+        SnapshotError, match=r"demo/lab: band is 200 to 300 Hz, expected at least 0\.4 Hz within 3 to 150"
+    ):
+        desk.spectra(latest(), ["y2"], band_hz=(200.0, 300.0))
+
+
+@cache
+def quiet(machine: Machine = LAB) -> tuple[SampleBlock, ...]:
+    """The rotor kit with nothing but its unbalance."""
+    scenario, _ = load_scenario("healthy")
+    still = {"sources": (), "sensors": type(scenario.sensors)(), "duration_s": SECONDS}
+    return tuple(block for block, _ in blocks(scenario.model_copy(update=still), machine))
+
+
+def test_the_orbit_of_a_known_unbalance() -> None:
+    data = LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:])
+    snapshot = desk_of(LAB).orbits(data, 8)
+    assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
+    assert snapshot.speed_source == "phase reference"
+    W, rotor = LAB.operation.speed_rad_s, LAB.rotor
+    H = H_matrix(rotor, W)
+    dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
+    q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
+    circle = np.exp(1j * np.linspace(0, 2 * np.pi, 20_000))
+    assert [orbit.location for orbit in snapshot.orbits] == ["bearing", "disc"]
+    for orbit, q_y, q_z in zip(snapshot.orbits, q_um[[0, 1]], q_um[[3, 4]], strict=True):
+        assert orbit.unit == "um"
+        assert orbit.y is not None
+        assert orbit.y.amplitude == pytest.approx(abs(q_y), rel=1e-3)
+        assert orbit.y.phase_lag_deg == pytest.approx(np.degrees(-np.angle(q_y)) % 360, abs=0.1)
+        assert orbit.z is not None
+        assert orbit.z.amplitude == pytest.approx(abs(q_z), rel=1e-3)
+        assert orbit.z.phase_lag_deg == pytest.approx(np.degrees(-np.angle(q_z)) % 360, abs=0.1)
+        y, z = np.real(q_y * circle), np.real(q_z * circle)
+        radius = np.hypot(y, z)
+        far = int(radius.argmax())
+        for ellipse in (orbit.ellipse, orbit.nominal):
+            assert ellipse is not None
+            assert ellipse.semi_major == pytest.approx(radius.max(), rel=1e-3)
+            assert ellipse.semi_minor == pytest.approx(radius.min(), rel=1e-3)
+            apart = ellipse.tilt_deg - np.degrees(np.arctan2(z[far], y[far]))
+            assert (apart + 90) % 180 - 90 == pytest.approx(0, abs=0.5)
+            assert (ellipse.sense, ellipse.precession) == ("y to z", "forward")
+        assert orbit.estimated is None
+        assert orbit.path is not None
+        path = numbers(orbit.path.y) + 1j * numbers(orbit.path.z)
+        turn = np.exp(1j * W * (np.array(orbit.path.times_s) - snapshot.pulses_s[0]))
+        on_ellipse = np.real(q_y * turn) + 1j * np.real(q_z * turn)
+        assert np.abs(path - on_ellipse).max() < 0.01 * radius.max()
+    assert snapshot.theory.estimated_reason == "not asked"
+    assert np.diff(snapshot.pulses_s) == pytest.approx(2 * np.pi / W, rel=1e-4)
+    assert snapshot.path_start_ns is not None
+    assert quiet()[-1].end_ns - snapshot.path_start_ns < 9.1 * 2e9 * np.pi / W
+
+
+def test_errors_of_an_orbit_are_the_scatter_of_many() -> None:
+    """Twelve hops of the healthy machine against the errors of its amplitudes, and the estimated orbit's own size."""
+    data = latest()
+    assert data.window is not None
+    assert data.window.hop_synchronous is not None
+    snapshot = desk_of(LAB).orbits(data)
+    for orbit in snapshot.orbits:
+        assert orbit.nominal is not None
+        assert orbit.estimated is not None
+        for vector in (orbit.y, orbit.z):
+            assert vector is not None
+            hops = 1e6 * np.abs(data.window.hop_synchronous[:, data.window.states.index(vector.channel)])
+            assert vector.amplitude_error == pytest.approx(hops.std(ddof=1) / np.sqrt(12), rel=0.2)
+        assert orbit.ellipse is not None
+        assert orbit.ellipse.semi_major == pytest.approx(orbit.nominal.semi_major, rel=0.1)
+    assert snapshot.revolutions == 0
+    assert snapshot.path_reason == "none were asked for"
+    assert all(orbit.path is None for orbit in snapshot.orbits)
+
+
+def test_a_shaft_that_turns_backwards() -> None:
+    """The angle falls, and the motion goes against the rotation; z is in another unit than y."""
+    t = np.arange(round(71 * LAB.rate_hz)) / LAB.rate_hz
+    turn = 2 * np.pi * 25.0 * t
+    rng = np.random.default_rng(2)
+    stream_ = synthetic(
+        {
+            "theta": (1.0 - turn) % (2 * np.pi),
+            "y1": 30 * np.cos(turn - 1.0 - np.pi / 2) + 400 + rng.standard_normal(t.size),
+            "z1": (10 * np.sin(turn - 1.0 - np.pi / 2) - 300 + rng.standard_normal(t.size)) / 25.4,
+        }
+    )
+    channels = {channel.name: channel for channel in LAB.sensors}
+    channels["z1"] = channels["z1"].model_copy(update={"unit": "mil"})
+    machine = NOTHING.model_copy(update={"sensors": tuple(channels.values())})
+    data = LatestData(window_of(machine, stream_), 1.0, (), "", tuple(stream_[-10:]))
+    snapshot = desk_of(machine).orbits(data, 3)
+    assert snapshot.speed_rad_s == pytest.approx(-2 * np.pi * 25, rel=1e-3)
+    orbit = snapshot.orbits[0]
+    assert orbit.ellipse is not None
+    assert (orbit.ellipse.sense, orbit.ellipse.precession) == ("y to z", "backward")
+    assert orbit.ellipse.semi_major == pytest.approx(30, rel=2e-3)
+    assert orbit.ellipse.semi_minor == pytest.approx(10, rel=5e-3)
+    assert orbit.ellipse.tilt_deg == pytest.approx(0, abs=0.2)
+    assert orbit.y is not None
+    assert orbit.y.phase_lag_deg == pytest.approx(90, abs=0.2)
+    assert orbit.path is not None
+    assert np.ptp(numbers(orbit.path.z)) == pytest.approx(20, rel=0.5)
+
+
+def test_without_a_phase_reference_size_and_sense_remain() -> None:
+    machine = Machine.model_validate(LAB.model_dump() | {"sensors": [c for c in LAB.sensors if c.name != "theta"]})
+    data = LatestData(window_of(machine, stream(SECONDS, SEED)), 1.0, (), "", stream(SECONDS, SEED)[-20:])
+    blind, seeing = desk_of(machine).orbits(data, 4), desk_of(LAB).orbits(latest())
+    assert blind.speed_source == "estimated"
+    assert blind.speed_rad_s == pytest.approx(LAB.operation.speed_rad_s, rel=1e-3)
+    for one, other in zip(blind.orbits, seeing.orbits, strict=True):
+        assert one.y is not None
+        assert (one.y.phase_lag_deg, one.y.phase_error_deg) == (None, None)
+        assert one.ellipse is not None
+        assert other.ellipse is not None
+        assert (one.ellipse.sense, one.ellipse.precession) == ("y to z", None)
+        assert one.ellipse.semi_major == pytest.approx(other.ellipse.semi_major, rel=0.15)
+        assert one.path is not None
+        assert one.path.times_s[-1] == pytest.approx(4 * 2 * np.pi / LAB.operation.speed_rad_s, abs=2 / LAB.rate_hz)
+    assert blind.revolutions == 4
+    assert blind.pulses_s == ()
+    assert blind.path_reason.startswith("the shaft angle is not measured")
+    snapshot = desk_of(machine).correlations(data)
+    assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
+
+
+def test_nothing_is_known_of_the_machine() -> None:
+    reason = "the machine's parameters are not known, so there is no theory to predict from"
+    data, desk = LatestData(latest().window, 1.0, (), "", stream(SECONDS, SEED)[-20:]), desk_of(NOTHING)
+    correlations, spectra, orbits = desk.correlations(data), desk.spectra(data, (), ["y1"]), desk.orbits(data, 2)
+    known = desk_of(LAB).correlations(latest())
+    assert [pair.measured for pair in correlations.pairs] == [pair.measured for pair in known.pairs]
+    for snapshot in (correlations, spectra, orbits):
+        assert (snapshot.reason, snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == (
+            "",
+            reason,
+            reason,
+        )
+    assert {(pair.nominal, pair.estimated, pair.nominal_z) for pair in correlations.pairs} == {(None, None, None)}
+    assert {(density.nominal, density.estimated) for density in spectra.densities} == {(None, None)}
+    assert {(orbit.nominal, orbit.estimated) for orbit in orbits.orbits} == {(None, None)}
+    assert all(orbit.ellipse is not None and orbit.path is not None for orbit in orbits.orbits)
+
+
+def test_a_window_that_was_not_evaluated_is_predicted_as_nominal() -> None:
+    why = "demo/lab: gain of y1 is 20 % lower than when it was commissioned"
+    data = LatestData(latest().window, 1.0, (), why)
+    snapshot = desk_of(LAB).correlations(data)
+    assert (snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", why)
+    assert snapshot.theory.changes == ()
+    assert all(pair.estimated is None and pair.estimated_z is None for pair in snapshot.pairs)
+    assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
+    unsaid = desk_of(LAB).spectra(LatestData(latest().window, 1.0))
+    assert unsaid.theory.estimated_reason == "no parameter was read in this window"
+
+
+def test_before_the_first_window() -> None:
+    data = LatestData(None, 0.25, (), "", stream(SECONDS, SEED)[:20])
+    desk = desk_of(LAB)
+    correlations, spectra, orbits = desk.correlations(data), desk.spectra(data), desk.orbits(data, 35)
+    for snapshot in (correlations, spectra, orbits):
+        assert snapshot.reason == "demo/lab: no window of 60 s is full yet, 25% of one is there"
+        assert (snapshot.start_ns, snapshot.end_ns, snapshot.speed_rad_s) == (None, None, None)
+        assert snapshot.filled == 0.25
+    assert (correlations.pairs, spectra.densities) == ((), ())
+    assert orbits.revolutions == 35
+    assert all(orbit.path is not None and orbit.ellipse is None for orbit in orbits.orbits)
+
+
+def test_a_channel_that_does_not_move() -> None:
+    stream_ = [
+        SampleBlock(b.start_ns, b.sequence, b.run, b.rate_hz, np.where(np.array(NAMES) == "y1", 5.0, b.samples))
+        for b in stream(SECONDS, SEED)
+    ]
+    data = LatestData(window_of(LAB, stream_), 1.0, (), "y1 is stuck")
+    snapshot = desk_of(LAB).correlations(data)
+    assert snapshot.theory.nominal_reason.startswith("demo/lab: no fluctuation in y1")
+    assert snapshot.theory.estimated_reason == "y1 is stuck"
+    assert set(snapshot.pairs[0].measured) <= {0.0, -0.0}
+    assert snapshot.pairs[0].nominal is None
+    assert (
+        json.loads(desk_of(LAB).spectra(data, (), ["y1"], ["y2"]).model_dump_json())["cross"][0]["coherence"][0] is None
+    )
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        (["y9"], [], r"demo/lab: first is 'y9', which is not a channel of it; expected one of y1, z1, y1_dot"),
+        (["y1"], ["theta"], r"demo/lab: second is 'theta', which is the shaft angle; expected one of y1"),
+        (["y1", "y2"], ["z1"], r"demo/lab: 2 values of first and 1 of second, expected as many"),
+        ([], ["z1"], r"demo/lab: 0 values of first and 1 of second"),
+        (["y1"] * 65, [], r"demo/lab: 65 values of first, expected at most 64"),
+    ],
+)
+def test_channels_that_are_not_there(first: list[str], second: list[str], message: str) -> None:
+    desk = desk_of(LAB)
+    with pytest.raises(SnapshotError, match=message):
+        desk.correlations(latest(), first, second)
+    with pytest.raises(SnapshotError, match=message):
+        desk.spectra(latest(), (), first, second)
+
+
+def test_channels_by_name_and_a_choice_without_displacements() -> None:
+    desk = desk_of(LAB)
+    assert [(p.first, p.second) for p in desk.correlations(latest(), ["z2", "y1"]).pairs] == [
+        ("z2", "z2"),
+        ("y1", "y1"),
+    ]
+    with pytest.raises(SnapshotError, match="channel is 'q'"):
+        desk.spectra(latest(), ["q"])
+    with pytest.raises(SnapshotError, match=f"revolutions is 65, expected 0 to {MOST_REVOLUTIONS}"):
+        desk.orbits(latest(), 65)
+    rates = NOTHING.model_copy(update={"sensors": tuple(c for c in LAB.sensors if c.quantity == "velocity")})
+    data = LatestData(window_of(rates, stream(SECONDS, SEED)), 1.0)
+    snapshot = desk_of(rates).spectra(data)
+    assert [density.channel for density in snapshot.densities] == ["y1_dot", "z1_dot", "y2_dot", "z2_dot"]
+    assert (snapshot.rotation_hz, snapshot.left_out_hz) == (None, None)
+    orbits = desk_of(rates).orbits(data)
+    assert orbits.orbits == ()
+    assert orbits.reason.endswith("measured displacements: none")
+
+
+def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[WindowStatistics] = []
+
+    def counted(known: Machine | None, window: WindowStatistics, *rest: object) -> Prediction:
+        asked.append(window)
+        return predict(known, window, *rest)  # type: ignore[arg-type]  # handed on as they came
+
+    monkeypatch.setattr(desk_module, "predict", counted)
+    desk = desk_of(LAB)
+    first = desk.correlations(latest())
+    desk.spectra(latest())
+    assert desk.correlations(latest()) == first
+    assert len(asked) == 1
+    desk.correlations(latest(K_BY))
+    assert len(asked) == 2
+
+
+@pytest.mark.parametrize("model", [CorrelationSnapshot, SpectrumSnapshot, OrbitSnapshot])
+def test_snapshots_as_json(model: type[BaseModel]) -> None:
+    """Every field has an example; what is written is read again; no number is anything but a number."""
+    model.model_validate(example(model))
+    desk = desk_of(LAB)
+    made: dict[type[BaseModel], Callable[[LatestData], BaseModel]] = {
+        CorrelationSnapshot: desk.correlations,
+        SpectrumSnapshot: lambda data: desk.spectra(data, (), ["y1"], ["y2"]),
+        OrbitSnapshot: lambda data: desk.orbits(data, 8),
+    }
+    for data in (latest(), LatestData()):
+        snapshot = made[model](data)
+        text = snapshot.model_dump_json()
+        assert model.model_validate_json(text) == snapshot
+        json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
+
+
+def test_the_newest_blocks_are_kept_without_a_gap() -> None:
+    stream_ = stream(SECONDS, SEED)
+    newest = NewestBlocks(length_s=1.0)
+    assert NewestBlocks().blocks == ()
+    for block in stream_[:30]:
+        newest.add(block, continuous=True)
+    assert newest.blocks == stream_[20:30]
+    newest.add(stream_[35], continuous=False)
+    assert newest.blocks == (stream_[35],)
+    newest.add(stream_[36], continuous=True)
+    assert newest.blocks == stream_[35:37]
+
+
+def test_too_few_revolutions_are_said() -> None:
+    desk, stream_ = desk_of(LAB), stream(SECONDS, SEED)
+    few = desk.orbits(LatestData(None, 0.0, (), "", stream_[-2:]), 20)
+    assert few.revolutions in (3, 4)
+    assert few.path_reason == f"{few.revolutions} of 20 revolutions: there are 0.2 s of samples without a gap at most"
+    none = desk.orbits(LatestData(None, 0.0, (), "", ()), 20)
+    assert (none.revolutions, none.path_reason) == (0, "no samples have come in")
+    assert all(orbit.path is None for orbit in none.orbits)
