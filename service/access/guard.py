@@ -18,7 +18,7 @@ import math
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import Depends, FastAPI, Request
 from fastapi.responses import JSONResponse
@@ -34,8 +34,9 @@ from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import NEEDED, Requirement, requires
 from service.access.routes import PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
-from service.access.tokens import TokenStore, parse_token, token_is_valid
+from service.access.tokens import PresentedToken, TokenStore, parse_token, token_is_valid
 from service.access_settings import AccessSettings
+from service.store.records import TokenRecord
 
 __all__ = ["ACCESS_PROBLEMS", "AccessError", "Guard"]
 
@@ -43,11 +44,19 @@ ACCESS_PROBLEMS = (401, 403, 429, 503)
 """What any guarded route may answer besides its own; those that take a body also 413 and 415."""
 
 _KNOWN_TOKENS = 1_000
+_WITHOUT_DATABASE_S = 900.0
 _SEATS_RETRY_S = 5
 
 
 class AccessError(RotorwatchError):
     """An application cannot be guarded the way it is built."""
+
+
+class _Known(NamedTuple):
+    """A token that was valid when it was looked up."""
+
+    record: TokenRecord
+    looked_up_s: float
 
 
 class Guard:
@@ -99,10 +108,11 @@ class Guard:
         self.gate: Any = Depends(self.pass_gate)
         self._tokens = tokens
         self._clock_ns = clock_ns
-        self._hosts = frozenset(("localhost", host.lower(), *access.hosts))
+        self._host = host.lower()
         self._requests = MovingWindow(limits.requests_per_minute, clock=monotonic)
         self._failures = MovingWindow(limits.failures_per_minute, clock=monotonic)
-        self._known: OrderedDict[bytes, None] = OrderedDict()
+        self._monotonic = monotonic
+        self._known: OrderedDict[bytes, _Known] = OrderedDict()
 
     def protect(self, app: FastAPI) -> None:
         """Put the middleware around an application all of whose routes are there, and serve its ``/openapi.json``.
@@ -151,7 +161,8 @@ class Guard:
             raise _too_many(f"more than {self.access.limits.requests_per_minute} requests in a minute", wait_s)
         if caller is None:
             raise HTTPException(401, NEEDED, {"WWW-Authenticate": challenge(request)})
-        check_origin(request.headers, request.method, hosts=self._hosts, open_to_all=in_the_open)
+        hosts = self.access.hosts
+        check_origin(request.headers, request.method, listens_on=self._host, hosts=hosts, open_to_all=in_the_open)
         return caller
 
     def pass_gate(self, request: Request) -> None:
@@ -207,24 +218,32 @@ class Guard:
         # Who shares an address with somebody who tries tokens out is not locked out with them.
         if wait_s and (presented is None or presented.secret_hash not in self._known):
             raise _too_many("too many attempts with a wrong token from this address", wait_s)
-        record = None
-        if presented is not None:
-            try:
-                record = await run_in_threadpool(self._tokens.find, presented.token_id)
-            except RotorwatchError as error:
-                raise HTTPException(503, f"tokens cannot be looked up: {error}") from error
+        record = None if presented is None else await self._looked_up(presented, request.method)
         valid = token_is_valid(record, presented, self._clock_ns())
         if record is None or presented is None or not valid:
             if presented is not None:
                 self._known.pop(presented.secret_hash, None)
             self._failures.hit(network)
             return None
-        self._known[presented.secret_hash] = None
-        self._known.move_to_end(presented.secret_hash)
-        if len(self._known) > _KNOWN_TOKENS:
-            self._known.popitem(last=False)
         granted = frozenset(scope for scope in Scope if scope.value in record.scopes)
         return Caller(record.name, granted, address, record.token_id)
+
+    async def _looked_up(self, presented: PresentedToken, method: str) -> TokenRecord | None:
+        now_s = self._monotonic()
+        known = self._known.get(presented.secret_hash)
+        try:
+            record = await run_in_threadpool(self._tokens.find, presented.token_id)
+        except RotorwatchError as error:
+            # Just when the database fails, operators want to look at their machines.
+            if known is not None and method in SAFE_METHODS and now_s - known.looked_up_s <= _WITHOUT_DATABASE_S:
+                return known.record
+            raise HTTPException(503, f"tokens cannot be looked up: {error}") from error
+        if record is not None and token_is_valid(record, presented, self._clock_ns()):
+            self._known[presented.secret_hash] = _Known(record, now_s)
+            self._known.move_to_end(presented.secret_hash)
+            if len(self._known) > _KNOWN_TOKENS:
+                self._known.popitem(last=False)
+        return record
 
 
 def _is_public(request: Request) -> bool:

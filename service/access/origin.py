@@ -22,7 +22,7 @@ _FROM_HERE = ("none", "same-origin")
 _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip")
 
 
-def check_origin(headers: Headers, method: str, *, hosts: frozenset[str], open_to_all: bool) -> None:
+def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple[str, ...], open_to_all: bool) -> None:
     """Refuse what may come from a page of somebody else's.
 
     Parameters
@@ -31,8 +31,10 @@ def check_origin(headers: Headers, method: str, *, hosts: frozenset[str], open_t
         Of the request.
     method : str
         Of the request.
-    hosts : frozenset of str
-        Names, other than addresses, under which browsers reach the service.
+    listens_on : str
+        Address or name that is listened on.
+    hosts : tuple of str
+        Other names under which browsers reach the service.
     open_to_all : bool
         Whether callers need no token; then the service's name is looked at, and nothing is taken from a proxy.
 
@@ -44,7 +46,7 @@ def check_origin(headers: Headers, method: str, *, hosts: frozenset[str], open_t
     host = headers.get("host", "")
     if open_to_all:
         name = _host_name(f"//{host}")
-        if not is_address(name) and name not in hosts:
+        if not is_address(name) and name not in ("localhost", listens_on, *hosts):
             raise HTTPException(403, f"host {host!r} is not one of this service; see [access] hosts in the settings")
         passed_on = next((header for header in _FORWARDED if header in headers), None)
         if passed_on is not None:
@@ -64,12 +66,10 @@ def check_origin(headers: Headers, method: str, *, hosts: frozenset[str], open_t
         raise HTTPException(415, f"content type is {kind[:100] or 'missing'}, expected application/json")
 
 
-def _is_ours(origin: str, host: str, hosts: frozenset[str]) -> bool:
-    """Whether a page is one of this service, whose name a proxy may have changed on the way."""
-    scheme, found, place = origin.partition("://")
-    if not found or scheme not in ("http", "https"):
-        return False
-    return place == host or _host_name(origin) in hosts - {"localhost"}
+def _is_ours(origin: str, host: str, hosts: tuple[str, ...]) -> bool:
+    """Whether a page is one of this service; a proxy may have put another name into the request."""
+    scheme, _, place = origin.partition("://")
+    return scheme in ("http", "https") and (place == host or place.lower() in hosts)
 
 
 def _host_name(url: str) -> str:

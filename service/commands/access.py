@@ -1,0 +1,248 @@
+"""``rotorwatch token`` and ``rotorwatch audit``: who may use the HTTP API, and who did."""
+
+import getpass
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from models.errors import MachineFileError
+from service.commands.running import exit_codes
+
+if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
+    from service.store.records import AuditEntry, TokenRecord
+    from service.store.store import Store
+
+__all__ = ["register"]
+
+_PAGE = 500
+
+_ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    tokens = typer.Typer(no_args_is_help=True, help="Tokens for the HTTP API; they work at once, without a restart.")
+    tokens.command("create")(create)
+    tokens.command("list")(list_)
+    tokens.command("revoke")(revoke)
+    app.add_typer(tokens, name="token")
+    app.command()(audit)
+
+
+def create(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Who will use it, as the audit log shall say.")],
+    scope: Annotated[
+        list[str] | None,
+        typer.Option("--scope", metavar="SCOPE", help="read, operate or configure; none includes another. Repeatable."),
+    ] = None,
+    days: Annotated[
+        int | None, typer.Option("--days", metavar="DAYS", help="How long it holds; until it is revoked if left out.")
+    ] = None,
+    config: _ConfigOption = None,
+) -> None:
+    """Create a token and show it, once: only a hash of it is kept.
+
+    [bold]Examples[/bold]
+
+    [cyan]rotorwatch token create dashboard --scope read[/cyan]
+
+    [cyan]rotorwatch token create "control room" --scope read --scope operate --days 90 --config plant.toml[/cyan]
+    """
+    with exit_codes():
+        from service.access.scopes import Scope  # noqa: PLC0415  # keeps --help quick
+        from service.access.tokens import new_token  # noqa: PLC0415
+
+        unknown = set(scope or ()) - set(Scope)
+        if unknown:
+            raise MachineFileError(f"--scope is {', '.join(sorted(unknown))}, expected {', '.join(Scope)}")
+        now_ns = time.time_ns()
+        record, text = new_token(name, [Scope(one) for one in scope or ()], now_ns=now_ns, days=days)
+        with _opened(config) as store:
+            if any(one.name == name and _state(one, now_ns) == "valid" for one in store.tokens.all()):
+                raise MachineFileError(f"a token of {name!r} is valid already: take another name, or revoke it first")
+            _write(store, "create-token", f"{record.token_id}, {name}, {' '.join(record.scopes)}")
+            store.tokens.add(record)
+        until = "until it is revoked" if record.expires_ns is None else f"until {_utc(record.expires_ns)}"
+        typer.echo(f"token {record.token_id} of {name} ({', '.join(record.scopes)}), valid {until}", err=True)
+        typer.echo("it is shown this once; send it as header Authorization: Bearer TOKEN", err=True)
+        typer.echo(text)
+
+
+def list_(config: _ConfigOption = None) -> None:
+    """Show every token there ever was, and which hold.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch token list --config plant.toml[/cyan]
+    """
+    with exit_codes():
+        from rich.console import Console  # noqa: PLC0415  # keeps --help quick
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+
+        with _opened(config) as store:
+            records = store.tokens.all()
+        now_ns = time.time_ns()
+        table = Table("token", "name", "scopes", "created", "expires", "state")
+        for record in sorted(records, key=lambda one: one.created_ns):
+            state = _state(record, now_ns)
+            table.add_row(
+                record.token_id,
+                Text(record.name),
+                " ".join(record.scopes),
+                _utc(record.created_ns),
+                "-" if record.expires_ns is None else _utc(record.expires_ns),
+                Text(state, style="green" if state == "valid" else "red"),
+            )
+        Console(soft_wrap=True).print(table)
+
+
+def revoke(
+    token: Annotated[str, typer.Argument(metavar="ID", help="Public part of the token, from: rotorwatch token list.")],
+    config: _ConfigOption = None,
+) -> None:
+    """Revoke a token: it is refused from the next request on.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch token revoke 3fK09aZqT1xB[/cyan]
+    """
+    with exit_codes():
+        from service.access.tokens import masked  # noqa: PLC0415  # keeps --help quick
+
+        with _opened(config) as store:
+            record = store.tokens.find(token)
+            if record is None:
+                raise MachineFileError(
+                    f"there is no token {masked(token)!r}; expected the 12 characters after rw_, see: rotorwatch token "
+                    "list"
+                )
+            if record.revoked_ns is None:
+                _write(store, "revoke-token", f"{record.token_id}, {record.name}")
+                store.tokens.revoke(token, time.time_ns())
+                typer.echo(f"token {record.token_id} of {record.name} is revoked")
+            else:
+                typer.echo(f"token {record.token_id} of {record.name} was revoked at {_utc(record.revoked_ns)}")
+
+
+def audit(
+    machine: Annotated[
+        str | None, typer.Option("--machine", metavar="SITE/MACHINE", help="Only what was done to this machine.")
+    ] = None,
+    actor: Annotated[str | None, typer.Option("--actor", metavar="NAME", help="Only what this user did.")] = None,
+    limit: Annotated[int, typer.Option("--limit", min=1, max=100_000, help="At most this many, the newest.")] = 50,
+    config: _ConfigOption = None,
+) -> None:
+    """Show who did what over HTTP, and who was refused; newest first, times in UTC.
+
+    An action whose outcome is not known was begun, and the monitor ended before it could write what came of it.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch audit --machine plant/pump-7 --limit 20[/cyan]
+    """
+    with exit_codes():
+        from rich.console import Console  # noqa: PLC0415  # keeps --help quick
+        from rich.table import Table  # noqa: PLC0415
+        from rich.text import Text  # noqa: PLC0415
+
+        with _opened(config) as store:
+            entries = list(_with_outcomes(store, machine, actor, limit))
+        table = Table("time", "who", "from", "request", "status", "action", "machine", "alarm", "reason")
+        for entry in entries:
+            table.add_row(
+                _utc(entry.at_ns),
+                # Text, because what callers sent is not to be taken for markup.
+                *(Text(part or "-") for part in (entry.actor, entry.address, f"{entry.method} {entry.path}")),
+                str(entry.status) if entry.status else "not known",
+                *(Text(part or "-") for part in (entry.action, entry.machine, entry.alarm, entry.reason)),
+            )
+        Console(soft_wrap=True).print(table)
+
+
+def _with_outcomes(store: "Store", machine: str | None, actor: str | None, limit: int) -> "Iterator[AuditEntry]":
+    """Entries, newest first, without the beginnings whose outcome is there too."""
+    from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
+
+    outcomes: set[tuple[int, str, str]] = set()
+    before: int | None = None
+    shown = 0
+    while True:
+        page = store.audit.entries(before=before, limit=_PAGE, machine=machine, actor=actor)
+        for entry in page:
+            key = (entry.at_ns, entry.method, entry.path)
+            if entry.status == 0 and entry.action == STARTED and key in outcomes:
+                continue
+            outcomes.add(key)
+            yield entry
+            shown += 1
+            if shown == limit:
+                return
+        if len(page) < _PAGE:
+            return
+        before = page[-1].number
+
+
+@contextmanager
+def _opened(config: Path | None) -> "Iterator[Store]":
+    from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
+    from service.store.store import Store  # noqa: PLC0415
+
+    history = load_settings(config).history
+    if history.database.endswith(":memory:"):
+        raise MachineFileError(
+            f"{config}: history.url is {history.database!r}: tokens would be in memory, where no other program "
+            "finds them; expected a file or a PostgreSQL server"
+        )
+    store = Store(history.database, history.retention)
+    store.open()
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def _write(store: "Store", action: str, reason: str) -> None:
+    """Into the audit log, before it is done."""
+    from service.store.records import AuditEntry  # noqa: PLC0415  # keeps --help quick
+
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a container whose user has no name
+        user = f"user {os.getuid()}"
+    store.audit.append(
+        AuditEntry(
+            number=0,
+            at_ns=time.time_ns(),
+            actor=user,
+            address="",
+            method="command",
+            path="rotorwatch token",
+            status=200,
+            action=action,
+            machine="",
+            alarm="",
+            reason=reason,
+        )
+    )
+
+
+def _state(record: "TokenRecord", now_ns: int) -> str:
+    if record.revoked_ns is not None:
+        return f"revoked {_utc(record.revoked_ns)}"
+    if record.expires_ns is not None and record.expires_ns <= now_ns:
+        return "expired"
+    return "valid"
+
+
+def _utc(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")

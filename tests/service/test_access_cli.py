@@ -1,0 +1,119 @@
+"""``rotorwatch token`` and ``rotorwatch audit`` beside a running service, on the same database."""
+
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner, Result
+
+from service.access.scopes import Scope
+from service.commands import access as access_commands
+from tests.service.guarded import Guarded, guarded
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
+    monkeypatch.setenv("COLUMNS", "300")
+    app = typer.Typer()
+    access_commands.register(app)
+    return app
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> str:
+    path = tmp_path / "plant.toml"
+    path.write_text('[history]\nurl = "sqlite:///history.sqlite"\n', encoding="utf-8")
+    return str(path)
+
+
+def run(app: typer.Typer, *arguments: str) -> Result:
+    return CliRunner().invoke(app, arguments)
+
+
+def status(monitor: Guarded, token: str, method: str = "GET", path: str = "/health") -> int:
+    with monitor.client(token) as client:
+        return client.request(method, path).status_code
+
+
+def test_a_token_works_at_once_and_not_a_request_longer(tmp_path: Path, commands: typer.Typer, config: str) -> None:
+    with guarded(tmp_path) as monitor:
+        created = run(
+            commands, "token", "create", "control room", "--scope", "read", "--days", "90", "--config", config
+        )
+        assert created.exit_code == 0, created.output
+        token = created.stdout.strip()
+        assert "shown this once" in created.stderr
+        assert token not in created.stderr
+        assert status(monitor, token) == 200
+        assert status(monitor, token, "DELETE", "/machine") == 403
+
+        listed = run(commands, "token", "list", "--config", config).stdout
+        token_id, secret = token.split("_")[1:]
+        assert token_id in listed
+        assert "control room" in listed
+        assert "valid" in listed
+        assert secret not in listed
+
+        again = run(commands, "token", "create", "control room", "--scope", "read", "--config", config)
+        assert again.exit_code == 2
+        assert "valid already" in again.stderr
+
+        revoked = run(commands, "token", "revoke", token_id, "--config", config)
+        assert revoked.exit_code == 0
+        assert status(monitor, token) == 401
+        assert "was revoked at" in run(commands, "token", "revoke", token_id, "--config", config).stdout
+        assert "revoked" in run(commands, "token", "list", "--config", config).stdout
+
+        written = run(commands, "audit", "--config", config).stdout
+        assert "create-token" in written
+        assert "revoke-token" in written
+        assert secret not in written
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("create", "x"), "scope: none is given, expected one or more of read, operate, configure"),
+        (("create", "x", "--scope", "admin"), "--scope is admin, expected read, operate, configure"),
+        (("create", "x", "--scope", "read", "--days", "0"), "days is 0, expected 1 to 3650"),
+        (("create", " ", "--scope", "read"), "name is ' '"),
+        (("revoke", "000000000000"), "there is no token '000000000000'"),
+    ],
+)
+def test_mistakes_exit_2_with_a_sentence(
+    commands: typer.Typer, config: str, arguments: tuple[str, ...], expected: str
+) -> None:
+    result = run(commands, "token", *arguments, "--config", config)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+
+
+def test_tokens_in_memory_make_no_sense(tmp_path: Path, commands: typer.Typer) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text('[history]\nurl = "sqlite:///:memory:"\n', encoding="utf-8")
+    result = run(commands, "token", "list", "--config", str(path))
+    assert result.exit_code == 2
+    assert "in memory" in result.stderr
+
+
+def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Typer, config: str) -> None:
+    with guarded(tmp_path) as monitor:
+        token = monitor.token(*Scope, name="control room")
+        with monitor.client(token) as client:
+            client.post("/alarms/k_by/shelve", json={"reason": "[bold]bolt[/bold] replaced"})
+            client.delete("/machine")
+        with monitor.client() as nobody:
+            nobody.get("/health")
+        visit = monitor.guard.trail.visit("10.0.0.1", "POST", "/cut/short")
+        monitor.guard.trail.start(visit)
+        lines = [line for line in run(commands, "audit", "--config", config).stdout.splitlines() if "│" in line]
+        requests = [line.split("│")[4].strip() for line in lines]
+        assert requests == ["POST /cut/short", "GET /health", "DELETE /machine", "POST /alarms/k_by/shelve"]
+        assert "not known" in lines[0]
+        assert "[bold]bolt[/bold] replaced" in lines[-1]
+        assert "control room" in lines[-1]
+        chosen = run(commands, "audit", "--machine", "demo/lab", "--config", config).stdout
+        assert "k_by" in chosen
+        assert "DELETE" not in chosen
+        assert "DELETE" not in run(commands, "audit", "--limit", "2", "--config", config).stdout
+        assert "GET /health" not in run(commands, "audit", "--actor", "control room", "--config", config).stdout

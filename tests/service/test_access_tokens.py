@@ -1,0 +1,200 @@
+"""Tokens: made, taken apart, checked, hidden; rates and settings beside them."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from models.errors import MachineFileError
+from service.access.presented import network_of
+from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
+from service.access.scopes import ANONYMOUS, Scope
+from service.access.tokens import masked, new_token, parse_token, token_is_valid
+from service.access_settings import AccessSettings, TlsSettings, check_access
+from service.store.records import TokenRecord
+
+DAY_NS = 86_400 * 10**9
+ALPHABET = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"
+
+
+def made(name: str = "ops", days: int | None = None) -> tuple[TokenRecord, str]:
+    return new_token(name, [Scope.READ], now_ns=0, days=days)
+
+
+def test_tokens_differ_and_hold_256_bits() -> None:
+    tokens = [made()[1] for _ in range(200)]
+    secrets = {token.rpartition("_")[2] for token in tokens}
+    assert len(secrets) == len({token[:15] for token in tokens}) == 200
+    assert {len(secret) for secret in secrets} == {43}
+    assert 62**42 < 2**256 <= 62**43
+    # Every digit of the last place occurs, the first is small because 62**43 is more than 2**256.
+    assert len({secret[-1] for secret in secrets}) > 50
+
+
+def test_only_the_hash_of_the_secret_is_in_the_record() -> None:
+    record, text = made()
+    secret = text.rpartition("_")[2]
+    assert secret not in repr(record)
+    assert len(record.secret_hash) == 32
+    parsed = parse_token(text)
+    assert parsed is not None
+    assert parsed.token_id == record.token_id
+    assert secret not in repr(parsed)
+    assert repr(parsed.secret_hash) not in repr(parsed)
+
+
+@given(st.text())
+def test_any_text_is_no_token_and_breaks_nothing(text: str) -> None:
+    assert parse_token(text) is None
+    assert not token_is_valid(made()[0], parse_token(text), 1)
+
+
+@given(st.data())
+def test_one_wrong_character_is_enough(data: st.DataObject) -> None:
+    record, text = made()
+    place = data.draw(st.integers(0, len(text) - 1))
+    other = data.draw(st.sampled_from([*ALPHABET, "_", "-", " ", "\n", "é", "\0"]).filter(lambda c: c != text[place]))
+    for wrong in (text[:place] + other + text[place + 1 :], text[:place], text + other, other + text):
+        assert not token_is_valid(record, parse_token(wrong), 1)
+    assert token_is_valid(record, parse_token(text), 1)
+
+
+@given(st.text(alphabet=ALPHABET, min_size=12, max_size=12), st.text(alphabet=ALPHABET, min_size=43, max_size=43))
+def test_whatever_has_the_form_is_taken_apart(token_id: str, secret: str) -> None:
+    parsed = parse_token(f"rw_{token_id}_{secret}")
+    assert parsed is not None
+    assert parsed.token_id == token_id
+    assert not token_is_valid(None, parsed, 1)
+
+
+def test_expiry_and_revocation() -> None:
+    record, text = made(days=2)
+    presented = parse_token(text)
+    assert token_is_valid(record, presented, 2 * DAY_NS - 1)
+    assert not token_is_valid(record, presented, 2 * DAY_NS)
+    fields = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
+    assert not token_is_valid(TokenRecord(**{**fields, "revoked_ns": 1}), presented, 1)
+    # The right secret under another token's name.
+    assert not token_is_valid(TokenRecord(**{**fields, "token_id": "0" * 12}), presented, 1)
+
+
+@pytest.mark.parametrize("name", ["", " x", "x ", "a\nb", "x" * 65, ANONYMOUS, "rw_0123456789AB_x"])
+def test_names_that_mean_nobody_are_refused(name: str) -> None:
+    with pytest.raises(MachineFileError, match="name is"):
+        made(name)
+
+
+def test_scopes_and_days_are_checked() -> None:
+    with pytest.raises(MachineFileError, match="read, operate, configure"):
+        new_token("ops", [], now_ns=0)
+    for days in (0, -1, 3651):
+        with pytest.raises(MachineFileError, match=f"days is {days}"):
+            made(days=days)
+    assert new_token("ops", [Scope.OPERATE, Scope.READ, Scope.READ], now_ns=0)[0].scopes == ("read", "operate")
+
+
+@given(st.text(alphabet=" /?&=é\n"), st.text(alphabet=" /?&=é\n_"), st.integers(1, 43))
+def test_secrets_are_hidden_wherever_they_stand_and_if_they_are_cut_off(before: str, after: str, length: int) -> None:
+    text = made()[1]
+    assert masked(f"{before}{text[: 16 + length]}{after}") == f"{before}{text[:16]}…{after}"
+
+
+# Rates
+
+
+@given(st.integers(1, 5), st.lists(st.tuples(st.sampled_from("ab"), st.floats(0.0, 40.0)), max_size=60))
+def test_never_more_than_so_many_in_any_minute(amount: int, hits: list[tuple[str, float]]) -> None:
+    now_s = 0.0
+    window = MovingWindow(amount, clock=lambda: now_s)
+    admitted: dict[str, list[float]] = {"a": [], "b": []}
+    for key, pause_s in hits:
+        now_s += pause_s
+        recent = [one for one in admitted[key] if one > now_s - 60.0]
+        assert (window.wait(key) == 0.0) == (len(recent) < amount)
+        wait_s = window.hit(key)
+        if wait_s == 0.0:
+            admitted[key].append(now_s)
+        else:
+            assert wait_s == recent[0] + 60.0 - now_s
+        assert (wait_s == 0.0) == (len(recent) < amount)
+
+
+def test_many_addresses_do_not_fill_the_memory() -> None:
+    window = MovingWindow(1, clock=lambda: 0.0, keys=100)
+    for number in range(1000):
+        window.hit(str(number))
+    assert len(window) == 100
+    assert window.wait("999") == 60.0
+
+
+def test_what_is_over_is_forgotten() -> None:
+    now_s = 0.0
+    window = MovingWindow(1, clock=lambda: now_s)
+    window.hit("a")
+    now_s = 60.0
+    assert window.wait("a") == 0.0
+    assert len(window) == 0
+
+
+def test_seats_come_back_after_an_error() -> None:
+    seats = StreamSeats(1, 2)
+    with pytest.raises(RuntimeError, match="broken"), seats.seat("a"):
+        raise RuntimeError("broken")
+    assert seats.taken == 0
+    with seats.seat("a"), seats.seat("b"):
+        with pytest.raises(TooManyStreamsError, match="of yours"), seats.seat("a"):
+            pass
+        with pytest.raises(TooManyStreamsError, match="this service has"), seats.seat("c"):
+            pass
+        assert seats.taken == 2
+    assert seats.taken == 0
+
+
+@pytest.mark.parametrize(
+    ("address", "network"),
+    [
+        ("10.0.0.1", "10.0.0.1"),
+        ("::ffff:10.0.0.1", "10.0.0.1"),
+        ("2001:db8:1:2:3:4:5:6", "2001:db8:1:2::/64"),
+        ("2001:db8:1:2::9", "2001:db8:1:2::/64"),
+        ("fe80::1%eth0", "fe80::/64"),
+        ("", ""),
+        ("unix", "unix"),
+    ],
+)
+def test_what_counts_as_one_address(address: str, network: str) -> None:
+    assert network_of(address) == network
+
+
+# Settings
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "10.0.0.1", "monitor.plant", ""])  # noqa: S104  # refused
+def test_open_to_all_only_on_loopback(host: str) -> None:
+    access = AccessSettings(open_on_loopback=True)
+    with pytest.raises(MachineFileError, match=r"plant\.toml: access\.open_on_loopback is true, but http\.host"):
+        check_access("plant.toml", access, host)
+    check_access("plant.toml", AccessSettings(), host)
+
+
+def test_open_on_loopback_stands() -> None:
+    for host in ("127.0.0.1", "127.1.2.3", "::1", "localhost"):
+        check_access("plant.toml", AccessSettings(open_on_loopback=True), host)
+    with pytest.raises(MachineFileError, match=r"access\.proxies names 10\.0\.0\.1"):
+        check_access("plant.toml", AccessSettings(open_on_loopback=True, proxies=("10.0.0.1",)), "127.0.0.1")
+
+
+def test_settings_refuse_what_they_do_not_know() -> None:
+    for fields in ({"open": True}, {"proxies": ["proxy.plant"]}, {"limits": {"body_bytes": 1}}, {"tls": {"key": "k"}}):
+        with pytest.raises(ValueError, match="validation error"):
+            AccessSettings.model_validate(fields)
+
+
+def test_certificates_are_beside_the_settings_file() -> None:
+    tls = TlsSettings(certificate=Path("c.pem"), key=Path("/keys/k.pem"), client_ca=Path("ca.pem"))
+    found = AccessSettings(tls=tls).beside(Path("/etc/rotorwatch")).tls
+    assert found == TlsSettings(
+        certificate=Path("/etc/rotorwatch/c.pem"), key=Path("/keys/k.pem"), client_ca=Path("/etc/rotorwatch/ca.pem")
+    )
+    assert AccessSettings().beside(Path("/x")) == AccessSettings()
