@@ -32,10 +32,10 @@ NO_PARAMETERS = "the machine's parameters are not known, so there is no theory t
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 _HALF_WIDTHS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
 """Edges of panels on either side of a natural frequency, in units of half its half-power bandwidth."""
-_CYCLES = 0.8
+_CYCLES = 1.2
 """Most periods of the longest lag in one panel."""
 _GROWTH = 0.05
-_OVER_BAND = 6.0
+_OVER_BAND = 4.0
 
 
 @dataclass(frozen=True, slots=True)
