@@ -10,14 +10,14 @@ of feeding it, and the same blocks give the same reports. What it remembers can 
 into another one, which goes on as if nothing had happened.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
-from models.arrivals import Arrivals
 
 from models.alarm_names import CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST, data_alarm
+from models.arrivals import Arrivals
 from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
 from models.commissioning.installed import Installed
 from models.diagnosis.moments import HopMoments, plan_for
@@ -42,6 +42,7 @@ from service.residuals import Evaluation, evaluator_for
 __all__ = ["MachineMonitor"]
 
 _RPM = 30 / np.pi
+_NEWEST_SAMPLES = 20_000
 
 
 class MachineMonitor:
@@ -68,6 +69,9 @@ class MachineMonitor:
         self._refused: Counter[str] = Counter()
         self._latest: WindowReport | None = None
         self._end_ns: int | None = None
+        self._statistics: WindowStatistics | None = None
+        self._newest: deque[SampleBlock] = deque()
+        self._newest_samples = 0
 
     def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> tuple[MonitorReport, ...]:
         """Decode a message of the stream and take what is in order now as `step` does.
@@ -109,6 +113,7 @@ class MachineMonitor:
             return MonitorReport(verdict)
         if not verdict.continuous:
             self._window.gap()
+        self._keep(block, continuous=verdict.continuous and not verdict.clock_step_s)
         if verdict.clock_step_s:
             self._window.clear()
             self._test.clear()
@@ -140,6 +145,16 @@ class MachineMonitor:
     def end_ns(self) -> int | None:
         """End of the newest data; None before the first."""
         return self._end_ns
+
+    @property
+    def window(self) -> WindowStatistics | None:
+        """The window of the latest report; None if it was not full."""
+        return self._statistics
+
+    @property
+    def blocks(self) -> tuple[SampleBlock, ...]:
+        """The newest blocks, without a gap, about 20 000 samples at most."""
+        return tuple(self._newest)
 
     @property
     def next_sequence(self) -> int:
@@ -210,6 +225,16 @@ class MachineMonitor:
             self._alarms.next_sequence - 1,
         )
 
+    def _keep(self, block: SampleBlock, *, continuous: bool) -> None:
+        """Hold the newest blocks for whoever wants to see samples."""
+        if not continuous:
+            self._newest.clear()
+            self._newest_samples = 0
+        self._newest.append(block)
+        self._newest_samples += block.samples.shape[0]
+        while self._newest_samples - self._newest[0].samples.shape[0] >= _NEWEST_SAMPLES:
+            self._newest_samples -= self._newest.popleft().samples.shape[0]
+
     def _count(self, verdict: Verdict) -> Verdict:
         quality = self._quality
         if verdict.reason is not None:
@@ -266,7 +291,7 @@ class MachineMonitor:
         """Evaluate the window as it is after a completed hop."""
         filled = self._window.filled
         events = self._alarms.update_state(GAP, False, end_ns) + self._alarms.update_state(CLOCK, False, end_ns)
-        statistics = self._window.statistics()
+        statistics = self._statistics = self._window.statistics()
         if statistics is None:
             report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
             self._latest = report

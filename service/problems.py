@@ -4,39 +4,87 @@ from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
-from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.logs import logger
 from service.schemas import Problem, example
+from service.store.errors import StoreError
 
 __all__ = ["add_problems", "problem_answer", "problem_responses", "responses"]
 
 _PROBLEM = "application/problem+json"
+_ANYWHERE = (429, 500)
+_GUARDED = (401, 403, 503)
+_HEADERS: dict[int, dict[str, Any]] = {
+    401: {"WWW-Authenticate": {"description": "how to show who you are", "schema": {"type": "string"}}},
+    429: {"Retry-After": {"description": "seconds to wait", "schema": {"type": "integer"}}},
+}
+_DETAILS = {
+    400: "There was an error parsing the body",
+    401: "a valid access token is needed, as header Authorization: Bearer rw_…",
+    403: "this needs the scope operate; screen has read",
+    409: "k_by is acknowledged (version 18), not as it was seen (version 17): look again",
+    413: "the request body is too large, expected at most 1000000 bytes",
+    415: "content type is text/plain, expected application/json",
+    422: "limit: Input should be less than or equal to 1000",
+    428: "say how you saw the alarm: header If-Match with its ETag, or expected_state in the body",
+    429: "more than 600 requests in a minute; try again in 3 s",
+    500: "an error inside the service; its log says more",
+    503: "demo/lab: busy for 10 s; nothing was done",
+}
 _log = logger(part="api")
 
 
-def responses(model: type[BaseModel], *problems: int, status_code: int = 200) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries: an example of the answer, and the problems a request may meet."""
-    shown_answer = {"content": {"application/json": {"example": example(model)}}}
-    found: dict[int | str, dict[str, Any]] = {status_code: shown_answer, **problem_responses(*problems)}
-    return found
+def responses(
+    model: type[BaseModel],
+    *problems: int,
+    status_code: int = 200,
+    guarded: bool = True,
+    shown: object = None,
+    headers: dict[str, Any] | None = None,
+) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries: an example of the answer, and the problems a request may meet.
+
+    Parameters
+    ----------
+    model : type
+        Of the answer.
+    *problems : int
+        Besides those that any request may meet.
+    status_code : int
+        Of the answer.
+    guarded : bool
+        Whether a token is needed.
+    shown : object, optional
+        Example, if not the one made of the examples of the model's fields.
+    headers : dict, optional
+        Of the answer, as OpenAPI has them.
+    """
+    answer: dict[str, Any] = {"content": {"application/json": {"example": example(model) if shown is None else shown}}}
+    if headers is not None:
+        answer["headers"] = headers
+    return {status_code: answer, **problem_responses(*problems, guarded=guarded)}
 
 
-def problem_responses(*problems: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI entries of the problems a request may meet."""
+def problem_responses(*problems: int, guarded: bool = True) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI entries of the problems a request may meet, those that any request may meet included."""
     found: dict[int | str, dict[str, Any]] = {}
-    for status in (*problems, 500):
+    for status in sorted({*problems, *_ANYWHERE, *(_GUARDED if guarded else ())}):
         phrase = HTTPStatus(status).phrase
-        shown = {**example(Problem), "title": phrase, "status": status}
+        shown: dict[str, Any] = {**example(Problem), "title": phrase, "status": status}
+        if status in _DETAILS:
+            shown["detail"] = _DETAILS[status]
         found[status] = {
             "description": phrase,
             "content": {_PROBLEM: {"schema": Problem.model_json_schema(), "example": shown}},
         }
+        if status in _HEADERS:
+            found[status]["headers"] = _HEADERS[status]
     return found
 
 
@@ -63,20 +111,47 @@ def add_problems(app: FastAPI) -> None:
         detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
         return problem_answer(request, 422, detail, {"errors": faults})
 
-    async def guard(request: Request, call_next: RequestResponseEndpoint) -> Response:
-        # A handler for Exception would let it through to the server after answering, which then drops the connection.
-        try:
-            return await call_next(request)
-        except Exception:
-            # Nothing narrower: refusals and invalid requests were answered further in, what arrives here is an error
-            # in any code behind any path. Each must be a 500 in problem details that tells nothing of the inside.
-            _log.exception("request failed", path=request.url.path)
-            return problem_answer(request, 500, "an error inside the service; its log says more")
+    async def on_history(request: Request, error: Exception) -> JSONResponse:
+        return problem_answer(request, 503, f"the history cannot be used: {error}")
 
     handlers: dict[type[Exception], Callable[[Request, Exception], Awaitable[JSONResponse]]] = {
         StarletteHTTPException: on_http,
         RequestValidationError: on_invalid,
+        StoreError: on_history,
     }
     for kind, handler in handlers.items():
         app.add_exception_handler(kind, handler)
-    app.add_middleware(BaseHTTPMiddleware, dispatch=guard)
+    app.add_middleware(_LastResort)
+
+
+class _LastResort:
+    """Answers what nobody answered.
+
+    A handler for Exception would let it through to the server after answering, which then drops the connection.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        begun = False
+
+        async def watched(message: Message) -> None:
+            nonlocal begun
+            begun = True
+            await send(message)
+
+        try:
+            await self._app(scope, receive, watched)
+        except Exception:
+            # Nothing narrower: refusals and invalid requests were answered further in, what arrives here is an error
+            # in any code behind any path. Each must be a 500 in problem details that tells nothing of the inside.
+            request = Request(scope, receive)
+            _log.exception("request failed", path=request.url.path)
+            if begun:
+                raise
+            await problem_answer(request, 500, "an error inside the service; its log says more")(scope, receive, send)

@@ -38,11 +38,13 @@ from service.access.tls import server_arguments
 from service.access_settings import AccessSettings
 from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
+from service.event_feed import EventFeed
 from service.logs import logger
 from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder
 from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
+from service.store.audit import AuditLog
 from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.worker import MachineWorker
@@ -51,6 +53,7 @@ __all__ = ["HttpError", "Runtime", "StopRequest", "running", "stop_request"]
 
 _TICK_S = 0.25
 _JOIN_S = 10.0
+_LAST_ANSWERS_S = 5
 
 _log = logger(part="runtime")
 
@@ -80,6 +83,7 @@ class Runtime:
         self._installed = [install(entry.load(), entry.bundle) for entry in settings.machines]
         self._workers: list[MachineWorker] = []
         self.store = Store(settings.history.database, settings.history.retention)
+        self.feed = EventFeed()
         directory = settings.recording.directory
         self.catalogue = None if directory is None else Catalogue(Path(directory))
         self.replays = ReplayDesk(settings, self.catalogue)
@@ -94,6 +98,11 @@ class Runtime:
         if self._server is None:
             raise HttpError("the HTTP API is not started")
         return self._server.url
+
+    @property
+    def audit(self) -> AuditLog:
+        """Who asked for what."""
+        return self.store.audit
 
     def machines(self) -> tuple[MachineWorker, ...]:
         """Every monitored machine."""
@@ -149,14 +158,15 @@ class Runtime:
             for installed in self._installed:
                 machine = installed.machine
                 history = self.store.machine(machine.site, machine.name)
-                self._workers.append(MachineWorker(installed, self.settings.queue, history))
+                self._workers.append(MachineWorker(installed, self.settings.queue, history, on_events=self.feed.wake))
             for worker in self._workers:
                 self._record(worker.machine, self._link, undo)
                 links.append(self._connect(worker, self._link, undo))
-            supervisor = _Supervisor(list(zip(self._workers, links, strict=True)))
+            supervisor = _Supervisor(list(zip(self._workers, links, strict=True)), self.feed)
             undo.callback(supervisor.stop)
             supervisor.start()
             undo.callback(self.replays.close)
+            undo.callback(self.feed.close)
             self._server = server
             server.start(create_app(self, guard))
             self._undo = undo.pop_all()
@@ -266,8 +276,9 @@ def stop_request() -> Iterator[StopRequest]:
 class _Supervisor:
     """Publishes health when it has changed, silence included."""
 
-    def __init__(self, watched: list[tuple[MachineWorker, MachineLink]]) -> None:
+    def __init__(self, watched: list[tuple[MachineWorker, MachineLink]], feed: EventFeed) -> None:
         self._watched = watched
+        self._feed = feed
         self._stop = threading.Event()
         self._published: dict[int, Health] = {}
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
@@ -302,6 +313,7 @@ class _Supervisor:
             return
         self._published[number] = health
         link.publish_health(health.model_dump_json())
+        self._feed.health(health)
         if before is None or before.state != health.state:
             _log.info("state", machine=f"{health.site}/{health.machine}", state=health.state.value, why=health.reason)
 
@@ -335,7 +347,14 @@ class _HttpServer:
 
     def start(self, app: FastAPI) -> None:
         """Serve the API."""
-        config = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", **self._arguments)
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            timeout_graceful_shutdown=_LAST_ANSWERS_S,  # for whoever has stopped reading
+            **self._arguments,
+        )
         server = self._server = uvicorn.Server(config)
         self._thread = threading.Thread(target=server.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True)
         self._thread.start()

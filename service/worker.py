@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from models.commissioning.installed import Installed
-from models.errors import RotorwatchError
 from service import conversion
 from service.alarm_conversion import Identity, alarm_log_page, alarm_states
 from service.alarm_schemas import AlarmCloudEvent, AlarmStates
 from service.alarms.alarm import AlarmEvent
 from service.alarms.book import NO_ALARMS
-from service.alarms.operation import Operation
+from service.alarms.operation import NotInTime, Operation
 from service.config import QueueSettings
 from service.descriptor import descriptor_mismatch
 from service.inbox import Inbox, RawBlock
@@ -27,18 +26,15 @@ from service.monitor import MachineMonitor
 from service.remembered import checkpoint_step, restored, stored_event, stored_readings, stored_report
 from service.reports import MachineHealth, MonitorReport, WindowReport
 from service.schemas import DetectableChanges, Health, MachineDescription, StreamStatus
+from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.errors import StoreError
 from service.store.machine import MachineStore
 from service.store.records import Step, StoredEvent
 
-__all__ = ["Clocks", "MachineWorker", "NotInTime", "Outlet", "Tally"]
+__all__ = ["Clocks", "MachineWorker", "Outlet", "Tally"]
 
 _OPERATION_S = 10.0
 _LATEST = 100
-
-
-class NotInTime(RotorwatchError):  # noqa: N818  # said to an operator, by its name
-    """The machine's thread did not get round to what was asked; whether it will be done is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +125,8 @@ class MachineWorker:
             bundle=installed.identity,
             machine_hash=conversion.machine_hash(machine),
         )
+        self.snapshots = SnapshotDesk(installed, self.identity)
+        self.latest = LatestData()
         self.errors = 0
         self.last_error = ""
         self.tally = Tally()
@@ -369,6 +367,7 @@ class MachineWorker:
     def _conclude(self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...]) -> tuple[str, ...]:
         """Commit, then publish; returns the events as they are published."""
         self._snapshot = self._monitor.health()
+        self.latest = self._held()
         if not windows and not events:
             return ()
         recorded_ns = self._clocks.utc_ns()
@@ -400,6 +399,17 @@ class MachineWorker:
         if events:
             self._on_events()
         return tuple(one.text for one in told)
+
+    def _held(self) -> LatestData:
+        """What the monitor holds, for snapshots."""
+        latest, monitor = self._snapshot.latest, self._monitor
+        return LatestData(
+            window=monitor.window,
+            filled=self._snapshot.filled,
+            parameters=() if latest is None else latest.parameters,
+            why_not="" if latest is None else latest.reason,
+            blocks=monitor.blocks,
+        )
 
     def _publish(self, reports: Iterable[str], events: Iterable[str]) -> None:
         outlet = self._outlet

@@ -7,7 +7,15 @@ from models.errors import RotorwatchError
 from service.alarms.alarm import EventKind
 from service.alarms.life_cycle import Happening
 
-__all__ = ["HAPPENINGS", "Operation", "OperationConflict", "OperationKind", "OperationRefused", "UnknownAlarm"]
+__all__ = [
+    "HAPPENINGS",
+    "NotInTime",
+    "Operation",
+    "OperationConflict",
+    "OperationKind",
+    "OperationRefused",
+    "UnknownAlarm",
+]
 
 OperationKind = Literal["acknowledge", "reset", "shelve", "unshelve", "remove-from-service", "return-to-service"]
 
@@ -32,6 +40,10 @@ class OperationRefused(RotorwatchError):  # noqa: N818
 
 class OperationConflict(RotorwatchError):  # noqa: N818
     """The alarm is no longer as the operator saw it; the message says how it is."""
+
+
+class NotInTime(RotorwatchError):  # noqa: N818
+    """The machine's thread did not get round to what was asked; whether it will be done is not known."""
 
 
 @dataclass(frozen=True, slots=True)
