@@ -32,7 +32,7 @@ LEFT_OUT_BINS = 3
 """Lines on either side of the rotation that are not compared: what is left of 1× there is not stochastic."""
 _GROUPS = 150
 _HELD = 1e9
-_STEPS, _NEAR, _GAIN = 60, 0.15, 6.0
+_STEPS, _NEAR, _GAIN = 60, 0.15, 3.0
 _SMOOTH = 2000.0
 """The search begins with forces of one colour, and the window says how far they differ."""
 
