@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import BigInteger, Select, cast, func, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from service.store.database import Database
@@ -160,11 +160,11 @@ def _of_buckets(series_ids: list[int], grid: _Grid, since_ns: int | None) -> Sel
         select(
             stored.series_id,
             ((stored.start_ns - grid.start_ns) // grid.length_ns).label("place"),
-            func.sum(stored["count"]),
+            cast(func.sum(stored["count"]), BigInteger),
             func.min(stored.minimum),
             func.max(stored.maximum),
             func.sum(stored.total),
-            func.sum(stored.errors),
+            cast(func.sum(stored.errors), BigInteger),
             func.sum(stored.errors_total),
         )
         .where(

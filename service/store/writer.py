@@ -11,6 +11,7 @@ from pathlib import Path
 import structlog
 from sqlalchemy import select, text, update
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from service.store.backlog import Backlog, PackedReport
@@ -169,9 +170,10 @@ class Writer:
         """Write one transaction; say whether the database has taken it."""
         try:
             refused = await self._commit(ready)
-        except (SQLAlchemyError, OSError, TimeoutError) as error:
+        except Exception as error:
+            # Nothing narrower: whatever a driver raises, this task must go on, or no machine would be written again.
             await self._disconnect(broken=True)
-            if len(ready) > 1 and isinstance(error, DBAPIError) and not _is_operational(error):
+            if len(ready) > 1 and not _is_operational(error):
                 # The database is well, one machine's step is not: the others shall not wait for it.
                 return all([await self._write([claim]) for claim in ready])
             self._fail(ready, str(self._database.failure(error)))
@@ -242,8 +244,11 @@ class Writer:
             await connection.close()
 
 
-def _is_operational(error: DBAPIError) -> bool:
-    return error.connection_invalidated or isinstance(error, (OperationalError, InterfaceError, InternalError))
+def _is_operational(error: Exception) -> bool:
+    """Whether the database is at fault, and not what was to be written."""
+    if isinstance(error, DBAPIError) and error.connection_invalidated:
+        return True
+    return isinstance(error, (OperationalError, InterfaceError, InternalError, PoolTimeoutError, OSError))
 
 
 async def _lock_row(connection: AsyncConnection, machine_id: int) -> bool:

@@ -1,18 +1,27 @@
-"""A real PostgreSQL for the tests, in a temporary folder, reached over a socket in it."""
+"""A real PostgreSQL for the tests, in a temporary folder, reached over a socket in it.
 
+`database_url` is for tests that run on both databases; one server is started for all of them.
+"""
+
+import atexit
+import functools
 import os
 import pwd
 import shutil
 import subprocess
 import tempfile
+import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["USER", "PostgresServer", "missing", "postgres_server"]
+import pytest
+
+__all__ = ["KINDS", "USER", "PostgresServer", "database_url", "missing", "postgres_server"]
 
 USER = "rotorwatch"
+KINDS = ("sqlite", "postgresql")
 _INSTALLED = Path("/usr/lib/postgresql")
 
 
@@ -91,6 +100,22 @@ def postgres_server() -> Iterator[PostgresServer]:
             server.stop()
 
 
+def database_url(kind: str, folder: Path) -> str:
+    """Address of an empty database of one of `KINDS`; skips the test, with the reason, if there is no server."""
+    if kind == "sqlite":
+        return f"sqlite:///{folder / 'history.sqlite'}"
+    if missing():
+        pytest.skip(missing())
+    return _shared_server().new_database(f"history_{uuid.uuid4().hex}")
+
+
+@functools.cache
+def _shared_server() -> PostgresServer:
+    stack = ExitStack()
+    atexit.register(stack.close)
+    return stack.enter_context(postgres_server())
+
+
 def _account() -> str | None:
     try:
         return pwd.getpwnam("postgres").pw_name
@@ -102,5 +127,7 @@ def _program(name: str) -> Path | None:
     found = shutil.which(name)
     if found is not None:
         return Path(found)
-    places = sorted(_INSTALLED.glob(f"*/bin/{name}"), key=lambda path: int(path.parts[-3]) if path.parts[-3].isdigit() else 0)
+    places = sorted(
+        _INSTALLED.glob(f"*/bin/{name}"), key=lambda path: int(path.parts[-3]) if path.parts[-3].isdigit() else 0
+    )
     return places[-1] if places else None

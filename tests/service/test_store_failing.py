@@ -1,0 +1,226 @@
+"""The database fails and comes back: nothing is lost, nothing is there twice, the order is kept."""
+
+import select
+import socket
+import socketserver
+import sqlite3
+import tempfile
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from service.store.errors import StoreError
+from service.store.records import Step
+from service.store.retention import Retention
+from service.store.store import Store
+from tests.service.live import until
+from tests.service.postgres import KINDS, USER, PostgresServer, missing, postgres_server
+from tests.service.test_store import T0, alarm_event, head, hop_step
+
+QUICK_S = 0.3
+
+
+Parts = tuple[str, Callable[[], None], Callable[[], None]]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PostgresServer]:
+    """A server that may be stopped: other tests have theirs."""
+    if missing():
+        pytest.skip(missing())
+    with postgres_server() as made:
+        yield made
+
+
+@pytest.fixture(params=KINDS)
+def parts(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Parts]:
+    """A database, what makes it fail, and what brings it back."""
+    if request.param == "postgresql":
+        server: PostgresServer = request.getfixturevalue("server")
+        yield server.new_database(f"history_{uuid.uuid4().hex}"), server.stop, server.start
+        return
+    file = tmp_path / "history.sqlite"
+    blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
+    try:
+        yield f"sqlite:///{file}", lambda: void(blocker, "BEGIN IMMEDIATE"), lambda: void(blocker, "ROLLBACK")
+    finally:
+        blocker.close()
+
+
+def void(connection: sqlite3.Connection, statement: str) -> None:
+    connection.execute(statement)
+
+
+@contextmanager
+def opened(url: str, **changes: float) -> Iterator[Store]:
+    store = Store(url, Retention(), timeout_s=QUICK_S, retry_s=0.05, **changes)  # type: ignore[arg-type]  # numbers
+    store.open()
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def test_nothing_is_lost_while_the_database_is_away(
+    parts: Parts,
+) -> None:
+    url, fail, mend = parts
+    with opened(url) as store:
+        lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
+        for number in range(3):
+            assert lab.commit(hop_step(number, events=(alarm_event(number),)))
+        assert store.trouble == ""
+        fail()
+        for number in range(3, 40):
+            assert not lab.commit(hop_step(number, events=(alarm_event(number),)))
+            assert not pump.commit(hop_step(number, events=(alarm_event(number - 3),)))
+        assert store.trouble != ""
+        assert (lab.waiting, lab.last_sequence()) == (37, 39)
+        mend()
+        until(lambda: lab.waiting == pump.waiting == 0, "recovery")
+        assert store.trouble == ""
+        assert lab.commit(hop_step(40, events=(alarm_event(40),)))
+        assert [event.sequence for event in lab.events()] == list(range(41))
+        assert [event.sequence for event in pump.events()] == list(range(37))
+        assert [report.text for _, report in lab.reports()] == [f'{{"number": {n}}}' for n in range(40, -1, -1)]
+        assert [round(each.value / 0.1) for _, each in lab.readings(quantity="parameter", name="k_by")] == list(
+            range(41)
+        )
+        restored = lab.restore()
+        assert restored is not None
+        assert restored.head == head(T0 + 40 * 5_000_000_000)
+        assert [hop for _, hop in restored.hops] == [b"hop 38", b"hop 39", b"hop 40"]
+
+
+def test_what_waits_is_bounded_and_events_are_never_dropped(
+    parts: Parts,
+) -> None:
+    url, fail, mend = parts
+    with opened(url, waiting_reports=5) as store:
+        lab = store.machine("demo", "lab")
+        assert lab.commit(hop_step(0, events=(alarm_event(0),)))
+        fail()
+        for number in range(1, 60):
+            assert not lab.commit(hop_step(number, events=(alarm_event(number),)))
+        mend()
+        until(lambda: lab.waiting == 0, "recovery")
+        assert [event.sequence for event in lab.events()] == list(range(60))
+        # The step that was tried first is kept as it was; then the newest five.
+        assert [report.text for _, report in lab.reports()] == [
+            f'{{"number": {n}}}' for n in (59, 58, 57, 56, 55, 1, 0)
+        ]  # fmt: skip
+        restored = lab.restore()
+        assert restored is not None
+        assert [hop for _, hop in restored.hops] == [b"hop 57", b"hop 58", b"hop 59"]
+
+
+def test_what_waits_is_written_at_closing(parts: Parts) -> None:
+    url, fail, mend = parts
+    store = Store(url, Retention(), timeout_s=QUICK_S, retry_s=3600.0)
+    store.open()
+    lab = store.machine("demo", "lab")
+    fail()
+    assert not lab.commit(Step(events=(alarm_event(0),)))
+    assert not lab.commit(Step(events=(alarm_event(1),)))
+    mend()
+    store.close()
+    with opened(url) as store:
+        assert store.machine("demo", "lab").last_sequence() == 1
+
+
+def test_one_machine_whose_step_fails_does_not_hold_up_the_others(tmp_path: Path) -> None:
+    with opened(f"sqlite:///{tmp_path}/history.sqlite") as store:
+        lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
+        # Something that only the database notices: the number of a step in the database that is no number any more.
+        with sqlite3.connect(tmp_path / "history.sqlite") as connection:
+            connection.execute("UPDATE machines SET reports = 'many' WHERE name = 'lab'")
+        connection.close()
+        assert not lab.commit(hop_step(0, events=(alarm_event(0),)))
+        pump.commit(hop_step(0, events=(alarm_event(0),)))
+        until(lambda: pump.waiting == 0, "the other machine's step")
+        assert len(pump.events()) == 1
+        assert store.trouble != ""
+        assert lab.waiting == 1
+        with sqlite3.connect(tmp_path / "history.sqlite") as connection:
+            connection.execute("UPDATE machines SET reports = 0 WHERE name = 'lab'")
+        connection.close()
+        until(lambda: lab.waiting == 0, "the step")
+        assert len(lab.events()) == len(lab.reports()) == 1
+
+
+class LosingProxy(socketserver.ThreadingUnixStreamServer):
+    """Stands before a server's socket and, when told, swallows the answer to a commit and hangs up."""
+
+    def __init__(self, server: PostgresServer, folder: Path) -> None:
+        super().__init__(str(folder / ".s.PGSQL.5432"), _Relay)
+        self.target = str(server.folder / ".s.PGSQL.5432")
+        self.armed = threading.Event()
+        self.swallowed = 0
+
+
+class _Relay(socketserver.BaseRequestHandler):
+    server: LosingProxy
+
+    def handle(self) -> None:
+        client: socket.socket = self.request
+        losing = False
+        with socket.socket(socket.AF_UNIX) as target:
+            target.connect(self.server.target)
+            while True:
+                for source in select.select([client, target], [], [])[0]:
+                    data = source.recv(65536)
+                    if source is target and losing:
+                        assert b"COMMIT" in data  # the server has done it
+                        self.server.armed.clear()
+                        self.server.swallowed += 1
+                        return
+                    if not data:
+                        return
+                    losing |= source is client and b"COMMIT" in data and self.server.armed.is_set()
+                    (target if source is client else client).sendall(data)
+
+
+@contextmanager
+def losing_proxy(server: PostgresServer) -> Iterator[tuple[LosingProxy, str]]:
+    """A running proxy and the folder of its socket."""
+    # Not below pytest's folders: the path of a socket may have a hundred letters.
+    with tempfile.TemporaryDirectory(prefix="pg-") as folder, LosingProxy(server, Path(folder)) as proxy:
+        thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield proxy, folder
+        finally:
+            proxy.shutdown()
+            thread.join()
+
+
+def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServer) -> None:
+    name = f"history_{uuid.uuid4().hex}"
+    server.new_database(name)
+    with losing_proxy(server) as (proxy, folder), opened(f"postgresql://{USER}@/{name}?host={folder}") as store:
+        lab = store.machine("demo", "lab")
+        for number in range(20):
+            if number % 3 == 1:
+                proxy.armed.set()
+            lab.commit(hop_step(number, events=(alarm_event(number),)))
+            until(lambda: lab.waiting == 0, "the step")
+        assert proxy.swallowed == 7
+        assert [event.sequence for event in lab.events()] == list(range(20))
+        assert [report.text for _, report in lab.reports()] == [f'{{"number": {n}}}' for n in range(19, -1, -1)]
+        assert len(lab.readings(quantity="misfit", name="z")) == 20
+
+
+def test_locks_are_taken_again_after_the_database_was_away(parts: Parts) -> None:
+    url, fail, mend = parts
+    with opened(url) as store:
+        lab = store.machine("demo", "lab")
+        fail()
+        assert not lab.commit(Step(events=(alarm_event(0),)))
+        mend()
+        until(lambda: lab.waiting == 0, "recovery")
+        with opened(url) as other, pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
+            other.machine("demo", "lab")

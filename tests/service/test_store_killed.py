@@ -1,0 +1,48 @@
+"""kill -9 of a process that writes: whole steps only, no event twice, and what was called durable is there."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.store.retention import Retention
+from service.store.store import Store
+from tests.service.live import program
+from tests.service.postgres import KINDS, database_url
+
+ROUNDS = 4
+
+
+@pytest.fixture(params=KINDS)
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    return database_url(request.param, tmp_path)
+
+
+def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    safe = -1
+    for _ in range(ROUNDS):
+        with program(tmp_path, "tests.service.test_store", url) as writer:
+            writer.wait_for(f"{safe + 3}\n")
+            time.sleep(rng.uniform(0.0, 0.05))  # at any moment of a transaction
+            writer.kill()
+            safe = int(writer.output().rsplit("\n", 2)[-2])
+        store = Store(url, Retention())
+        store.open()  # the dead process has let go of the machine
+        try:
+            lab = store.machine("demo", "lab")
+            last = lab.last_sequence()
+            steps = (last + 1) // 2
+            assert last % 2 == 1  # both events of a step or none
+            assert steps - 2 <= safe < steps  # what was called durable, and at most the step in mid-write
+            assert [event.id for event in lab.events(limit=10_000)] == [f"event-{n}" for n in range(last + 1)]
+            texts = [report.text for _, report in lab.reports(limit=10_000)]
+            assert texts == [f'{{"number": {n}}}' for n in range(steps - 1, -1, -1)]
+            assert len(lab.readings(quantity="misfit", name="z", limit=10_000)) == steps
+            restored = lab.restore()
+            assert restored is not None
+            assert [hop for _, hop in restored.hops] == [b"hop %d" % n for n in range(steps - 3, steps)]
+            safe = steps - 1
+        finally:
+            store.close()
