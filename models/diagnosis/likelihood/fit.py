@@ -90,7 +90,7 @@ class LikelihoodFit:
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next windows' readings depend on, as named arrays."""
-        found = {
+        found: dict[str, np.ndarray] = {
             "last": np.array([] if self._last is None else self._last, dtype=np.float64),
             "strength": np.array([] if self._strength is None else [self._strength], dtype=np.float64),
             "followed": np.array([self._line_segments, self._followed], dtype=np.int64),

@@ -129,12 +129,15 @@ class Linearised:
         theta = checked(arrays, "searched", np.float64, size)
         of_searched, of_point, of_slopes = checked(arrays, "speeds_rad_s", np.float64, (3,)).tolist()
         levels = checked(arrays, "point_levels", np.float64, (6, 6))
+        point = checked(arrays, "point", np.float64, size)
+        if not (np.all(np.isfinite(theta)) and np.all(np.isfinite(point)) and np.all(np.isfinite(levels))):
+            raise np.linalg.LinAlgError("a point that is not finite")
         at_slopes = model.at(theta, of_slopes)
         return cls(
             model,
             weights,
             model.at(theta, of_searched),
-            model.at(checked(arrays, "point", np.float64, size), of_point, levels),
+            model.at(point, of_point, levels),
             Derivatives(
                 model.slopes(at_slopes, inverse_factor(at_slopes.S)),
                 checked(arrays, "information", np.float64, size * 2),

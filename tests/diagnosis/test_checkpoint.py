@@ -1,0 +1,362 @@
+"""What a monitor remembers, stored as bytes at any block and restored: everything goes on to the last bit."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays_of
+
+from models.checkpoint import checked, from_bytes, prefixed, to_bytes, unprefixed
+from models.commissioning.installed import install
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.following import Linearised
+from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.moments import HopMoments, plan_for
+from models.diagnosis.verdict.sequential import Finding, SequentialState
+from models.diagnosis.verdict.stretch import Stretch
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.errors import CheckpointError
+from models.ingest import Gate, Reason, Verdict
+from models.physics.parameters import PARAMETERS
+from models.signals.block import SampleBlock
+from service.monitor import MachineMonitor
+from service.reports import MonitorReport
+from simulator.scenario import Event
+from tests.service.live import LAB, scenario_blocks
+
+FAULT_S, DURATION_S = 78.0, 106.0
+WITHOUT_ANGLE = LAB.model_copy(update={"sensors": tuple(one for one in LAB.sensors if one.name != "theta")})
+MACHINES = {"phase reference": (LAB, "lab"), "no phase reference": (WITHOUT_ANGLE, None)}
+
+
+@lru_cache
+def stream(machine: str) -> tuple[SampleBlock, ...]:
+    """A bearing that loses a quarter of its stiffness, two gaps, and one block twice."""
+    fault = Event(at_s=FAULT_S, parameter="k_by", relative_change=-0.25)
+    columns = len(MACHINES[machine][0].sensors)
+    found = [replace(one, samples=one.samples[:, :columns]) for one in scenario_blocks(DURATION_S, fault)]
+    return (*found[:332], *found[337:700], found[650], *found[700:901], *found[904:])
+
+
+def monitor(machine: str) -> MachineMonitor:
+    return MachineMonitor(install(*MACHINES[machine]))
+
+
+@lru_cache
+def uninterrupted(machine: str) -> tuple[MonitorReport, ...]:
+    running = monitor(machine)
+    return tuple(running.step(block) for block in stream(machine))
+
+
+def renewed(running: MachineMonitor, kept: dict[int, bytes], build: Callable[[], MachineMonitor]) -> MachineMonitor:
+    """Another monitor that knows nothing but bytes; each hop is stored when it is complete."""
+    state = running.state(tuple(kept))
+    kept |= dict(state.new_hops)
+    again = build()
+    again.restore(state.state, [kept[end_ns] for end_ns in state.hops])
+    again.restore_alarms(state.alarms)
+    return again
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str) -> None:
+    """Statistics, readings, verdicts and alarms; stopped in warming, at hops, between them, around gap and fault."""
+    blocks, expected = stream(machine), uninterrupted(machine)
+    rng = np.random.default_rng(11)
+    hops = [number for number, report in enumerate(expected) if report.windows]
+    after_fault = [number for number in hops if blocks[number].start_ns - blocks[0].start_ns > FAULT_S * 1e9]
+    stops = {hops[2] + 1, 335, *(hops[at] + 1 for at in (-9, -7, -1)), *(number + 1 for number in after_fault[:4])}
+    stops |= {int(number) for number in rng.integers(0, len(blocks), 12)}
+    running, kept = monitor(machine), dict[int, bytes]()
+    for number, block in enumerate(blocks):
+        if number in stops:
+            running = renewed(running, kept, lambda: monitor(machine))
+        assert running.step(block) == expected[number], f"block {number}"
+    assert sum(bool(window.parameters) for report in expected for window in report.windows) >= 6
+    last = expected[hops[-1]].windows[-1].verdict
+    assert last is not None
+    assert [finding.name for finding in last.findings] == ["k_by"]
+    assert {report.verdict.reason for report in expected} == {None, "overlap"}
+    assert sum(not report.verdict.continuous for report in expected) == 3  # two gaps, one repetition
+
+
+@pytest.mark.parametrize("forgotten", ["line/searched", "last"])
+def test_what_the_likelihood_remembers_matters(forgotten: str) -> None:
+    """The test above would notice: from another maximum the next readings differ in their last digits at least."""
+    machine = "no phase reference"
+    blocks, expected = stream(machine), uninterrupted(machine)
+    evaluated = [number for number, report in enumerate(expected) if any(one.parameters for one in report.windows)]
+    running = monitor(machine)
+    for block in blocks[: evaluated[1] + 1]:
+        running.step(block)
+    state = running.state()
+    arrays = from_bytes(state.state)
+    name = f"evaluator/likelihood/window/{forgotten}"
+    if forgotten == "last":  # cold: nothing to start from, nothing to follow
+        arrays = {key: array for key, array in arrays.items() if "/window/line" not in key and key[-7:] != "/states"}
+        arrays[name] = np.empty(0)
+    else:
+        arrays[name] = arrays[name] * (1 + 1e-9)
+    again = monitor(machine)
+    again.restore(to_bytes(arrays), [data for _, data in state.new_hops])
+    again.restore_alarms(state.alarms)
+    reports = [again.step(block) for block in blocks[evaluated[1] + 1 : evaluated[2] + 1]]
+    (now,), (then,) = reports[-1].windows, expected[evaluated[2]].windows
+    assert now.parameters != then.parameters
+    for one, other in zip(now.parameters, then.parameters, strict=True):
+        if one.change is not None:
+            assert other.change is not None
+            assert other.standard_error is not None
+            assert abs(one.change - other.change) < other.standard_error
+
+
+@lru_cache
+def windows() -> tuple[WindowStatistics, ...]:
+    """Sixteen windows of a machine whose speed is never quite the same."""
+    plan = plan_for(LAB, lagged=False)
+    window, found, rng = SlidingWindow(plan), list[WindowStatistics](), np.random.default_rng(3)
+    for block in scenario_blocks(138.0, Event(at_s=130.0, parameter="c_bz", relative_change=0.6)):
+        for _ in window.feed(plan.to_si(block.samples), block.start_ns):
+            full = window.statistics()
+            if full is not None:
+                found.append(replace(full, speed_rad_s=full.speed_rad_s * (1 + 1e-4 * rng.standard_normal())))
+    return tuple(found)
+
+
+def test_a_maximum_followed_for_long_goes_on_to_the_last_bit() -> None:
+    """Twelve windows are followed from one search, then one takes its own units: stored after every window."""
+    fit = LikelihoodFit(LAB, follow=True)
+    expected = [fit.diagnose(window) for window in windows()]
+    assert len(expected) == 16
+    running = LikelihoodFit(LAB, follow=True)
+    for window, diagnosis in zip(windows(), expected, strict=True):
+        again = LikelihoodFit(LAB, follow=True)
+        again.restore(from_bytes(to_bytes(running.checkpoint())))
+        found = again.diagnose(window)
+        assert found.parameters == diagnosis.parameters
+        assert_same_bits(found.full_covariance, diagnosis.full_covariance)
+        assert found.misfit_z == diagnosis.misfit_z
+        assert (found.suspect, found.steps) == (diagnosis.suspect, diagnosis.steps)
+        running = again
+
+
+def test_slopes_taken_over_from_another_speed_are_those_of_that_speed() -> None:
+    """A search that stays where it began keeps the slopes of the search before it, at that one's speed."""
+    first, second = windows()[:2]
+    fit = LikelihoodFit(LAB, follow=True)
+    fit.diagnose(first)
+    line = fit._line
+    assert line is not None
+    search = fit._search(line.model, second, second.speed_rad_s, line.weights.strength)
+    found = search.maximise(line.theta, 0, 0.15, 3.0, line.derivatives)
+    assert found.slopes_rad_s == first.speed_rad_s != second.speed_rad_s
+    moved = Linearised.around(line.model, search.weights, found)
+    again = Linearised.restored(line.model, search.weights, from_bytes(to_bytes(moved.checkpoint())))
+    assert_same_bits(again.derivatives.slopes, moved.derivatives.slopes)
+    assert_same_bits(again.derivatives.information, moved.derivatives.information)
+
+
+@lru_cache
+def remembered() -> tuple[dict[str, np.ndarray], tuple[tuple[int, bytes], ...]]:
+    """The arrays and hops of a monitor that follows a maximum."""
+    running = monitor("no phase reference")
+    for block in stream("no phase reference")[:690]:
+        running.step(block)
+    state = running.state()
+    return from_bytes(state.state), state.new_hops
+
+
+def test_a_hop_of_the_rotor_kit_is_small() -> None:
+    running = monitor("phase reference")
+    for block in stream("phase reference")[:130]:
+        running.step(block)
+    state = running.state()
+    assert len(state.new_hops) == 2
+    assert max(len(data) for _, data in state.new_hops) < 400e3
+    assert len(state.state) < 1e6
+
+
+def test_a_state_that_does_not_fit_is_refused_and_changes_nothing() -> None:
+    arrays, hops = remembered()
+    moments = [HopMoments.restored(from_bytes(data)) for _, data in hops]
+    window = unprefixed("window", arrays)
+    empty = SlidingWindow(plan_for(WITHOUT_ANGLE, lagged=False))
+    with pytest.raises(CheckpointError, match=r"the hop from start_ns \d+ to \d+ is missing"):
+        empty.restore(window, moments[1:])
+    with pytest.raises(CheckpointError, match="other channels or settings"):
+        SlidingWindow(plan_for(WITHOUT_ANGLE, lagged=True)).restore(window, moments)
+    with pytest.raises(CheckpointError, match=r"pending has .* expected float64 and \(any, 9\)"):
+        SlidingWindow(plan_for(LAB, lagged=False)).restore(window, moments)
+    with pytest.raises(CheckpointError, match="level is missing"):
+        empty.restore({name: array for name, array in window.items() if name != "level"}, moments)
+    assert empty.hops == ()
+    empty.restore(window, [*moments, *moments])
+    assert len(empty.hops) == len(moments) == 12
+    likelihood = unprefixed("evaluator/likelihood", arrays)
+    for change in (
+        {"window/states": np.array(["y1", "nowhere"])},
+        {"window/scale": np.ones(3)},
+        {"window/line/information": np.ones((2, 2))},
+        {"window/line/searched": np.full_like(likelihood["window/line/searched"], np.nan)},
+        {"window/excluded": np.ones_like(likelihood["window/excluded"])},
+        {"hop": np.array(1.5)},
+    ):
+        fits = LengthFits(WITHOUT_ANGLE)
+        with pytest.raises(CheckpointError):
+            fits.restore(likelihood | change)
+        assert fits.checkpoint().keys() == LengthFits(WITHOUT_ANGLE).checkpoint().keys()
+    gate = Gate(LAB)
+    with pytest.raises(CheckpointError, match="courses"):
+        gate.restore({"courses": np.array([["1", "2", "x", "4", "5"]])})
+    assert gate.courses == ()
+    with pytest.raises(CheckpointError, match="findings are of parameters"):
+        SequentialState.restored(
+            SequentialState().checkpoint() | {"findings": np.array([[9, 1, 2]]), "finding_stretch_s": np.ones(1)}
+        )
+
+
+def test_a_gate_in_the_middle_of_a_stepped_clock_goes_on() -> None:
+    blocks = scenario_blocks(6.0)
+    stepped = [replace(one, start_ns=one.start_ns - 10**12) for one in blocks[20:]]
+    wild = replace(blocks[7], start_ns=blocks[7].start_ns + 10**12)
+    arriving = [*blocks[:7], wild, *blocks[8:20], wild, *stepped[:5], blocks[3], *stepped[2:30], blocks[19]]
+    arriving += [*stepped[30:], wild, blocks[2]]
+    expected = [Gate(LAB).judge(one) for one in arriving[:1]]
+    for stop in range(1, len(arriving)):
+        gate = Gate(LAB)
+        verdicts = [gate.judge(one) for one in arriving[:stop]]
+        again = Gate(LAB)
+        again.restore(from_bytes(to_bytes(gate.checkpoint())))
+        verdicts += [again.judge(one) for one in arriving[stop:]]
+        assert len(expected) == 1 or verdicts == expected
+        expected = verdicts
+    assert sum(one.clock_step_s != 0 for one in expected) == 1
+    assert expected[-3] == Verdict()
+    assert [one.reason for one in expected[-2:]] == [Reason.OVERLAP, Reason.OVERLAP]
+
+
+numbers = st.floats(width=64)
+times = st.integers(-(2**62), 2**62)
+
+
+@st.composite
+def stretches(draw: st.DrawFn) -> Stretch:
+    n = len(PARAMETERS)
+    lower = np.tril(draw(arrays_of.arrays(np.float64, (n, n), elements=numbers)))
+    common = arrays_of.arrays(np.float64, (n, n), elements=numbers)
+    return Stretch(
+        draw(times),
+        draw(times),
+        draw(arrays_of.arrays(np.float64, (n,), elements=numbers)),
+        lower + np.tril(lower, -1).T,
+        draw(st.none() | numbers),
+        draw(st.none() | common),
+    )
+
+
+findings = st.builds(Finding, st.sampled_from(PARAMETERS), times, times, numbers)
+states = st.builds(
+    SequentialState,
+    st.dictionaries(st.sampled_from([1, 2, 4, 8, 16, 32]), st.lists(stretches(), min_size=1, max_size=4)),
+    st.none() | times,
+    st.tuples(*[numbers] * len(PARAMETERS)),
+    st.lists(findings, max_size=3).map(tuple),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
+@given(states)
+def test_the_state_of_the_sequential_test_is_restored_exactly(state: SequentialState) -> None:
+    again = SequentialState.restored(from_bytes(to_bytes(state.checkpoint())))
+    assert again.change_ns == state.change_ns
+    assert repr(again.before) == repr(state.before)
+    assert repr(again.findings) == repr(state.findings)
+    assert again.sums.keys() == state.sums.keys()
+    for windows, ring in state.sums.items():
+        for one, other in zip(again.sums[windows], ring, strict=True):
+            assert (one.start_ns, one.end_ns, repr(one.misfit_z)) == (
+                other.start_ns,
+                other.end_ns,
+                repr(other.misfit_z),
+            )
+            for found, wanted in ((one.vector, other.vector), (one.information, other.information)):
+                assert_same_bits(found, wanted)
+            assert (one.common is None) == (other.common is None)
+            if one.common is not None and other.common is not None:
+                assert_same_bits(one.common, other.common)
+
+
+def assert_same_bits(one: np.ndarray, other: np.ndarray) -> None:
+    assert (one.dtype, one.shape) == (other.dtype, other.shape)
+    assert np.array_equal(one, other, equal_nan=one.dtype.kind in "fc")
+    if one.dtype.kind == "f":
+        np.testing.assert_array_equal(np.signbit(one), np.signbit(other))
+
+
+kinds = st.sampled_from([np.float64, np.complex128, np.int64, np.bool_, np.dtype("<U5")])
+named = st.dictionaries(
+    st.text("abcdefghij_/.file", min_size=1, max_size=12),
+    arrays_of.arrays(kinds, arrays_of.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4)),
+    max_size=5,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(named)
+def test_arrays_come_back_as_they_were(arrays: dict[str, np.ndarray]) -> None:
+    data = to_bytes(arrays)
+    again = from_bytes(data)
+    assert list(again) == list(arrays)
+    for name, array in arrays.items():
+        assert_same_bits(again[name], array)
+    assert data == to_bytes(again)
+
+
+def test_how_an_array_lies_in_memory_is_kept() -> None:
+    across = np.asfortranarray(np.arange(12.0).reshape(3, 4))
+    again = from_bytes(to_bytes({"across": across}))["across"]
+    assert again.flags.f_contiguous
+    assert not again.flags.c_contiguous
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.data())
+def test_damaged_bytes_are_refused(data: st.DataObject) -> None:
+    whole = to_bytes({"level": np.arange(5.0), "names": np.array(["y1", "z1"])})
+    at = data.draw(st.integers(0, len(whole) - 1))
+    flipped = bytearray(whole)
+    flipped[at] ^= 1 << data.draw(st.integers(0, 7))
+    for damaged in (bytes(flipped), whole[:at], whole + b"\0"):
+        with pytest.raises(CheckpointError):
+            from_bytes(damaged)
+
+
+@pytest.mark.parametrize(
+    ("foreign", "says"),
+    [
+        (b"", "0 bytes"),
+        (b"PK\x03\x04" + bytes(100), "expected a checkpoint"),
+        (b"RWCP\x09\x00" + bytes(100), "format 9, expected format 1"),
+        (b"RWCP\x01\x00" + bytes(100), "damaged"),
+    ],
+)
+def test_foreign_bytes_are_refused(foreign: bytes, says: str) -> None:
+    with pytest.raises(CheckpointError, match=says):
+        from_bytes(foreign)
+
+
+def test_objects_are_refused() -> None:
+    with pytest.raises(CheckpointError, match="nothing: an array of type object"):
+        to_bytes({"nothing": np.array([None])})
+
+
+def test_parts_are_kept_apart() -> None:
+    parts = prefixed("a", {"x": np.array(1)}) | prefixed("ab", {"x": np.array(2)})
+    assert unprefixed("a", parts) == {"x": np.array(1)}
+    assert unprefixed("b", parts) == {}
+    with pytest.raises(CheckpointError, match="x is missing; there are a/x, ab/x"):
+        checked(parts, "x", np.int64, ())
