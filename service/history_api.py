@@ -81,8 +81,8 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             since_ns=since_ns,
             until_ns=until_ns,
             alarm=name,
-            kind=kind,
-            severity=severity,
+            kind=None if kind is None else kind.value,
+            severity=None if severity is None else severity.value,
             limit=limit,
             newest_first=after is None,
         )

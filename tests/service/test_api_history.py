@@ -1,76 +1,113 @@
-"""What is kept in memory, and what becomes of it in JSON."""
+"""The log of alarms page by page and for followers, and what becomes of records in JSON."""
 
 import json
-import threading
+from collections.abc import Iterator
 
+import httpx
 import pytest
 
 from models.diagnosis.readings import EquationReading, ParameterReading
 from service import conversion
-from service.alarms.alarm import Alarm, AlarmEvent
+from service.alarm_conversion import Identity, alarm_cloud_event
+from service.alarms.alarm import Alarm, AlarmEvent, EventKind
 from service.alarms.life_cycle import AlarmState
-from service.history import History
+from service.api_schemas import AlarmEventList, AuditList
 from service.reports import DataQuality, HealthState, MachineHealth, WindowReport
+from service.runtime import Runtime
 from service.schemas import AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report, StreamStatus, example
 from tests.service.live import LAB
+from tests.service.monitored import PLACE, answered, client, fed
 
 IDENTITY = Identity("demo", "lab", None, conversion.machine_hash(LAB))
+NAMES = ("k_by", "e", "model")
 
 
-def window(end_ns: int) -> WindowReport:
-    return WindowReport(end_ns - 60, end_ns, HealthState.HEALTHY, 1.0)
+@pytest.fixture(scope="module")
+def busy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, httpx.Client]]:
+    """A service with twelve events: three alarms are shelved and unshelved, twice."""
+    with fed(tmp_path_factory.mktemp("machine")) as (runtime, _), client(runtime) as http:
+        for _ in range(2):
+            for name in NAMES:
+                for kind in ("shelve", "unshelve"):
+                    body = {"reason": f"{kind} it", "expected_state": "normal" if kind == "shelve" else "shelved"}
+                    assert http.post(f"{PLACE}/alarms/{name}/{kind}", json=body).status_code == 200
+        yield runtime, http
 
 
-def event(time_ns: int) -> AlarmEvent:
-    return AlarmEvent("raised", time_ns, 0, Alarm("k_by"))
+def page(http: httpx.Client, query: str) -> AlarmEventList:
+    return answered(http.get(f"{PLACE}/alarms/events?{query}"), AlarmEventList)
 
 
-def ends(history: History, since_ns: int | None = None, until_ns: int | None = None, limit: int = 100) -> list[int]:
-    return [report.end_ns for report in history.reports(since_ns, until_ns, limit)]
+def sequences(found: AlarmEventList) -> list[int]:
+    return [event.data.sequence for event in found.events]
 
 
-def test_range_is_half_open_and_newest_come_first() -> None:
-    history = History(10, 10)
-    history.add([window(end) for end in (100, 105, 110, 115)], [event(107), event(112)])
-    assert ends(history) == [115, 110, 105, 100]
-    assert ends(history, since_ns=105) == [115, 110, 105]
-    assert ends(history, until_ns=110) == [105, 100]
-    assert ends(history, 105, 115) == [110, 105]
-    assert ends(history, limit=2) == [115, 110]
-    assert ends(history, until_ns=115, limit=1) == [110]
-    assert [entry.time_ns for entry in history.alarm_events(until_ns=112)] == [107]
+def test_pages_back_give_the_whole_log(busy: tuple[Runtime, httpx.Client]) -> None:
+    found, before = [], ""
+    for _ in range(3):
+        one = page(busy[1], f"limit=5{before}")
+        assert one.next_after is None
+        found += sequences(one)
+        before = f"&before={one.next_before}"
+    assert found == list(reversed(range(12)))
+    assert one.next_before is None
 
 
-def test_oldest_are_forgotten() -> None:
-    history = History(3, 1)
-    history.add([window(end) for end in range(5)], [event(1), event(2)])
-    assert ends(history) == [4, 3, 2]
-    assert [entry.time_ns for entry in history.alarm_events()] == [2]
+def test_a_follower_gets_each_event_once(busy: tuple[Runtime, httpx.Client]) -> None:
+    found, after = [], -1
+    while (one := page(busy[1], f"limit=5&after={after}")).events:
+        assert one.next_before is None
+        found += sequences(one)
+        assert one.next_after is not None
+        after = one.next_after
+    assert found == list(range(12))
+    assert one.next_after == 11
+    # What follows is asked for with the same number.
+    assert page(busy[1], "after=11") == one
+    assert sequences(page(busy[1], "after=3&before=6")) == [4, 5]
 
 
-def test_a_clock_that_was_set_back_hides_nothing() -> None:
-    history = History(10, 10)
-    history.add([window(end) for end in (100, 200, 50, 60)], [])
-    assert ends(history, since_ns=55, until_ns=150) == [60, 100]
+@pytest.mark.parametrize(
+    ("query", "expected"),
+    [
+        ("name=e", [9, 8, 3, 2]),
+        ("kind=unshelved", [11, 9, 7, 5, 3, 1]),
+        ("kind=shelved&name=model&after=-1", [4, 10]),
+        ("severity=danger", []),
+        ("severity=alert&limit=1", [11]),
+    ],
+)
+def test_events_are_filtered(busy: tuple[Runtime, httpx.Client], query: str, expected: list[int]) -> None:
+    assert sequences(page(busy[1], query)) == expected
 
 
-def test_readers_and_the_writer_do_not_disturb_each_other() -> None:
-    history = History(50, 50)
-    done = threading.Event()
-    seen: list[list[int]] = []
+def test_events_are_cut_by_data_time(busy: tuple[Runtime, httpx.Client]) -> None:
+    times = [event.data.time_ns for event in page(busy[1], "after=-1").events]
+    assert times == sorted(times)
+    assert sequences(page(busy[1], f"since_ns={times[3]}&until_ns={times[7]}")) == [6, 5, 4, 3]
 
-    def read() -> None:
-        while not done.is_set():
-            seen.append(ends(history))
 
-    reader = threading.Thread(target=read)
-    reader.start()
-    for end in range(5000):
-        history.add([window(end)], [])
-    done.set()
-    reader.join()
-    assert all(found == sorted(found, reverse=True) for found in seen)
-    assert ends(history, limit=1) == [4999]
+def test_events_are_served_as_they_were_published(busy: tuple[Runtime, httpx.Client]) -> None:
+    runtime, http = busy
+    stored = runtime.machines()[0].history.events(after=-1)
+    assert http.get(f"{PLACE}/alarms/events?after=-1").text == (
+        f'{{"events":[{",".join(one.text for one in stored)}],"next_before":null,"next_after":11}}'
+    )
+
+
+def test_audit_log_tells_who_did_what(busy: tuple[Runtime, httpx.Client]) -> None:
+    http = busy[1]
+    newest = answered(http.get("/api/v1/audit?limit=2"), AuditList)
+    done, begun = newest.entries
+    assert (done.actor, done.method, done.status) == ("anonymous", "POST", 200)
+    assert (done.action, done.machine, done.alarm, done.reason) == ("unshelve", "demo/lab", "model", "unshelve it")
+    assert (begun.action, begun.status, begun.at_ns, begun.path) == ("started", 0, done.at_ns, done.path)
+    older = answered(http.get(f"/api/v1/audit?limit=1000&before={newest.next_before}"), AuditList)
+    assert len(older.entries) == 2 * 12 - 2
+    assert older.next_before is None
+    assert {one.alarm for one in older.entries} == {*NAMES, ""}
+    assert len(answered(http.get("/api/v1/audit?machine=demo/lab"), AuditList).entries) == 12
+    assert answered(http.get("/api/v1/audit?actor=nobody"), AuditList).entries == ()
 
 
 @pytest.mark.parametrize("model", [AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report])
@@ -93,7 +130,7 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
     latest = WindowReport(0, 1, HealthState.HEALTHY, 1.0, float("nan"), readings, (equation,), misfit_z=float("inf"))
     health = conversion.health(
         IDENTITY,
-        MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", AlarmState.PENDING),), DataQuality()),
+        MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", beyond_ns=1),), DataQuality(), -1),
         StreamStatus(publisher_alive=False, data_age_s=None, descriptor_mismatch=()),
     )
     text = health.model_dump_json()
@@ -112,22 +149,24 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
 
 
 def test_no_data_outranks_a_raised_alarm_and_hides_it_not() -> None:
-    alarm = Alarm("k_by", AlarmState.ACTIVE, raised_ns=5, occurrence=1, change=-0.3, standard_error=0.01)
-    record = MachineHealth(HealthState.ALERT, 1.0, window(7), (alarm, Alarm("e")), DataQuality())
+    state = AlarmState.UNACKNOWLEDGED
+    alarm = Alarm("k_by", state, present=True, raised_ns=5, occurrence=1, change=-0.3, standard_error=0.01)
+    latest = WindowReport(0, 7, HealthState.HEALTHY, 1.0)
+    record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), DataQuality(), 0)
     stream = StreamStatus(publisher_alive=True, data_age_s=9.0, descriptor_mismatch=())
     health = conversion.health(IDENTITY, record, stream, no_data_reason="silence")
     assert health.state == "no-data"
     assert health.reason == "silence"
-    assert [(entry.parameter, entry.raised) for entry in health.alarms] == [("k_by", True)]
+    assert [(entry.name, entry.raised) for entry in health.alarms] == [("k_by", True)]
     assert conversion.health(IDENTITY, record, stream).state == "alert"
 
 
-def test_event_identity_is_stable_and_differs_between_kinds_and_occurrences() -> None:
-    alarm = Alarm("k_by", AlarmState.ACTIVE, occurrence=2)
-    same = [alarm_cloud_event(IDENTITY, AlarmEvent("raised", 77, 3, alarm)).id for _ in range(2)]
-    other = alarm_cloud_event(IDENTITY, AlarmEvent("escalated", 77, 4, alarm))
-    assert same == ["demo/lab/k_by/2/raised/77"] * 2
-    assert other.id != same[0]
+def test_event_identity_is_stable_and_differs_between_events() -> None:
+    alarm = Alarm("k_by", AlarmState.UNACKNOWLEDGED, occurrence=2)
+    same = {alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.RAISED, 77, 3, alarm)).id for _ in range(2)}
+    other = alarm_cloud_event(IDENTITY, AlarmEvent(EventKind.ESCALATED, 77, 4, alarm))
+    assert len(same) == 1
+    assert other.id not in same
     assert other.sequence > "00000000000000000003"
     assert other.time == "1970-01-01T00:00:00.000000Z"
 
