@@ -257,6 +257,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
             "machines": entries,
             "recording": recording,
             "history": history,
+            "link": settings.link.beside(folder),
             "access": settings.access.beside(folder),
         }
     )

@@ -1,38 +1,25 @@
-"""The command ``rotorwatch``: monitor machines, check settings, look at what monitors say."""
+"""The command ``rotorwatch``: monitor machines, check settings; all other commands are in `service.commands`."""
 
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from rich.console import Console
-from rich.table import Table
 
-from models.errors import BundleError, MachineFileError, RotorwatchError
+from models.errors import BundleError, MachineFileError
+from service.commands import access as access_commands
 from service.commands import interchange as interchange_commands
 from service.commands import plot as plot_commands
 from service.commands import record as record_commands
 from service.commands import replay as replay_commands
+from service.commands import watching as watching_commands
 from service.commands.replay import NamespaceOption, in_namespace
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
+from service.commands.running import ENDPOINT, ConnectOption, LinkOption, ListenOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from service.config import ServiceSettings
-    from service.schemas import Health
-    from service.transport import TopicMessage
 
 __all__ = ["app"]
-
-_BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
-_STYLES = {
-    "danger": "bold red",
-    "alert": "bold yellow",
-    "outside-model": "yellow",
-    "data-health": "magenta",
-    "unchanged": "green",
-    "no-data": "magenta",
-    "healthy": "green",
-}
 
 app = typer.Typer(
     name="rotorwatch",
@@ -42,11 +29,6 @@ app = typer.Typer(
     help="Condition monitoring of rotating machines: which parameter changed, by how much, how sure.",
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
 )
-
-record_commands.register(app)
-replay_commands.register(app)
-interchange_commands.register(app)
-plot_commands.register(app)
 
 
 @app.command()
@@ -65,6 +47,7 @@ def run(
     ] = None,
     listen: ListenOption = None,
     connect: ConnectOption = None,
+    link: LinkOption = None,
     http_port: Annotated[
         int | None, typer.Option("--http-port", min=0, max=65535, help="Port of the HTTP API; 0 takes a free one.")
     ] = None,
@@ -97,7 +80,7 @@ def run(
         from service.logs import configure_logging  # noqa: PLC0415
         from service.runtime import running, stop_request  # noqa: PLC0415  # must see the variables set above
 
-        settings = _overridden(load_settings(config), machine, listen, connect, http_port, when_full, namespace)
+        settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
         configure_logging(settings.log)
         with stop_request() as stop, running(settings) as service:
             for worker in service.machines():
@@ -138,85 +121,7 @@ def check_config(
 
 
 @app.command()
-def watch(
-    machine: Annotated[
-        str, typer.Option("--machine", metavar="SITE/MACHINE", help="Which machine; * stands for any.")
-    ] = "*/*",
-    connect: ConnectOption = None,
-    windows: Annotated[bool, typer.Option("--windows", help="One line per evaluated window as well.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per line: topic and message.")] = False,
-    namespace: NamespaceOption = None,
-) -> None:
-    """Show alarms and changes of state as they happen, until Ctrl-C.
-
-    Times are UTC and those of the data. Figures are relative changes with their 95 % half widths.
-
-    [bold]Examples[/bold]
-
-    Alarms of every machine of the monitor on this computer:
-    [cyan]rotorwatch watch[/cyan]
-
-    Every window of one machine:
-    [cyan]rotorwatch watch --machine demo/lab --windows[/cyan]
-
-    For another program:
-    [cyan]rotorwatch watch --json | jq .message.data.text[/cyan]
-    """
-    with exit_codes():
-        if machine.count("/") != 1:
-            raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
-        from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
-        from service.runtime import stop_request  # noqa: PLC0415
-        from service.transport import follow  # noqa: PLC0415
-
-        topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
-        link = LinkSettings(mode="client", connect=tuple(connect) if connect else (ENDPOINT,))
-        link = in_namespace(link, namespace)
-        show = _JsonLines() if as_json else _Lines()
-        with stop_request() as stop, follow(link, machine, topics, show) as connected:
-            there = True
-            while not stop.wait(0.5):
-                if connected() != there:
-                    there = not there
-                    typer.echo("connected again" if there else "connection lost, trying again", err=True)
-
-
-@app.command()
-def status(
-    url: Annotated[str, typer.Option("--url", help="Where the monitor's HTTP API is.")] = "http://127.0.0.1:8080",
-) -> None:
-    """Table of all machines of a running monitor.
-
-    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if any is in alert, danger, outside the model
-    or without data, or if the monitor does not answer.
-
-    [bold]Example[/bold]
-
-    [cyan]rotorwatch status || echo "look at the machines"[/cyan]
-    """
-    with exit_codes():
-        healths = _fetch_healths(url.rstrip("/"))
-        table = Table("machine", "state", "window", "raised alarms", "data age", "refused", "gaps", "why")
-        for health in healths:
-            alarms = [f"{a.name} {a.severity}" for a in health.alarms if a.raised]
-            age_s = health.stream.data_age_s
-            table.add_row(
-                f"{health.site}/{health.machine}",
-                f"[{_STYLES.get(health.state, 'default')}]{health.state}[/]",
-                f"{health.filled:.0%}",
-                ", ".join(alarms) or "-",
-                "-" if age_s is None else f"{age_s:.1f} s",
-                str(sum(health.quality.refused_blocks.values())),
-                str(health.quality.gaps),
-                health.reason or "-",
-            )
-        Console(soft_wrap=True).print(table)
-        if any(health.state in _BAD_STATES for health in healths):
-            raise typer.Exit(1)
-
-
-@app.command()
-def router(listen: ListenOption = None, connect: ConnectOption = None) -> None:
+def router(listen: ListenOption = None, connect: ConnectOption = None, link: LinkOption = None) -> None:
     """Run a Zenoh router until Ctrl-C, for networks in which monitors and sensors cannot reach each other directly.
 
     Everybody who connects to it must do so as a client: rotorwatch run --connect, rotorsim publish --mode client.
@@ -226,12 +131,16 @@ def router(listen: ListenOption = None, connect: ConnectOption = None) -> None:
     [cyan]rotorwatch router --listen tcp/0.0.0.0:7447[/cyan]
     """
     with exit_codes():
-        from service.runtime import stop_request  # noqa: PLC0415  # keeps --help quick
+        from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
+        from models.signals.link import LinkSettings  # noqa: PLC0415
+        from service.runtime import stop_request  # noqa: PLC0415
         from service.transport import route  # noqa: PLC0415
 
-        endpoints = tuple(listen) if listen else (ENDPOINT,)
-        with stop_request() as stop, route(endpoints, tuple(connect or ())):
-            typer.echo(f"router listening on {', '.join(endpoints)}")
+        settings = LinkSettings(listen=(ENDPOINT,)) if link is None else load_link(link)
+        ends = {name: tuple(given) for name, given in (("listen", listen), ("connect", connect)) if given}
+        settings = settings.model_copy(update=ends)
+        with stop_request() as stop, route(settings):
+            typer.echo(f"router listening on {', '.join(settings.listen)}")
             sys.stdout.flush()
             stop.wait()
 
@@ -264,53 +173,10 @@ def demo(
     raise typer.Exit(code)
 
 
-class _Lines:
-    """Shows messages as text: alarms always, states when they change, windows if subscribed to."""
-
-    def __init__(self) -> None:
-        self._console = Console(highlight=False, markup=False, soft_wrap=True)
-        self._states: dict[str, str] = {}
-        self._alarms: set[str] = set()
-
-    def __call__(self, message: "TopicMessage") -> None:
-        from service import lines, schemas  # noqa: PLC0415  # keeps --help quick
-
-        if message.key.endswith("/alarm/event"):
-            event = schemas.AlarmCloudEvent.model_validate_json(message.text)
-            style = "green" if event.data.kind == "cleared" else _STYLES[event.data.severity]
-            self._say(lines.alarm_event_line(event), style)
-        elif message.key.endswith("/alarm/state"):
-            if message.key not in self._alarms:  # later changes arrive as events
-                self._alarms.add(message.key)
-                for line in lines.alarm_state_lines(schemas.AlarmStates.model_validate_json(message.text)):
-                    self._say(line, "bold")
-        elif message.key.endswith("/health"):
-            health = schemas.Health.model_validate_json(message.text)
-            if self._states.get(message.key) != health.state:
-                self._states[message.key] = health.state
-                self._say(lines.health_line(health), _STYLES.get(health.state))
-        else:
-            report = schemas.Report.model_validate_json(message.text)
-            self._say(lines.report_line(report), _STYLES.get(report.state) if report.state in _BAD_STATES else None)
-
-    def _say(self, line: str, style: str | None) -> None:
-        self._console.print(line, style=style)
-        sys.stdout.flush()
-
-
-class _JsonLines:
-    """Writes messages as JSON lines."""
-
-    def __call__(self, message: "TopicMessage") -> None:
-        import json  # noqa: PLC0415  # only here
-
-        sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
-        sys.stdout.flush()
-
-
 def _overridden(
     settings: "ServiceSettings",
     machines: list[str] | None,
+    link: Path | None,
     listen: list[str] | None,
     connect: list[str] | None,
     http_port: int | None,
@@ -324,11 +190,15 @@ def _overridden(
     if machines:
         pairs = [text.partition("@") for text in machines]
         update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
+    if link is not None:
+        from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
+
+        update["link"] = load_link(link)
     if listen or connect:
         # A router joins clients; between peers, which it takes to know each other, it passes nothing on.
         mode = "peer" if listen else "client"
         ends = {"mode": mode, "listen": tuple(listen or ()), "connect": tuple(connect or ())}
-        update["link"] = settings.link.model_copy(update=ends)
+        update["link"] = update.get("link", settings.link).model_copy(update=ends)
     if namespace is not None:
         update["link"] = in_namespace(update.get("link", settings.link), namespace)
         # What is replayed must not end up among the recordings and in the history of the live machine.
@@ -361,21 +231,13 @@ def _checked(file: Path) -> str:
     return f"settings for {', '.join(names)}"
 
 
-def _fetch_healths(url: str) -> "list[Health]":
-    import httpx  # noqa: PLC0415  # only here
-    from pydantic import ValidationError  # noqa: PLC0415
-
-    from service.schemas import Health  # noqa: PLC0415  # keeps --help quick
-
-    try:
-        with httpx.Client(base_url=url, timeout=5.0, trust_env=False) as client:
-            listed = client.get("/api/v1/machines").raise_for_status().json()["machines"]
-            places = [f"/api/v1/machines/{entry['site']}/{entry['machine']}/health" for entry in listed]
-            return [Health.model_validate_json(client.get(place).raise_for_status().content) for place in places]
-    except (httpx.HTTPError, httpx.InvalidURL) as error:
-        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
-    except (ValidationError, ValueError, KeyError, TypeError) as error:
-        raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor") from error
+# After the commands of this module, which are the first in the list.
+watching_commands.register(app)
+access_commands.register(app)
+record_commands.register(app)
+replay_commands.register(app)
+interchange_commands.register(app)
+plot_commands.register(app)
 
 
 if __name__ == "__main__":

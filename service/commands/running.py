@@ -3,13 +3,23 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 
-__all__ = ["ENDPOINT", "ConnectOption", "FromOption", "ListenOption", "ToOption", "exit_codes", "one_blas_thread"]
+__all__ = [
+    "ENDPOINT",
+    "ConnectOption",
+    "FromOption",
+    "LinkOption",
+    "ListenOption",
+    "ToOption",
+    "exit_codes",
+    "one_blas_thread",
+]
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
@@ -20,6 +30,12 @@ ConnectOption = Annotated[
 ]
 ListenOption = Annotated[
     list[str] | None, typer.Option("--listen", metavar="ENDPOINT", help="Zenoh endpoint to listen on. Repeatable.")
+]
+LinkOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--link", metavar="FILE", help="How to connect: a file with the table [link], with passwords or certificates."
+    ),
 ]
 
 FromOption = Annotated[

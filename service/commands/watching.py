@@ -1,0 +1,197 @@
+"""``rotorwatch watch`` and ``rotorwatch status``: look at what monitors say."""
+
+import ssl
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from models.errors import MachineFileError, RotorwatchError
+from service.commands.replay import NamespaceOption, in_namespace
+from service.commands.running import ENDPOINT, ConnectOption, LinkOption, exit_codes
+
+if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
+    from service.schemas import Health
+    from service.transport import TopicMessage
+
+__all__ = ["register"]
+
+_BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
+_STYLES = {
+    "danger": "bold red",
+    "alert": "bold yellow",
+    "outside-model": "yellow",
+    "data-health": "magenta",
+    "unchanged": "green",
+    "no-data": "magenta",
+    "healthy": "green",
+}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(watch)
+    app.command()(status)
+
+
+def watch(
+    machine: Annotated[
+        str, typer.Option("--machine", metavar="SITE/MACHINE", help="Which machine; * stands for any.")
+    ] = "*/*",
+    connect: ConnectOption = None,
+    link: LinkOption = None,
+    windows: Annotated[bool, typer.Option("--windows", help="One line per evaluated window as well.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object per line: topic and message.")] = False,
+    namespace: NamespaceOption = None,
+) -> None:
+    """Show alarms and changes of state as they happen, until Ctrl-C.
+
+    Times are UTC and those of the data. Figures are relative changes with their 95 % half widths.
+
+    [bold]Examples[/bold]
+
+    Alarms of every machine of the monitor on this computer:
+    [cyan]rotorwatch watch[/cyan]
+
+    Every window of one machine:
+    [cyan]rotorwatch watch --machine demo/lab --windows[/cyan]
+
+    For another program:
+    [cyan]rotorwatch watch --json | jq .message.data.text[/cyan]
+    """
+    with exit_codes():
+        if machine.count("/") != 1:
+            raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
+        from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
+        from models.signals.link import LinkSettings  # noqa: PLC0415
+        from service.runtime import stop_request  # noqa: PLC0415
+        from service.transport import follow  # noqa: PLC0415
+
+        topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
+        base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
+        ends = {"connect": tuple(connect)} if connect else {}
+        settings = in_namespace(base.model_copy(update=ends), namespace)
+        show = _JsonLines() if as_json else _Lines()
+        with stop_request() as stop, follow(settings, machine, topics, show) as connected:
+            there = True
+            while not stop.wait(0.5):
+                if connected() != there:
+                    there = not there
+                    typer.echo("connected again" if there else "connection lost, trying again", err=True)
+
+
+def status(
+    url: Annotated[str, typer.Option("--url", help="Where the monitor's HTTP API is.")] = "http://127.0.0.1:8080",
+    token: Annotated[
+        str | None,
+        typer.Option(
+            "--token",
+            envvar="ROTORWATCH_TOKEN",
+            show_envvar=True,
+            help="Token with the scope read, if the API asks for one; better given in the environment.",
+        ),
+    ] = None,
+    ca: Annotated[
+        Path | None, typer.Option("--ca", metavar="FILE", help="Authority (PEM) of the API's certificate.")
+    ] = None,
+) -> None:
+    """Table of all machines of a running monitor.
+
+    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if any is in alert, danger, outside the model
+    or without data, or if the monitor does not answer.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch status || echo "look at the machines"[/cyan]
+    """
+    with exit_codes():
+        healths = _fetch_healths(url.rstrip("/"), token, ca)
+        table = Table("machine", "state", "window", "raised alarms", "data age", "refused", "gaps", "why")
+        for health in healths:
+            alarms = [f"{a.name} {a.severity}" for a in health.alarms if a.raised]
+            age_s = health.stream.data_age_s
+            table.add_row(
+                f"{health.site}/{health.machine}",
+                f"[{_STYLES.get(health.state, 'default')}]{health.state}[/]",
+                f"{health.filled:.0%}",
+                ", ".join(alarms) or "-",
+                "-" if age_s is None else f"{age_s:.1f} s",
+                str(sum(health.quality.refused_blocks.values())),
+                str(health.quality.gaps),
+                health.reason or "-",
+            )
+        Console(soft_wrap=True).print(table)
+        if any(health.state in _BAD_STATES for health in healths):
+            raise typer.Exit(1)
+
+
+class _Lines:
+    """Shows messages as text: alarms always, states when they change, windows if subscribed to."""
+
+    def __init__(self) -> None:
+        self._console = Console(highlight=False, markup=False, soft_wrap=True)
+        self._states: dict[str, str] = {}
+        self._alarms: set[str] = set()
+
+    def __call__(self, message: "TopicMessage") -> None:
+        from service import lines, schemas  # noqa: PLC0415  # keeps --help quick
+
+        if message.key.endswith("/alarm/event"):
+            event = schemas.AlarmCloudEvent.model_validate_json(message.text)
+            style = _STYLES[event.data.severity] if event.data.kind in {"raised", "escalated"} else "green"
+            self._say(lines.alarm_event_line(event), style)
+        elif message.key.endswith("/alarm/state"):
+            if message.key not in self._alarms:  # later changes arrive as events
+                self._alarms.add(message.key)
+                for line in lines.alarm_state_lines(schemas.AlarmStates.model_validate_json(message.text)):
+                    self._say(line, "bold")
+        elif message.key.endswith("/health"):
+            health = schemas.Health.model_validate_json(message.text)
+            if self._states.get(message.key) != health.state:
+                self._states[message.key] = health.state
+                self._say(lines.health_line(health), _STYLES.get(health.state))
+        else:
+            report = schemas.Report.model_validate_json(message.text)
+            self._say(lines.report_line(report), _STYLES.get(report.state) if report.state in _BAD_STATES else None)
+
+    def _say(self, line: str, style: str | None) -> None:
+        self._console.print(line, style=style)
+        sys.stdout.flush()
+
+
+class _JsonLines:
+    """Writes messages as JSON lines."""
+
+    def __call__(self, message: "TopicMessage") -> None:
+        import json  # noqa: PLC0415  # only here
+
+        sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
+        sys.stdout.flush()
+
+
+def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health]":
+    import httpx  # noqa: PLC0415  # only here
+    from pydantic import ValidationError  # noqa: PLC0415
+
+    from service.schemas import Health  # noqa: PLC0415  # keeps --help quick
+
+    try:
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        verify = True if ca is None else ssl.create_default_context(cafile=ca)
+        with httpx.Client(base_url=url, timeout=5.0, trust_env=False, headers=headers, verify=verify) as client:
+            listed = client.get("/api/v1/machines").raise_for_status().json()["machines"]
+            places = [f"/api/v1/machines/{entry['site']}/{entry['machine']}/health" for entry in listed]
+            return [Health.model_validate_json(client.get(place).raise_for_status().content) for place in places]
+    except httpx.HTTPStatusError as error:
+        if error.response.status_code in {httpx.codes.UNAUTHORIZED, httpx.codes.FORBIDDEN}:
+            raise RotorwatchError(
+                f"{url}: the API asks for a token with the scope read: set ROTORWATCH_TOKEN (rotorwatch token create)"
+            ) from error
+        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
+    except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
+        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
+    except (ValidationError, ValueError, KeyError, TypeError) as error:
+        raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor") from error
