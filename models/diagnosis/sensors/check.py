@@ -9,6 +9,8 @@ from models.diagnosis.sensors.finding import Naming, SensorFinding, implicated
 from models.diagnosis.sensors.jump import gain_jump
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
 from models.diagnosis.sensors.level import clipped, offset, stuck
+from models.diagnosis.sensors.noise import noisy
+from models.diagnosis.sensors.phase import phase_faults
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.channels import Channel
@@ -64,4 +66,10 @@ def sensor_findings(
     bad = implicated(findings)
     findings += gain_and_delay(window, readings, bands, naming, reference)
     findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
+    bad = implicated(findings)
+    findings += noisy(window, readings, bands, naming, reference, sound)
+    if "theta" not in bad:
+        bad = implicated(findings)
+        columns = [column for column, state in enumerate(window.states) if state not in bad]
+        findings += phase_faults(window, columns, naming, reference)
     return tuple(findings)

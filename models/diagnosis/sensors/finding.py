@@ -8,7 +8,7 @@ from models.signals.channels import Channel, state_name
 
 __all__ = ["FAULT_KINDS", "FaultKind", "Naming", "SensorFinding", "implicated"]
 
-FaultKind = Literal["stuck", "clipped", "offset", "gain", "delay", "swapped", "incoherent"]
+FaultKind = Literal["stuck", "clipped", "offset", "gain", "delay", "swapped", "incoherent", "noise"]
 
 FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 """All kinds of fault."""
@@ -23,14 +23,15 @@ class SensorFinding:
     states : tuple of str
         What the channels measure whose data must not be used: one, or all among which the fault could not be told.
     kind : str
-        ``stuck``, ``clipped``, ``offset``, ``gain``, ``delay``, ``swapped``, or ``incoherent``: two sensors of one
-        motion show different things, and none of the other kinds explains it.
+        ``stuck``, ``clipped``, ``offset``, ``gain``, ``delay``, ``swapped``, ``noise``: it shows more than it did of
+        what is not the machine's, or ``incoherent``: two sensors of one motion show different things, and none of the
+        other kinds explains it.
     text : str
         One sentence: the channels, the value found, what was expected.
     value : float
         ``stuck``: how long it stood still, s. ``clipped``: part of the samples at the limit. ``offset``: the change of
         the mean, SI. ``gain``: relative change. ``delay``: s. ``swapped``, ``incoherent``: how much of the motion the
-        two sensors share, 0 to 1.
+        two sensors share, 0 to 1. ``noise``: rms of the noise over that of the channel.
     z : float or None
         Standard errors by which it exceeds what a healthy sensor shows; None where no chance is involved.
     """

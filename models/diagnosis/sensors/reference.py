@@ -5,25 +5,56 @@ the change.
 """
 
 from collections.abc import Sequence
+from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from models.diagnosis.pairs import motion_pairs
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair, same
+from models.diagnosis.sensors.unshared import ChannelNoise, PairNoise, channel_noise, pair_noise, single
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["ChannelReference", "PairReference", "SensorReference", "learn_sensor_reference"]
+__all__ = ["ChannelReference", "NoiseReference", "PairReference", "SensorReference", "learn_sensor_reference"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class ChannelReference(BaseModel):
-    """One channel on the healthy machine, SI units."""
+class NoiseReference(BaseModel):
+    """Noise on the healthy machine, mean over the windows, in the bands of `models.diagnosis.sensors.unshared`."""
 
     model_config = _STRICT
+
+    density: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="two-sided, SI²/Hz")
+    share: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="over the channels' own mean squares, 1/Hz")
+    line_rms: float = Field(default=0.0, ge=0, description="strongest line that one channel alone shows, SI")
+
+    @model_validator(mode="after")
+    def _as_many(self) -> Self:
+        if len(self.density) != len(self.share):
+            raise ValueError(f"density holds {len(self.density)} bands and share {len(self.share)}, expected as many")
+        return self
+
+
+class _WithNoise(BaseModel):
+    """A reference that may be older than the check of noise; then it is written as it was read."""
+
+    model_config = _STRICT
+
+    noise: NoiseReference | None = Field(default=None, description="None where it was not learned")
+
+    @model_serializer(mode="wrap")
+    def _as_read(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
+        content: dict[str, object] = handler(self)
+        if self.noise is None:
+            content.pop("noise", None)
+        return content
+
+
+class ChannelReference(_WithNoise):
+    """One channel on the healthy machine, SI units."""
 
     state: str = Field(description="what it measures")
     mean: float = Field(description="mean of the samples")
@@ -33,10 +64,8 @@ class ChannelReference(BaseModel):
     rotation_spread: float | None = Field(default=None, ge=0, description="its relative standard deviation")
 
 
-class PairReference(BaseModel):
+class PairReference(_WithNoise):
     """Two sensors of one motion on the healthy machine."""
-
-    model_config = _STRICT
 
     first: str
     second: str
@@ -111,18 +140,34 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
         there = [reading for reading in readings if reading is not None]
         if len(there) < len(readings):
             raise EstimationError(f"no fluctuation in {states[pair.first]} or {states[pair.second]}")
-        pairs.append(_pair(states, there, min(same(own) for own in bands)))
+        noises = [pair_noise(window, own, one) for window, own, one in zip(windows, bands, there, strict=True)]
+        pairs.append(_pair(states, there, min(same(own) for own in bands), _noise(noises)))
+    alone = [channel_noise(window, single(states)) for window in windows]
+    noise = {each[0].column: _noise(each) for each in zip(*alone, strict=False)}
     speeds = np.concatenate([window.hop_speed_rad_s for window in windows])
     return SensorReference(
         n_windows=len(windows),
         n_hops=sum(len(window.waveforms) for window in windows),
         speed_rad_s=float(speeds.mean()) if np.all(np.isfinite(speeds)) else None,
-        channels=tuple(_channel(windows, column) for column in range(len(states))),
+        channels=tuple(_channel(windows, column, noise.get(column)) for column in range(len(states))),
         pairs=tuple(pairs),
     )
 
 
-def _channel(windows: Sequence[WindowStatistics], column: int) -> ChannelReference:
+def _noise(noises: Sequence[PairNoise | ChannelNoise]) -> NoiseReference | None:
+    """Mean of the windows' noise."""
+    density = np.mean([one.density for one in noises], axis=0)
+    share = np.mean([one.share for one in noises], axis=0)
+    if not (np.all(density > 0) and np.all(share > 0) and np.all(np.isfinite(share))):
+        return None
+    return NoiseReference(
+        density=tuple(density.tolist()),
+        share=tuple(share.tolist()),
+        line_rms=max(one.line_rms if isinstance(one, ChannelNoise) else 0.0 for one in noises),
+    )
+
+
+def _channel(windows: Sequence[WindowStatistics], column: int, noise: NoiseReference | None = None) -> ChannelReference:
     means = np.concatenate([window.hop_waveform.mean[:, column] for window in windows])
     squares = np.concatenate([window.hop_waveform.rms[:, column] ** 2 for window in windows])
     rotation = rotation_spread = None
@@ -139,10 +184,13 @@ def _channel(windows: Sequence[WindowStatistics], column: int) -> ChannelReferen
         rms=float(np.sqrt(squares.mean())),
         rotation=rotation,
         rotation_spread=rotation_spread,
+        noise=noise,
     )
 
 
-def _pair(states: tuple[str, ...], readings: list[PairReading], least_same: float) -> PairReference:
+def _pair(
+    states: tuple[str, ...], readings: list[PairReading], least_same: float, noise: NoiseReference | None
+) -> PairReference:
     """Mean of the windows' readings; the spread is their scatter beyond their own errors, and the mean's error."""
     gains = np.array([reading.log_gain for reading in readings])
     delays = np.array([reading.delay_s for reading in readings])
@@ -159,6 +207,7 @@ def _pair(states: tuple[str, ...], readings: list[PairReading], least_same: floa
         delay_spread_s=_spread(delays, delay_errors),
         shared=min(reading.shared for reading in readings),
         same=least_same,
+        noise=noise,
     )
 
 

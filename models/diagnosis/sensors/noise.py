@@ -1,0 +1,217 @@
+"""A sensor whose noise has risen: a bad cable, mains hum, a failing amplifier.
+
+Noise differs from machine to machine and from day to day: some of it goes with the range and some with the vibration,
+and temperature or an amplifier's supply moves it in all channels. So a rise counts by which both the noise and its part
+of the channel's vibration grew, and only as far as the other channels' did not. It must also be large enough to matter:
+the diagnosis allows for noise, and would be given up for nothing.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.diagnosis.pairs import MotionPair
+from models.diagnosis.sensors.finding import Naming, SensorFinding
+from models.diagnosis.sensors.kinematics import Banded, PairReading
+from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.sensors.unshared import ChannelNoise, channel_noise, channel_rms, matched, pair_noise, single
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+__all__ = ["noisy"]
+
+PAIR_RISE = 10.0
+"""Power of the difference of two sensors of one motion over the healthy one, beyond what the others' rose by."""
+ALONE_RISE = 40.0
+"""The same where no other pair says what all sensors do."""
+TOP_RISE = 1000.0
+"""Unshared power at the top of the band where a motion has one sensor: calibrated, other excitation makes up 150."""
+LINE_RISE = 4.0
+LEAST_PART = 0.02
+"""Part of the channel's rms that the noise in the band must reach."""
+LEAST_LINE = 0.03
+"""Part of it that a line must reach."""
+_FEWEST_OTHERS = 2
+_PAIR_SCATTER, _TOP_SCATTER = 0.05, 1.2
+"""Standard deviation of the logarithm of a healthy pair's, and of a healthy channel's rise, calibrated."""
+_CLEAR = 0.5
+"""One of two sensors is the noisy one if its noise exceeds the other's by more than this part of both."""
+_SURE = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """Density and share of noise now and when healthy, each of shape (n, n_bands)."""
+
+    density: FloatArray
+    share: FloatArray
+    healthy_density: FloatArray
+    healthy_share: FloatArray
+
+    def rise(self) -> FloatArray:
+        """Logarithm of the rise beyond that of the others, the smaller one of both measures; shape (n, n_bands)."""
+        absolute = np.log(self.density / self.healthy_density)
+        relative = np.log(self.share / self.healthy_share)
+        return np.asarray(np.minimum(_alone(absolute), _alone(relative)), dtype=np.float64)
+
+
+def _alone(rise: FloatArray) -> FloatArray:
+    """Rise beyond the median of the others, where that is a rise."""
+    n = rise.shape[0]
+    if n < 2:
+        return rise
+    others = np.stack([np.median(np.delete(rise, row, axis=0), axis=0) for row in range(n)])
+    return np.asarray(rise - np.maximum(others, 0.0), dtype=np.float64)
+
+
+def noisy(
+    window: WindowStatistics,
+    readings: Sequence[PairReading],
+    bands: Mapping[MotionPair, Banded],
+    naming: Naming,
+    reference: SensorReference | None,
+    sound: Callable[..., bool],
+) -> list[SensorFinding]:
+    """Channels whose noise is above what it was on the healthy machine.
+
+    Parameters
+    ----------
+    window : WindowStatistics
+    readings : sequence of PairReading
+        Of pairs that see the same motion.
+    bands : mapping of MotionPair to Banded
+    naming : Naming
+    reference : SensorReference or None
+        Without it, or if it says nothing of noise, nothing is found.
+    sound : callable
+        Whether nothing else is wrong with columns.
+    """
+    if reference is None:
+        return []
+    findings = _of_pairs(
+        window, [one for one in readings if sound(one.pair.first, one.pair.second)], bands, naming, reference
+    )
+    columns = single(window.states)
+    if not findings and sound(*range(len(window.states))):
+        findings += _of_single(window, channel_noise(window, columns), naming, reference)
+    return findings
+
+
+def _of_pairs(
+    window: WindowStatistics,
+    readings: Sequence[PairReading],
+    bands: Mapping[MotionPair, Banded],
+    naming: Naming,
+    reference: SensorReference,
+) -> list[SensorFinding]:
+    known = []
+    for reading in readings:
+        then = reference.pair(window.states[reading.pair.first], window.states[reading.pair.second])
+        healthy = None if then is None else then.noise
+        if healthy is not None and len(healthy.density) == bands[reading.pair].w.size:
+            known.append((reading, pair_noise(window, bands[reading.pair], reading), healthy))
+    if not known:
+        return []
+    rise = _Known(
+        np.stack([now.density for _, now, _ in known]),
+        np.stack([now.share for _, now, _ in known]),
+        np.array([healthy.density for _, _, healthy in known]),
+        np.array([healthy.share for _, _, healthy in known]),
+    ).rise()
+    limit = np.log(PAIR_RISE if len(known) > 1 else ALONE_RISE)
+    rms, findings = channel_rms(window), []
+    for row, (reading, now, _) in enumerate(known):
+        risen = rise[row] > limit
+        if not np.any(risen):
+            continue
+        pair, own = reading.pair, bands[reading.pair]
+        guilty = _guilty(own, reading, risen)
+        width_hz = (window.frequencies_hz[-1] - window.frequencies_hz[0]) / own.w.size
+        excess = 2 * width_hz * now.density[risen] * -np.expm1(-rise[row, risen])
+        # What is seen as the second shows it, as the first would.
+        first = float(np.sqrt(np.sum(excess / own.w[risen] ** (2 * pair.order)))) * float(np.exp(-reading.log_gain))
+        sizes = {pair.first: first, pair.second: float(np.sqrt(excess.sum()))}
+        columns = [pair.first, pair.second] if guilty is None else [guilty]
+        column = min((sizes[one] / rms[one], one) for one in columns)[1]
+        if sizes[column] < LEAST_PART * rms[column]:
+            continue
+        states = tuple(window.states[one] for one in columns)
+        factor = float(np.exp(rise[row].max() / 2))
+        f = own.w[risen] / (2 * np.pi)
+        text = (
+            f"{naming.names(states)}: noise of {naming.value(window.states[column], sizes[column])} rms "
+            f"({sizes[column] / rms[column]:.0%} of what {naming.name(window.states[column])} shows) around "
+            f"{f[0]:.3g} to {f[-1]:.3g} Hz, up to {factor:.3g} times the healthy one, expected less than "
+            f"{np.exp(limit / 2):.2g} times: cable, earthing or amplifier"
+        )
+        if guilty is None:
+            text += "; which of the two it is does not show"
+        scatter = float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
+        findings.append(
+            SensorFinding(states, "noise", text, sizes[column] / float(rms[column]), float(rise[row].max()) / scatter)
+        )
+    return findings
+
+
+def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -> int | None:
+    """Which of two sensors is noisy, from their powers beyond what the other places say of the motion."""
+    spectra = matched(bands, reading)[risen]
+    power, n = np.maximum(np.einsum("bii->bi", spectra).real, np.finfo(float).tiny), spectra.shape[1]
+    own = spectra[:, :2, :2]
+    if n > 2:
+        scale = 1 / np.sqrt(power[:, 2:])
+        others = spectra[:, 2:, 2:] * scale[:, :, None] * scale[:, None, :] + 1e-9 * np.eye(n - 2)
+        along = spectra[:, :2, 2:] * scale[:, None, :]
+        own = own - along @ np.linalg.solve(others, along.conj().transpose(0, 2, 1))
+    z, v, cross = own[:, 0, 0].real, own[:, 1, 1].real, own[:, 1, 0].real
+    both = np.maximum(z + v - 2 * cross, 1e-12 * (z + v))  # sum of the noises; their difference is v - z
+    common = np.maximum(z + v + 2 * cross, 0.0)
+    variance = both * (common + both) / (2 * bands.averages[risen]) + (2 * reading.log_gain_error * common / 4) ** 2
+    weight = 1 / variance
+    share = float(weight @ (v - z) / (weight @ both))
+    error = float(1 / np.sqrt(weight.sum()) / (weight @ both / weight.sum()))
+    if error > _SURE or abs(share) < _CLEAR:
+        return None
+    return reading.pair.second if share > 0 else reading.pair.first
+
+
+def _of_single(
+    window: WindowStatistics, noises: Sequence[ChannelNoise], naming: Naming, reference: SensorReference
+) -> list[SensorFinding]:
+    known = []
+    for now in noises:
+        channel = reference.channel(window.states[now.column])
+        healthy = None if channel is None else channel.noise
+        if healthy is not None and len(healthy.density) == now.density.size:
+            known.append((now, healthy))
+    if not known:
+        return []
+    rise = _Known(
+        np.stack([now.density for now, _ in known]),
+        np.stack([now.share for now, _ in known]),
+        np.array([healthy.density for _, healthy in known]),
+        np.array([healthy.share for _, healthy in known]),
+    ).rise()
+    rms, findings = channel_rms(window), []
+    band_hz = float(window.frequencies_hz[-1] - window.frequencies_hz[0])
+    for row, (now, healthy) in enumerate(known):
+        state, own = window.states[now.column], float(rms[now.column])
+        whole, name = float(rise[row].mean()), naming.name(window.states[now.column])
+        size = float(np.sqrt(2 * band_hz * now.density.mean()))
+        if now.line_rms > max(LEAST_LINE * own, np.sqrt(LINE_RISE) * healthy.line_rms):
+            text = (
+                f"{name}: a line of {naming.value(state, now.line_rms)} rms at {now.line_hz:.4g} Hz that no other "
+                f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, healthy.line_rms)} on "
+                "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
+            )
+            findings.append(SensorFinding((state,), "noise", text, now.line_rms / own))
+        elif len(known) > _FEWEST_OTHERS and whole > np.log(TOP_RISE) and size > LEAST_PART * own:
+            text = (
+                f"{name}: noise of about {naming.value(state, size)} rms in the band ({size / own:.0%} of what it "
+                f"shows), {np.exp(whole / 2):.3g} times the healthy one at the top of the band while the other "
+                f"channels stayed, expected less than {np.sqrt(TOP_RISE):.2g} times: cable, earthing or amplifier"
+            )
+            findings.append(SensorFinding((state,), "noise", text, size / own, whole / _TOP_SCATTER))
+    return findings

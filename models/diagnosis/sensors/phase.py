@@ -1,0 +1,248 @@
+"""The phase reference: a shaft angle that loses pulses, jumps, slips, jitters, or turns at another speed.
+
+What turns with the shaft stands still when seen from the shaft. If the rotation-synchronous vectors of all channels
+turn together and keep their lengths, it is the angle that moved: a machine that changes, changes them each in its own
+way, and an unbalance that grows keeps its place.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.sensors.finding import FaultKind, Naming, SensorFinding
+from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+__all__ = ["phase_faults"]
+
+MOST_ERRORS = 8.0
+"""Standard errors beyond which the angle jumped or slips; the most probable of all moments is tested."""
+LEAST_JUMP_RAD = 0.35
+"""A smaller jump costs little and may be the machine's."""
+LEAST_SLIP_RAD = 0.2
+"""Slip from hop to hop; thermal bending turns vectors, too, but by less."""
+LEAST_JITTER = 0.05
+"""Power of the line left at the speed over that of the line taken out: jitter of 0.47 rad."""
+_STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.1
+"""Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number."""
+_FEWEST_HOPS, _FEWEST_SIDE = 6, 3
+_ALIKE = 0.25
+_STAY = 3.0
+_LENGTH = 0.15
+"""Relative change of the vectors' common length that still counts as none."""
+_LINE_BINS, _AROUND_BINS = 1, 12
+_LINE_STRENGTH = 15.0
+"""A line is one where the channels' mean power stands out by this factor."""
+_GONE, _THERE = 1 / 3, 3.0
+"""The rotation is gone below this part of its healthy amplitude, and is elsewhere within this factor of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Common:
+    """Vectors of all hops, each channel in units of its own noise, and what they have in common."""
+
+    vectors: ComplexArray
+    course: ComplexArray
+
+
+def phase_faults(
+    window: WindowStatistics, columns: Sequence[int], naming: Naming, reference: SensorReference | None
+) -> list[SensorFinding]:
+    """At most one finding on the shaft angle.
+
+    Parameters
+    ----------
+    window : WindowStatistics
+    columns : sequence of int
+        Channels that nothing is wrong with.
+    naming : Naming
+    reference : SensorReference or None
+        Without it a speed that contradicts the vibration is not found.
+    """
+    vectors, speed = window.hop_synchronous, window.speed_rad_s
+    if window.speed_source != "phase reference" or vectors is None or not columns or not abs(speed) > 0:
+        return []
+    name = naming.name("theta")
+    found = _lost(window, name) or _elsewhere(window, columns, name, reference)
+    if found is None and len(vectors) >= _FEWEST_HOPS and not window.removed_by_hop:
+        common = _common(columns, vectors)
+        found = _slip(window, common, name) or _jump(common, name) or _jitter(window, columns, vectors, name)
+    return [found] if found else []
+
+
+def _theta(kind: FaultKind, text: str, value: float, z: float | None = None) -> SensorFinding:
+    return SensorFinding(("theta",), kind, text, value, z)
+
+
+def _lost(window: WindowStatistics, name: str) -> SensorFinding | None:
+    """Whole turns that are missing from, or too many in, single hops of a shaft that is steady otherwise."""
+    hops = len(window.waveforms)
+    if hops < _FEWEST_HOPS:
+        return None
+    turns = window.hop_speed_rad_s * (window.duration_s / hops) / (2 * np.pi)
+    off = turns - np.median(turns)
+    steady = np.abs(off) < 3 * _STEADY_TURNS
+    if steady.all() or 2 * steady.sum() < hops or steady[0] + steady[-1] < 1:
+        return None
+    spread = float(1.4826 * np.median(np.abs(off[steady])))
+    strange = np.flatnonzero(~steady)
+    stretches = np.split(strange, np.flatnonzero(np.diff(strange) > 1) + 1)
+    sums = np.array([off[stretch].sum() for stretch in stretches])
+    whole = np.round(sums)
+    if spread > _STEADY_TURNS or np.any(whole == 0) or np.any(np.abs(sums - whole) > _WHOLE_TURNS):
+        return None
+    if any(stretch.size > 2 for stretch in stretches):
+        return None
+    lost = float(-whole.sum())
+    what = "lost" if lost > 0 else "counted too many"
+    text = (
+        f"{name}: {abs(whole).sum():.0f} whole turns {what} in {strange.size} of {hops} hops of a shaft that turns "
+        f"{np.median(turns):.4g} ± {spread:.2g} times in each otherwise: pulses are missing or doubled"
+    )
+    return _theta("incoherent", text, lost)
+
+
+def _surroundings(window: WindowStatistics, columns: Sequence[int], at: int) -> tuple[FloatArray, FloatArray]:
+    """Power of a line's bins beyond their surroundings, mean square; and the surroundings' density."""
+    power = np.einsum("fii->fi", window.spectrum).real[:, list(columns)]
+    low, high = max(0, at - _AROUND_BINS), min(power.shape[0], at + _AROUND_BINS + 1)
+    near = np.arange(low, high)
+    beside = np.median(power[near[np.abs(near - at) > _LINE_BINS + 1]], axis=0)
+    bins = power[max(0, at - _LINE_BINS) : at + _LINE_BINS + 1]
+    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
+    return np.asarray(2 * step_hz * (bins - beside).sum(axis=0)), np.asarray(beside)
+
+
+def _bin(window: WindowStatistics, speed_rad_s: float) -> int | None:
+    """Bin of a speed, if it lies inside the band."""
+    f = window.frequencies_hz
+    at = round((abs(speed_rad_s) / (2 * np.pi) - f[0]) / (f[1] - f[0]))
+    return at if 2 * _LINE_BINS < at < f.size - 2 * _LINE_BINS else None
+
+
+def _elsewhere(
+    window: WindowStatistics, columns: Sequence[int], name: str, reference: SensorReference | None
+) -> SensorFinding | None:
+    """The rotation that every channel used to show is gone from the angle's speed and stands at another one."""
+    vectors = window.hop_synchronous
+    if reference is None or vectors is None or window.frequencies_hz.size <= 4 * _AROUND_BINS:
+        return None
+    known = [(column, reference.channel(window.states[column])) for column in columns]
+    usual = {column: one.rotation for column, one in known if one is not None and one.rotation}
+    if len(usual) < min(2, len(columns)):
+        return None
+    there, amplitude = list(usual), np.array(list(usual.values()))
+    if np.median(np.abs(vectors[:, there].mean(axis=0)) / amplitude) > _GONE:
+        return None
+    power = np.einsum("fii->fi", window.spectrum).real[:, there]
+    count = power.shape[0] // _AROUND_BINS
+    rows = power[: count * _AROUND_BINS].reshape(count, _AROUND_BINS, -1)
+    ratio = (rows / np.maximum(np.median(rows, axis=1, keepdims=True), np.finfo(float).tiny)).mean(axis=2).ravel()
+    at = int(ratio[2:-2].argmax()) + 2
+    if ratio[at] < _LINE_STRENGTH:
+        return None
+    line, _ = _surroundings(window, there, at)
+    seen = np.sqrt(2 * np.maximum(line, 0.0)) / amplitude
+    if not 1 / _THERE < float(np.median(seen)) < _THERE:
+        return None
+    rpm, own_rpm = 60 * window.frequencies_hz[at], window.speed_rad_s * 30 / np.pi
+    text = (
+        f"{name}: turns at {own_rpm:.5g} rpm, but the rotation stands in the vibration at {rpm:.5g} rpm and not there: "
+        "the angle is not this shaft's, or pulses are missing throughout"
+    )
+    return _theta("incoherent", text, float(own_rpm / rpm))
+
+
+def _common(columns: Sequence[int], vectors: ComplexArray) -> _Common:
+    own = vectors[:, list(columns)]
+    size = np.sqrt((np.abs(own) ** 2).mean(axis=0))
+    noise = np.abs(np.diff(np.abs(own), axis=0)).mean(axis=0)
+    unit = own / np.maximum(noise, np.maximum(1e-3 * size, np.finfo(float).tiny))
+    left, singular, _ = np.linalg.svd(unit, full_matrices=False)
+    return _Common(unit, np.asarray(left[:, 0] * singular[0], dtype=np.complex128))
+
+
+def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFinding | None:
+    """The vectors keep their length and turn evenly, hop by hop."""
+    course = common.course
+    length = np.abs(course)
+    if length.std() > _ALIKE * length.mean():
+        return None
+    steps = np.angle(course[1:] * course[:-1].conj())
+    mean = float(np.angle(np.exp(1j * steps).mean()))
+    error = float(np.std(np.angle(np.exp(1j * (steps - mean))))) / np.sqrt(steps.size)
+    if abs(mean) < max(LEAST_SLIP_RAD, MOST_ERRORS * error):
+        return None
+    per_minute = mean / (2 * np.pi) * len(course) / window.duration_s * 60
+    text = (
+        f"{name}: slips against the vibration by {per_minute:+.3g} turns a minute, expected none: "
+        "the angle is not this shaft's, or pulses are missing throughout"
+    )
+    return _theta("incoherent", text, 1 + per_minute / (window.speed_rad_s * 30 / np.pi), abs(mean) / max(error, 1e-9))
+
+
+def _jump(common: _Common, name: str) -> SensorFinding | None:
+    """The vectors of all channels turned by one angle between two hops and kept their lengths."""
+    n = len(common.course)
+    best, at = 0.0, 0
+    for k in range(_FEWEST_SIDE, n - _FEWEST_SIDE + 1):
+        change, error = _turn(common.course[:, None], k)
+        z = abs(float(change[0])) / float(error[0])
+        if z > best:
+            best, at = z, k
+    if best < MOST_ERRORS:
+        return None
+    change, error = _turn(common.course[:, None], at)
+    value = float(change[0])
+    before, after = np.abs(common.course[: at - 1]), np.abs(common.course[at + 1 :])
+    longer = abs(float(after.mean() / before.mean()) - 1)
+    turns, errors = _turn(common.vectors, at)
+    together = np.abs(np.angle(np.exp(1j * (turns - value)))) < np.maximum(_STAY * errors, _ALIKE * abs(value))
+    clear = _STAY * errors < abs(value) / 2
+    if abs(value) < LEAST_JUMP_RAD or longer > _LENGTH or not np.all(together) or 2 * clear.sum() < clear.size:
+        return None
+    text = (
+        f"{name}: jumped by {np.degrees(-value):+.0f}° (± {np.degrees(float(error[0])):.1f}°) within the window: every "
+        "channel's rotation turned by as much and kept its length, expected a machine to change each in its own way"
+    )
+    return _theta("offset", text, -value, best)
+
+
+def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
+    """Angle of each column after hop k against before, hops next to it left out; and its standard error."""
+    before, after = vectors[: k - 1], vectors[k + 1 :]
+    first, second = before.mean(axis=0), after.mean(axis=0)
+    scatter = np.concatenate([np.angle(before * first.conj()), np.angle(after * second.conj())])
+    freedom = max(1, len(scatter) - 2)
+    variance = (scatter**2).sum(axis=0) / freedom
+    error = np.sqrt(variance * (1 / len(before) + 1 / len(after)))
+    return np.asarray(np.angle(second * first.conj())), np.asarray(np.maximum(error, 1e-3))
+
+
+def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, name: str) -> SensorFinding | None:
+    """The line at the speed stays in the spectrum although its mean was taken out and no hop's differs."""
+    at = _bin(window, window.speed_rad_s)
+    if at is None:
+        return None
+    left, beside = _surroundings(window, columns, at)
+    own = vectors[:, list(columns)]
+    moved = (np.abs(own - own.mean(axis=0)) ** 2).mean(axis=0) / 2
+    out = np.abs(own.mean(axis=0)) ** 2 / 2
+    bins = 2 * _LINE_BINS + 1
+    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
+    error = 2 * step_hz * beside * np.sqrt(bins * 2.0 / window.n_segments)
+    part, sure = (left - 2 * moved) / out, error / out
+    weight = 1 / sure**2
+    share = float(np.median(part))
+    z = float(np.median(part / sure))
+    if share < LEAST_JITTER or z < MOST_ERRORS or not float(weight.sum()) > 0:
+        return None
+    jitter_rad = float(np.sqrt(2 * np.arcsinh(np.sqrt(share) / 2)))
+    text = (
+        f"{name}: jitters by about {np.degrees(jitter_rad):.0f}° rms: {share:.0%} of the rotation's power is still in "
+        f"every channel after what is steady with the angle was taken out, expected less than {LEAST_JITTER:.0%}"
+    )
+    return _theta("noise", text, jitter_rad, z)
