@@ -12,11 +12,12 @@ from pathlib import Path
 
 import httpx
 import pytest
-from fastapi import FastAPI, WebSocket
+from fastapi import FastAPI, Request, Response, WebSocket
+from starlette.middleware.base import BaseHTTPMiddleware, RequestResponseEndpoint
 from structlog.testing import capture_logs
 
 from service.access.audit import STARTED
-from service.access.guard import AccessError
+from service.access.guard import AccessError, Guard
 from service.access.routes import undeclared_routes
 from service.access.scopes import Caller, Scope
 from service.access_settings import AccessSettings, LimitSettings
@@ -327,6 +328,25 @@ def test_large_bodies_are_refused_while_they_are_read(tmp_path: Path) -> None:
             assert "10000 bytes" in problem(client.post(path, content=pieces(50), headers=JSON), 413)
         assert monitor.done == ["shelve e ops"]
         assert [entry.status for entry in monitor.entries() if entry.status][-2:] == [413, 413]
+
+
+def test_what_others_make_of_a_body_that_was_cut_off_is_not_sent(tmp_path: Path) -> None:
+    """Between a middleware of this kind and the route the refusal turns into a bad request."""
+
+    async def passed_on(request: Request, call_next: RequestResponseEndpoint) -> Response:
+        return await call_next(request)
+
+    def build(guard: Guard, done: list[str]) -> FastAPI:
+        app = application(guard, done)
+        app.add_middleware(BaseHTTPMiddleware, dispatch=passed_on)
+        return app
+
+    limits = LimitSettings(body_bytes=1000)
+    with guarded(tmp_path, AccessSettings(limits=limits), build) as monitor:
+        with monitor.client(monitor.token(READ, OPERATE)) as client:
+            body = iter([b"x" * 600, b"x" * 600])
+            problem(client.post("/alarms/e/shelve", content=body, headers=JSON), 413)
+        assert not monitor.done
 
 
 def test_a_body_that_never_ends_is_cut_off(tmp_path: Path) -> None:
