@@ -2,14 +2,14 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from service.alarms.alarm import EventKind, Severity
 from service.alarms.life_cycle import AlarmState
-from service.window_schemas import JSON
 
 __all__ = [
     "EXAMPLE_NS",
+    "JSON",
     "Alarm",
     "AlarmCloudEvent",
     "AlarmEventData",
@@ -23,6 +23,7 @@ __all__ = [
     "Site",
 ]
 
+JSON = ConfigDict(extra="forbid", frozen=True)
 EXAMPLE_NS = 1767225805000000000
 
 Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]

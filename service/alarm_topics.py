@@ -1,0 +1,150 @@
+"""A follower's side of Zenoh: what happens to alarms as it is published, and the alarm log by query."""
+
+import json
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Literal
+
+import zenoh
+import zenoh.ext
+
+from models.errors import RotorwatchError
+from models.signals.keys import PREFIX
+from models.signals.link import LinkSettings
+from service.transport import Link
+
+__all__ = ["AlarmMessage", "AlarmTopics", "LogUnavailable"]
+
+_ANSWER_S = 5.0
+_CACHED_EVENTS = 200
+
+
+class LogUnavailable(RotorwatchError):  # noqa: N818  # said to whoever follows, by its name
+    """A monitor could not answer from its alarm log; the message is the monitor's."""
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmMessage:
+    """Something heard of a machine's alarms.
+
+    Attributes
+    ----------
+    place : str
+        ``<site>/<machine>``.
+    kind : {"event", "state", "monitor"}
+        An alarm event, the alarms as they are now, or a monitor that has come.
+    text : str
+        JSON; empty for a monitor.
+    """
+
+    place: str
+    kind: Literal["event", "state", "monitor"]
+    text: str
+
+
+class AlarmTopics:
+    """Subscriptions to the alarms of some machines, and questions to their monitors.
+
+    A connection that is lost comes back by itself; what was published in between is not heard.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Where to connect.
+    machines : sequence of str
+        ``<site>/<machine>``, where ``*`` stands for any.
+    hear : callable
+        Takes each message, on a thread of Zenoh's: be short. Latest states and events that monitors still have come at
+        once, possibly out of order and more than once.
+
+    Raises
+    ------
+    LinkError
+        If an endpoint is malformed, or a client finds nobody there. A peer waits in the background.
+    """
+
+    def __init__(self, settings: LinkSettings, machines: Sequence[str], hear: Callable[[AlarmMessage], None]) -> None:
+        self._hear = hear
+        with ExitStack() as undo:
+            self._link = Link(settings)
+            undo.callback(self._link.close)
+            for place in machines:
+                self._subscribe(f"{PREFIX}/{place}", undo)
+            self._undo = undo.pop_all()
+
+    def __enter__(self) -> "AlarmTopics":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the session."""
+        self._undo.close()
+
+    def ask(self, place: str, after: int, limit: int) -> str | None:
+        """Ask a machine's monitor for its alarm log.
+
+        Parameters
+        ----------
+        place : str
+            ``<site>/<machine>``.
+        after : int
+            Sequence number after which; -1 for the beginning.
+        limit : int
+            At most so many events, up to 1000.
+
+        Returns
+        -------
+        str or None
+            JSON of an `AlarmLogPage`; None if nobody answers within five seconds.
+
+        Raises
+        ------
+        LogUnavailable
+            If the monitor cannot read its history now.
+        """
+        refusal = ""
+        selector = f"{PREFIX}/{place}/alarm/event?after={after};limit={limit}"
+        for reply in self._link.session.get(selector, timeout=_ANSWER_S):
+            if reply.ok is not None:
+                return reply.ok.payload.to_string()
+            if reply.err is not None:
+                refusal = _refusal(reply.err.payload.to_bytes()) or refusal
+        if refusal:
+            raise LogUnavailable(refusal)
+        return None
+
+    def _subscribe(self, root: str, undo: ExitStack) -> None:
+        session, guarded = self._link.session, self._link.guarded
+        for suffix, kept in (("alarm/event", _CACHED_EVENTS), ("alarm/state", 1)):
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                session,
+                f"{root}/{suffix}",
+                guarded(self._take),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=kept),
+                recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            )
+            undo.callback(subscriber.undeclare)
+        alive = session.liveliness().declare_subscriber(f"{root}/alive/monitor", guarded(self._take), history=True)
+        undo.callback(alive.undeclare)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        _, site, machine, topic, what = str(sample.key_expr).split("/")
+        place = f"{site}/{machine}"
+        if topic == "alive":
+            self._hear(AlarmMessage(place, "monitor", ""))
+        else:
+            self._hear(AlarmMessage(place, "event" if what == "event" else "state", sample.payload.to_string()))
+
+
+def _refusal(payload: bytes) -> str:
+    """What a monitor says; empty for what Zenoh itself says, such as that time is up."""
+    try:
+        said = json.loads(payload)
+    except ValueError:
+        return ""
+    return str(said["error"]) if isinstance(said, dict) and "error" in said else ""

@@ -1,0 +1,183 @@
+"""Follows the alarm logs of machines over Zenoh: every event once, in order, from a given number on."""
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+from pydantic import ValidationError
+
+from models.signals.link import LinkSettings
+from service.alarm_schemas import AlarmCloudEvent, AlarmLogPage, AlarmStates
+from service.alarm_topics import AlarmMessage, AlarmTopics, LogUnavailable
+from service.client.errors import ClientError
+from service.client.log_order import LogOrder
+
+__all__ = ["follow_alarms"]
+
+_PAGE = 500
+_QUEUED = 10_000
+_STOP_S = 0.25
+_HOLE_S = 0.1
+
+_log = logging.getLogger("rotorwatch.client")
+
+
+def follow_alarms(
+    link: LinkSettings,
+    machines: Sequence[str],
+    after: Mapping[str, int],
+    on_event: Callable[[AlarmCloudEvent], None],
+    *,
+    stop: threading.Event | None = None,
+    ask_every_s: float = 2.0,
+) -> None:
+    """Hand over every alarm event of some machines, once and in order, until told to stop.
+
+    Events come as they happen. What was missed, because this program, the connection or the monitor was away, is
+    asked for; while nobody answers this waits. Whoever keeps the sequence number of the last event handed over and
+    gives it back as `after` has the log without a hole and without a repetition.
+
+    Parameters
+    ----------
+    link : LinkSettings
+        Where to connect.
+    machines : sequence of str
+        ``<site>/<machine>``, where ``*`` stands for any.
+    after : mapping of str to int
+        Sequence number of the last event already taken, by machine; a machine that is not in it is followed from the
+        beginning.
+    on_event : callable
+        Takes one event after the other, in this thread; the next one comes after it has returned. If it raises, this
+        ends with the same exception, and the event counts as not taken.
+    stop : threading.Event, optional
+        Set it to end; without it this goes on for ever.
+    ask_every_s : float
+        How often each log is asked for what may have been missed, in seconds.
+
+    Raises
+    ------
+    LinkError
+        If an endpoint is malformed, or (as a client) nobody answers there at the start.
+    LogReplaced
+        If a log is not the one that was followed: it ends before `after`, or its last event has changed.
+    ClientError
+        If a monitor sends something that this version does not understand.
+    """
+    _Follower(machines, after, on_event, stop or threading.Event(), ask_every_s).run(link)
+
+
+class _Follower:
+    def __init__(
+        self,
+        machines: Sequence[str],
+        after: Mapping[str, int],
+        on_event: Callable[[AlarmCloudEvent], None],
+        stop: threading.Event,
+        ask_every_s: float,
+    ) -> None:
+        self._machines = tuple(machines)
+        self._after = after
+        self._on_event = on_event
+        self._stop = stop
+        self._ask_every_s = ask_every_s
+        self._heard: queue.Queue[AlarmMessage] = queue.Queue(_QUEUED)
+        self._orders: dict[str, LogOrder] = {}
+        self._due_s: dict[str, float] = {}
+        self._silent: set[str] = set()
+        for place in self._machines:
+            if "*" not in place:
+                self._order(place)
+
+    def run(self, link: LinkSettings) -> None:
+        with AlarmTopics(link, self._machines, self._hear) as topics:
+            while not self._stop.is_set():
+                now_s = time.monotonic()
+                due = [place for place, due_s in self._due_s.items() if due_s <= now_s]
+                for place in due:
+                    self._ask(topics, self._orders[place])
+                next_s = min(self._due_s.values(), default=now_s + _STOP_S)
+                self._listen(min(_STOP_S, max(0.0, next_s - time.monotonic())))
+
+    def _hear(self, message: AlarmMessage) -> None:
+        """Put a message into the queue, on Zenoh's thread; what does not fit in is a hole like any other."""
+        try:
+            self._heard.put_nowait(message)
+        except queue.Full:
+            _log.debug("%s: a message was left out, it will be read from the log", message.place)
+
+    def _order(self, place: str) -> LogOrder:
+        if place not in self._orders:
+            self._orders[place] = LogOrder(place, self._after.get(place, -1))
+            self._due_s[place] = 0.0
+        return self._orders[place]
+
+    def _listen(self, timeout_s: float) -> None:
+        try:
+            message = self._heard.get(timeout=timeout_s)
+        except queue.Empty:
+            return
+        order = self._order(message.place)
+        if message.kind == "monitor":
+            self._due_s[message.place] = 0.0
+            return
+        try:
+            if message.kind == "event":
+                order.hear(AlarmCloudEvent.model_validate_json(message.text))
+            else:
+                order.announce(AlarmStates.model_validate_json(message.text).sequence)
+        except ValidationError as error:
+            # Whoever sent it: what counts is what the log says.
+            _log.warning("%s", _unknown(message.place, error))
+            self._due_s[message.place] = 0.0
+            return
+        self._hand_over(order)
+        if order.incomplete:
+            # A moment's patience: what is missing may be on its way.
+            self._due_s[message.place] = min(self._due_s[message.place], time.monotonic() + _HOLE_S)
+
+    def _ask(self, topics: AlarmTopics, order: LogOrder) -> None:
+        """Read the log up to its end."""
+        self._due_s[order.place] = time.monotonic() + self._ask_every_s
+        while not self._stop.is_set():
+            before = order.last
+            page = self._page(topics, order)
+            if page is None:
+                return
+            try:
+                order.read(AlarmLogPage.model_validate_json(page))
+            except ValidationError as error:
+                raise _unknown(order.place, error) from error
+            self._hand_over(order)
+            if not order.incomplete:
+                return
+            if order.last == before:  # announced and not committed yet
+                self._due_s[order.place] = time.monotonic() + min(1.0, self._ask_every_s)
+                return
+
+    def _page(self, topics: AlarmTopics, order: LogOrder) -> str | None:
+        trouble = "nobody answers"
+        try:
+            page = topics.ask(order.place, order.ask_after, _PAGE)
+        except LogUnavailable as error:
+            page, trouble = None, str(error)
+        if page is None and order.place not in self._silent:
+            self._silent.add(order.place)
+            _log.warning("%s: the alarm log cannot be read at present: %s", order.place, trouble)
+        elif page is not None and order.place in self._silent:
+            self._silent.discard(order.place)
+            _log.warning("%s: the alarm log can be read again", order.place)
+        return page
+
+    def _hand_over(self, order: LogOrder) -> None:
+        while not self._stop.is_set() and (event := order.next()) is not None:
+            self._on_event(event)
+            order.taken()
+
+
+def _unknown(place: str, error: ValidationError) -> ClientError:
+    return ClientError(
+        f"{place}: what was received is not what this version understands; do versions differ? "
+        f"{error.errors()[0]['loc']}: {error.errors()[0]['msg']}"
+    )
