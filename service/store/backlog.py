@@ -140,7 +140,7 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
         for end_ns, _ in step.checkpoint.new_hops:
             _times(machine, "hop of the checkpoint", end_ns=end_ns)
         _texts(machine, "checkpoint", head.bundle or "", head.machine_hash, head.code_version, head.alarms)
-    compressor = zstandard.ZstdCompressor(level=9)
+    compressor = zstandard.ZstdCompressor()
     return tuple(PackedReport(each, recorded_ns, compressor.compress(each.text.encode())) for each in step.reports)
 
 

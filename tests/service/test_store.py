@@ -463,10 +463,10 @@ def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
 
         async def settings() -> list[object]:
             async with store._database.reading() as connection:
-                names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
+                names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size")
                 return [await connection.scalar(text(f"PRAGMA {name}")) for name in names]
 
-        assert store._database.call(settings) == ["wal", 2, 1, 5000]
+        assert store._database.call(settings) == ["wal", 2, 1, 5000, 8192]
     finally:
         store.close()
     with sqlite3.connect(file) as connection:
