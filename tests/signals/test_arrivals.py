@@ -1,0 +1,271 @@
+"""Blocks that the network delivered twice, late or not at all: the gate sees what it would have seen in order."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.arrivals import Arrivals
+from models.ingest import Gate, Reason
+from models.machine import load_machine
+from models.signals.block import SampleBlock
+
+MACHINE = load_machine("lab")
+START_NS, STEP_NS, LENGTH = 1_800_000_000_000_000_000, 100_000_000, 200
+SAMPLES = np.random.default_rng(1).standard_normal((LENGTH, 9)).astype(np.float32)
+BOUND = 5
+
+
+def block(number: int, *, sequence: int | None = None, run: int = 1, shift_ns: int = 0) -> SampleBlock:
+    start_ns = START_NS + number * STEP_NS + shift_ns
+    return SampleBlock(start_ns, number if sequence is None else sequence, run, 2000.0, SAMPLES)
+
+
+def told(blocks: Iterable[SampleBlock]) -> list[tuple[int, int, int]]:
+    return [(one.run, one.sequence, one.start_ns) for one in blocks]
+
+
+def ordered(stream: Iterable[SampleBlock], bound: int = BOUND, arrivals: Arrivals | None = None) -> list[SampleBlock]:
+    """What goes on to the gate, with the end of the stream."""
+    arrivals = Arrivals(bound) if arrivals is None else arrivals
+    found = []
+    for one in stream:
+        found += [arrived.block for arrived in arrivals.take(one)]
+        assert arrivals.waiting <= bound
+    found += [arrived.block for arrived in arrivals.flush()]
+    assert arrivals.waiting == 0
+    return found
+
+
+def accepted(stream: Iterable[SampleBlock], gate: Gate | None = None) -> list[tuple[tuple[int, int, int], str]]:
+    """Accepted blocks and what the gate says of each."""
+    gate = Gate(MACHINE) if gate is None else gate
+    verdicts = [(one, gate.judge(one)) for one in stream]
+    return [(*told([one]), verdict.text) for one, verdict in verdicts if verdict.accepted]
+
+
+def refused(stream: Iterable[SampleBlock]) -> list[Reason]:
+    gate = Gate(MACHINE)
+    return [verdict.reason for one in stream if (verdict := gate.judge(one)).reason is not None]
+
+
+def delivered(
+    stream: Sequence[SampleBlock], late: Sequence[int], again: Sequence[tuple[int, int]]
+) -> list[SampleBlock]:
+    """The stream with each block overtaken by up to `late` others, and repetitions later on."""
+    keys = [number + extra for number, extra in zip(range(len(stream)), late, strict=True)]
+    order = sorted(range(len(stream)), key=lambda number: (keys[number], -number))
+    found = [stream[number] for number in order]
+    for which, after in again:
+        # Not before its original has arrived: what comes first is the original.
+        at = order.index(which % len(stream)) + 1
+        found.insert(min(len(found), at + after), stream[which % len(stream)])
+        order.insert(min(len(order), at + after), -1)
+    return found
+
+
+def lateness(n: int, bound: int = BOUND) -> st.SearchStrategy[list[int]]:
+    return st.lists(st.integers(0, bound), min_size=n, max_size=n)
+
+
+repetitions = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 80)), max_size=12)
+N = 40
+
+
+@settings(max_examples=300, deadline=None)
+@given(lateness(N), repetitions)
+def test_reordering_and_repetition_change_nothing(late: list[int], again: list[tuple[int, int]]) -> None:
+    stream = [block(number) for number in range(N)]
+    arriving = delivered(stream, late, again)
+    gone_on = ordered(arriving)
+    assert accepted(gone_on) == accepted(stream)
+    assert len(gone_on) == len(arriving)  # the gate hears of every repetition
+    assert refused(gone_on) == [Reason.OVERLAP] * len(again)
+
+
+@settings(max_examples=300, deadline=None)
+@given(lateness(N), repetitions, st.sets(st.integers(1, N - 1), max_size=12))
+def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tuple[int, int]], lost: set[int]) -> None:
+    whole = [block(number) for number in range(N)]
+    stream = [one for one in whole if one.sequence not in lost]
+    arriving = [one for one in delivered(whole, late, again) if one.sequence not in lost]
+    assert accepted(ordered(arriving)) == accepted(stream)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    lateness(3 * N),
+    repetitions,
+    st.sampled_from([-3600, -50, -2, 0, 2, 900, 7200]),
+    st.integers(-20, 400),
+    st.booleans(),
+)
+def test_a_clock_that_is_set_and_a_restart_change_nothing(
+    late: list[int], again: list[tuple[int, int]], clock_s: int, pause: int, has_run: bool
+) -> None:
+    """As without arrivals, and repetitions of blocks from before are still repetitions."""
+    run = 2 if has_run else 1
+    first = [block(number) for number in range(N)]
+    second = [block(number, shift_ns=clock_s * 10**9) for number in range(N, 2 * N)]
+    third = [
+        block(number + 2 * N + pause, sequence=number if has_run else 2 * N + number, run=run, shift_ns=clock_s * 10**9)
+        for number in range(N)
+    ]
+    stream = [*first, *second, *third]
+    assert accepted(ordered(stream)) == accepted(stream)
+    # Blocks of different runs overtake each other only if a publisher overtakes its own restart.
+    late[N * 2 - BOUND : 2 * N] = [0] * BOUND
+    gone_on = ordered(delivered(stream, late, again))
+    assert accepted(gone_on) == accepted(stream)
+
+
+def test_any_block_may_be_repeated_anywhere() -> None:
+    """A wild time, a clock set back, set ahead, and a restart: every block repeated after every later one."""
+    back, ahead = -1000 * 10**9, 9000 * 10**9
+    stream = [
+        *(block(number) for number in range(4)),
+        block(4, shift_ns=10**12),
+        *(block(number) for number in range(5, 7)),
+        *(block(number, shift_ns=back) for number in range(7, 20)),
+        *(block(number, shift_ns=ahead) for number in range(20, 33)),
+        *(block(number, sequence=number - 33, run=2, shift_ns=ahead) for number in range(33, 36)),
+    ]
+    expected = accepted(stream)
+    assert len(expected) == len(stream) - 1 - 9 - 9
+    for which in range(len(stream)):
+        for after in range(which, len(stream)):
+            arriving = [*stream[: after + 1], stream[which], *stream[after + 1 :]]
+            assert accepted(arriving) == expected, (which, after)
+            assert accepted(ordered(arriving)) == expected, (which, after)
+
+
+@settings(max_examples=200, deadline=None)
+@given(lateness(N), repetitions, st.lists(st.integers(0, N), max_size=3))
+def test_restarts_of_the_monitor_change_nothing(
+    late: list[int], again: list[tuple[int, int]], stops: list[int]
+) -> None:
+    """What waited is lost with the monitor and comes again, with much else, from the publisher's cache."""
+    stream = [block(number) for number in range(N)]
+    arriving = delivered(stream, late, again)
+    gate, arrivals = Gate(MACHINE), Arrivals(BOUND)
+    found = []
+    for number, one in enumerate(arriving):
+        for _ in range(stops.count(number)):
+            state = gate.checkpoint()
+            gate, arrivals = Gate(MACHINE), Arrivals(BOUND)
+            gate.restore(state)
+            arrivals.resume(gate.courses)
+            for cached in sorted(arriving[:number], key=lambda each: each.sequence)[-30:]:
+                found += accepted((each.block for each in arrivals.take(cached)), gate)
+        found += accepted((each.block for each in arrivals.take(one)), gate)
+    found += accepted((each.block for each in arrivals.flush()), gate)
+    assert found == accepted(stream)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 12), st.integers(0, 2), st.integers(-30, 30), st.sampled_from([0, 1, 2**64 - 2])),
+        max_size=80,
+    ),
+    st.integers(0, 4),
+)
+def test_whatever_comes_goes_on_and_memory_is_bounded(coming: list[tuple[int, int, int, int]], bound: int) -> None:
+    stream = [
+        block(number, sequence=number + far, run=run, shift_ns=wrong * STEP_NS) for number, run, wrong, far in coming
+    ]
+    arrivals = Arrivals(bound)
+    gone_on = []
+    for one in stream:
+        gone_on += [arrived.block for arrived in arrivals.take(one)]
+        held = {id(each) for copies in arrivals._waiting.values() for each in copies}
+        assert len(held) <= bound
+    gone_on += [arrived.block for arrived in arrivals.flush()]
+    # Every block goes on, as often as it came; beyond `bound` copies of one that waits nobody counts.
+    assert set(told(gone_on)) == set(told(stream))
+    assert len(gone_on) <= len(stream)
+    if bound == 0:
+        assert gone_on == stream
+
+
+def test_a_hole_is_waited_for_and_given_up_at_the_bound() -> None:
+    arrivals = Arrivals(3)
+
+    def took(number: int) -> list[int]:
+        return [arrived.block.sequence for arrived in arrivals.take(block(number))]
+
+    assert [took(number) for number in (0, 2, 3, 4)] == [[0], [], [], []]
+    assert arrivals.waiting == 3
+    assert took(6) == [2, 3, 4]  # block 1 is given up, block 5 is not
+    assert arrivals.waiting == 1
+    assert took(5) == [5, 6]
+    assert took(1) == [1]  # too late; the gate says so
+    assert took(7) == [7]
+    assert took(9) == []
+    assert [arrived.block.sequence for arrived in arrivals.flush()] == [9]
+    assert took(10) == [10]
+
+
+def test_repetitions_of_a_waiting_block_follow_it() -> None:
+    arrivals = Arrivals(2)
+    other = replace(block(2), samples=SAMPLES + 1)
+    for one in (block(0), block(2), block(2), block(2), block(2), other):
+        arrivals.take(one)
+    assert arrivals.waiting == 1
+    gone_on = [arrived.block for arrived in arrivals.take(block(1))]
+    assert [one.sequence for one in gone_on] == [1, 2, 2, 2, 2]  # not more copies than the bound
+    assert gone_on[-1] is other  # another content under the same number is not thrown away
+    assert refused([block(0), *gone_on]) == [Reason.OVERLAP] * 3
+
+
+def test_a_stream_that_is_joined_late_begins_at_once_and_a_young_one_waits_for_its_beginning() -> None:
+    late, young = Arrivals(3), Arrivals(3)
+    assert len(late.take(block(36_000))) == 1
+    assert young.take(block(2)) == ()
+    assert young.take(block(1)) == ()
+    assert [arrived.block.sequence for arrived in young.take(block(0))] == [0, 1, 2]
+
+
+def test_another_run_ends_the_waiting_of_the_one_before() -> None:
+    arrivals = Arrivals(3)
+    for number in (0, 2):
+        arrivals.take(block(number))
+    gone_on = [arrived.block for arrived in arrivals.take(block(9, sequence=0, run=2))]
+    assert told(gone_on) == told([block(2), block(9, sequence=0, run=2)])
+    arrivals.take(block(11, sequence=2, run=2))
+    assert len(arrivals.take(block(0))) == 1  # a repetition of the old run does not end the waiting of the new one
+    assert arrivals.waiting == 1
+
+
+def test_blocks_of_odd_form_keep_their_place() -> None:
+    broken = replace(block(2), samples=np.full((LENGTH, 9), np.nan, np.float32))
+    narrow = replace(block(3), samples=np.zeros((LENGTH, 2), np.float32))
+    arriving = [block(0), narrow, block(4), broken, broken, block(1)]
+    gone_on = ordered(arriving)
+    assert told(gone_on) == told([block(0), block(1), broken, broken, narrow, block(4)])
+    assert refused(gone_on) == [Reason.NOT_FINITE] * 2 + [Reason.CHANNELS]
+
+
+def test_a_restored_gate_says_what_is_expected() -> None:
+    arrivals = Arrivals(3)
+    arrivals.expect(run=1, sequence=7)
+    assert len(arrivals.take(block(3))) == 1  # there already
+    assert arrivals.take(block(8)) == ()
+    assert [arrived.block.sequence for arrived in arrivals.take(block(7))] == [7, 8]
+    arrivals.resume(())
+    assert [arrived.block.sequence for arrived in arrivals.take(block(100))] == [100]
+
+
+def test_the_schema_hash_stays_with_its_block() -> None:
+    arrivals = Arrivals(3)
+    arrivals.take(block(0), "a")
+    arrivals.take(block(2), "c")
+    assert [(one.block.sequence, one.schema_hash) for one in arrivals.take(block(1), "b")] == [(1, "b"), (2, "c")]
+
+
+def test_a_negative_bound_is_refused() -> None:
+    with pytest.raises(ValueError, match="bound is -1, expected 0 or more"):
+        Arrivals(-1)
