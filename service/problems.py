@@ -107,7 +107,7 @@ def add_problems(app: FastAPI) -> None:
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
         if not isinstance(error, RequestValidationError):
             raise error
-        faults = [{"field": str(fault["loc"][-1]), "message": str(fault["msg"])} for fault in error.errors()]
+        faults = [{"field": _field(fault["loc"]), "message": str(fault["msg"])} for fault in error.errors()]
         detail = "; ".join(f"{fault['field']}: {fault['message']}" for fault in faults)
         return problem_answer(request, 422, detail, {"errors": faults})
 
@@ -122,6 +122,11 @@ def add_problems(app: FastAPI) -> None:
     for kind, handler in handlers.items():
         app.add_exception_handler(kind, handler)
     app.add_middleware(_LastResort)
+
+
+def _field(place: tuple[str | int, ...]) -> str:
+    """Innermost name of where a fault is; numbers count the values of a field."""
+    return next(part for part in reversed(place) if isinstance(part, str))
 
 
 class _LastResort:
