@@ -1,0 +1,371 @@
+"""A day of a machine's life through the real service, with all that goes wrong, against the same day offline.
+
+Run: ``python benchmarks/soak.py --hours 24 --seed 1`` (hours of data). A simulated rotor kit changes its parameters now
+and then; probes get stuck; blocks are lost, repeated and swapped; the monitor is killed (SIGKILL) in the middle of its
+work and started again; followers of the alarm log come, are killed and come back. The same blocks go, in order and
+undisturbed, through the data path in one process of their own. In the end the log in the database, the log that the
+followers wrote down and the offline log must be the same, event by event. Exit code 1 if they are not.
+
+In the last third the monitor is left alone, to see whether its memory stays where it is.
+"""
+
+import argparse
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import httpx
+import numpy as np
+import zenoh
+
+import models
+from models.alarm_names import STREAM_LOST
+from models.commissioning.installed import install
+from models.machine import Machine, load_machine
+from models.signals.block import SampleBlock
+from models.signals.link import LinkSettings
+from service.alarm_schemas import AlarmCloudEvent
+from service.client.alarm_log import follow_alarms
+from service.monitor import MachineMonitor
+from service.store.retention import Retention
+from service.store.store import Store
+from simulator.publisher import PublishSettings, publish
+from simulator.scenario import Scenario, load_scenario
+from simulator.stream import blocks
+
+_PLACE = "demo/lab"
+_BLOCK_S = 0.5
+_START_NS = 1_767_225_600_000_000_000
+_AHEAD = 80
+"""Blocks that may be on their way; a publisher keeps 300."""
+_FAULTS = {"k_by": (-0.35, -0.2, 0.4), "k_bz": (-0.35, 0.4), "c_by": (-0.5, 0.8), "c_bz": (-0.5, 0.8), "e": (0.5, 1.0)}
+_PAGE = 1000
+
+
+def machine_file(folder: Path) -> Path:
+    """The shipped rotor kit, for which a minute without data is no lost stream: the day is played much faster."""
+    text = (Path(models.__file__).parent / "machines" / "lab.toml").read_text(encoding="utf-8")
+    path = folder / "lab.toml"
+    path.write_text(f"{text}\n[ingest]\nno_data_after_s = 60.0\n", encoding="utf-8")
+    return path
+
+
+def story(seed: int, hours: float) -> Scenario:
+    """Faults that come and go: one parameter at a time, for five to twenty minutes, every half an hour or so."""
+    rng = np.random.default_rng([seed, 1])
+    events, at_s = [], 400.0
+    while at_s < hours * 3600 - 300:
+        name = str(rng.choice(sorted(_FAULTS)))
+        events.append({"at_s": at_s, "parameter": name, "relative_change": float(rng.choice(_FAULTS[name]))})
+        at_s += float(rng.uniform(300, 1200))
+        events.append({"at_s": at_s, "parameter": name, "relative_change": 0.0})
+        at_s += float(rng.uniform(300, 1800))
+    events = [event for event in events if float(str(event["at_s"])) < hours * 3600]
+    loaded, _ = load_scenario("healthy")
+    return Scenario.model_validate(loaded.model_dump() | {"duration_s": hours * 3600, "seed": seed, "events": events})
+
+
+def lived(machine: Machine, seed: int, hours: float) -> Iterator[SampleBlock]:
+    """Blocks that leave the machine, in order: some are lost for good, and now and then a probe is stuck."""
+    rng = np.random.default_rng([seed, 2])
+    lost = stuck = 0
+    for block, _ in blocks(story(seed, hours), machine, _BLOCK_S, _START_NS):
+        draw = rng.random(3)
+        if lost == 0 and draw[0] < 1 / 2400:  # every twenty minutes
+            lost = int(rng.choice([1, 4, 20, 60, 260]))
+        if stuck == 0 and draw[1] < 1 / 7200:  # every hour
+            stuck = int(rng.integers(60, 300))
+        if stuck:
+            stuck -= 1
+            block.samples[:, 0] = 12.5
+        if lost:
+            lost -= 1
+        else:
+            yield block
+
+
+def offline(file: Path, seed: int, hours: float) -> None:
+    """Print the log of alarms, one line an event."""
+    machine = load_machine(file)
+    monitor = MachineMonitor(install(machine, None))
+    for block in lived(machine, seed, hours):
+        for event in monitor.step(block).events:
+            alarm = event.alarm
+            shown = (event.kind, alarm.name, event.time_ns, alarm.occurrence, alarm.severity, alarm.state, alarm.change)
+            print(json.dumps(shown), flush=True)
+
+
+def follow(endpoint: str, path: Path) -> None:
+    """Write the alarm log into a file, going on after its last whole line, until killed."""
+    kept = path.read_bytes() if path.exists() else b""
+    whole = kept[: kept.rfind(b"\n") + 1]
+    last = AlarmCloudEvent.model_validate_json(whole.splitlines()[-1]).data.sequence if whole else -1
+    with path.open("r+b" if path.exists() else "w+b") as file:
+        file.truncate(len(whole))
+        file.seek(len(whole))
+
+        def keep(event: AlarmCloudEvent) -> None:
+            file.write(f"{event.model_dump_json()}\n".encode())
+            file.flush()
+            os.fsync(file.fileno())
+
+        follow_alarms(LinkSettings(mode="client", connect=(endpoint,)), [_PLACE], {_PLACE: last}, keep)
+
+
+@dataclass
+class Plant:
+    """The monitor, whoever follows it, and what is seen of them."""
+
+    folder: Path
+    file: Path
+    endpoint: str
+    rng: np.random.Generator
+    process: subprocess.Popen[bytes] | None = None
+    url: str = ""
+    reports: int = 0
+    kills: int = 0
+    follower: subprocess.Popen[bytes] | None = None
+    follower_kills: int = 0
+    memory_mb: list[tuple[float, float]] = field(default_factory=list)
+
+    def settings(self) -> Path:
+        """Settings of the monitor."""
+        path = self.folder / "monitor.toml"
+        path.write_text(
+            f'[link]\nlisten = ["{self.endpoint}"]\n[http]\nport = 0\n[access]\nopen_on_loopback = true\n'
+            f'[history]\nurl = "sqlite:///{self.folder / "history.sqlite"}"\n'
+            f'[queue]\nblocks = 40\nwhen_full = "wait"\n[[machines]]\nfile = "{self.file}"\n',
+            encoding="utf-8",
+        )
+        return path
+
+    def start(self) -> None:
+        """Start the monitor and wait until it listens."""
+        log = self.folder / "monitor.log"
+        with log.open("ab") as sink:
+            position = log.stat().st_size
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "service.rotorwatch", "run", "--config", str(self.settings())],
+                stdout=sink,
+                stderr=sink,
+                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            )
+        while (line := self._line(log, position, "HTTP API ")) is None:
+            if self.process.poll() is not None:
+                raise SystemExit(f"the monitor ended:\n{log.read_text(encoding='utf-8')[position:]}")
+            time.sleep(0.05)
+        self.url = line
+
+    @staticmethod
+    def _line(log: Path, position: int, begin: str) -> str | None:
+        for line in log.read_text(encoding="utf-8")[position:].splitlines():
+            if line.startswith(begin):
+                return line.removeprefix(begin)
+        return None
+
+    def kill(self) -> None:
+        """Kill -9, and up again; wait until the publisher's cache arrives."""
+        assert self.process is not None  # noqa: S101  # for the type checker
+        self.process.kill()
+        self.process.wait()
+        self.kills += 1
+        self.start()
+        while True:
+            health = httpx.get(f"{self.url}/api/v1/machines/{_PLACE}/health", trust_env=False).json()
+            if health["quality"]["accepted_blocks"] or health["quality"]["refused_blocks"]:
+                break
+            time.sleep(0.05)
+        self.reports += 1  # what was on its way has been lost or has arrived
+
+    def toggle_follower(self) -> None:
+        """Kill the follower if there is one, otherwise let one join."""
+        if self.follower is None:
+            self.follower = subprocess.Popen(
+                [sys.executable, __file__, "--follow", self.endpoint, "--into", str(self.folder / "followed.jsonl")]
+            )
+        else:
+            self.follower.kill()
+            self.follower.wait()
+            self.follower = None
+            self.follower_kills += 1
+
+    def weigh(self, data_h: float) -> None:
+        """Note the monitor's memory."""
+        assert self.process is not None  # noqa: S101  # for the type checker
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text(encoding="utf-8").split()[1])
+        self.memory_mb.append((data_h, pages * os.sysconf("SC_PAGE_SIZE") / 1e6))
+
+
+def disturbed(plant: Plant, machine: Machine, seed: int, hours: float) -> Iterator[tuple[SampleBlock, tuple[()]]]:
+    """The same blocks as they arrive: repeated, swapped; the monitor is killed in between."""
+    rng, newest, sent, since = plant.rng, 0.0, 0, 0
+    stream = lived(machine, seed, hours)
+    recent: list[SampleBlock] = []
+    kills_per_block = 40 / (24 * 3600 / _BLOCK_S)
+    for first in stream:
+        pair = [first]
+        if rng.random() < 0.01:
+            pair = [*islice(stream, int(rng.integers(1, 6))), first]  # overtaken by some
+        for block in pair:
+            while plant.reports == since and sent >= _AHEAD:
+                time.sleep(0.002)
+            if plant.reports != since:
+                since, sent = plant.reports, 0
+            yield block, ()
+            sent += 1
+            newest = max(newest, (block.end_ns - _START_NS) / 3.6e12)
+            recent = [*recent[-100:], block]
+            if rng.random() < 0.02:
+                yield recent[int(rng.integers(0, len(recent)))], ()
+        if newest < hours * 2 / 3 and rng.random() < kills_per_block:
+            plant.kill()
+            print(f"  {newest:6.2f} h  monitor killed", flush=True)
+        if rng.random() < 2 * kills_per_block:
+            plant.toggle_follower()
+        if not plant.memory_mb or newest - plant.memory_mb[-1][0] >= hours / 96:
+            plant.weigh(newest)
+
+
+def counting(plant: Plant, session: zenoh.Session, machine: Machine) -> "zenoh.Subscriber[None]":
+    """Count the reports that the monitor publishes."""
+
+    def take(sample: zenoh.Sample) -> None:
+        del sample
+        plant.reports += 1
+
+    return session.declare_subscriber(machine.keys.report, take)
+
+
+def free_endpoint() -> str:
+    """A free address on loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def live(plant: Plant, machine: Machine, seed: int, hours: float) -> None:
+    """Play the day."""
+    plant.start()
+    config = zenoh.Config()
+    for path, value in LinkSettings(mode="client", connect=(plant.endpoint,)).zenoh_items().items():
+        config.insert_json5(path, value)
+    with zenoh.open(config) as session:
+        subscriber = counting(plant, session, machine)
+        settings = PublishSettings(
+            link=LinkSettings(connect=(plant.endpoint,)), pace=None, wait_for_subscriber_s=60.0, linger_s=0, drain_s=60
+        )
+        publish(machine, disturbed(plant, machine, seed, hours), settings)
+        subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+def differences(expected: list[list[object]], events: list[AlarmCloudEvent]) -> list[str]:
+    """Where the log is not the offline one."""
+    found = [f"sequence {at} is {one.data.sequence}" for at, one in enumerate(events) if one.data.sequence != at]
+    last_ns = max((int(str(one[2])) for one in expected), default=0)
+    logged: list[list[object]] = [
+        [d.kind, d.name, d.time_ns, d.occurrence, d.severity, d.state, d.relative_change]
+        for d in (one.data for one in events)
+        if d.name != STREAM_LOST or d.time_ns <= last_ns  # the silence after the end is part of no recording
+    ]
+    for number in range(max(len(expected), len(logged))):
+        one = expected[number] if number < len(expected) else None
+        other = logged[number] if number < len(logged) else None
+        if one != other:
+            found.append(f"event {number}: offline {one}, live {other}")
+    return found[:20]
+
+
+def main() -> None:
+    """Play the day, compare, say what was seen."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--hours", type=float, default=24.0)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--offline", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--follow", help=argparse.SUPPRESS)
+    parser.add_argument("--into", type=Path, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[variable] = "1"
+    if given.offline is not None:
+        offline(given.offline, given.seed, given.hours)
+        return
+    if given.follow is not None:
+        follow(given.follow, given.into)
+        return
+    with tempfile.TemporaryDirectory(prefix="rotorwatch-soak-") as place:
+        sys.exit(soak(Path(place), given.seed, given.hours))
+
+
+def soak(folder: Path, seed: int, hours: float) -> int:
+    """Run both and compare."""
+    file, begin_s = machine_file(folder), time.monotonic()
+    machine = load_machine(file)
+    arguments = ["--offline", str(file), "--hours", str(hours), "--seed", str(seed)]
+    with (folder / "offline.jsonl").open("wb") as sink:
+        undisturbed = subprocess.Popen([sys.executable, __file__, *arguments], stdout=sink)
+    plant = Plant(folder, file, free_endpoint(), np.random.default_rng([seed, 3]))
+    try:
+        live(plant, machine, seed, hours)
+        undisturbed.wait()
+        expected = [json.loads(line) for line in (folder / "offline.jsonl").read_text(encoding="utf-8").splitlines()]
+        followed = _followed_to_the_end(plant, len(expected))
+    finally:
+        for process in (plant.follower, plant.process, undisturbed):
+            if process is not None and process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+                process.wait()
+    store = Store(f"sqlite:///{folder / 'history.sqlite'}", Retention())
+    store.open()
+    try:
+        history = store.machine(*_PLACE.split("/"))
+        texts: list[str] = []
+        while page := history.events(after=len(texts) - 1, limit=_PAGE):
+            texts += [one.text for one in page]
+    finally:
+        store.close()
+    events = [AlarmCloudEvent.model_validate_json(text) for text in texts]
+    faults = differences(expected, events)
+    if followed != texts[: len(followed)] or len(followed) < len(expected):
+        faults.append(f"followers wrote {len(followed)} events down, the log has {len(texts)}; they must be the same")
+    data_s = hours * 3600
+    elapsed_s = time.monotonic() - begin_s
+    print(f"{hours:g} h of data in {elapsed_s / 60:.1f} min ({data_s / elapsed_s:.0f} times real time), seed {seed}")
+    print(f"monitor killed {plant.kills} times, followers {plant.follower_kills} times")
+    kinds = {kind: sum(one.data.kind == kind for one in events) for kind in ("raised", "escalated", "cleared")}
+    print(f"events: {len(expected)} offline, {len(events)} in the history ({kinds}), {len(followed)} followed")
+    calm = [(at, mb) for at, mb in plant.memory_mb if at > hours * 0.7]
+    print(
+        "memory of the monitor, MB, over the last third: " + "  ".join(f"{at:.1f} h {mb:.0f}" for at, mb in calm[::4])
+    )
+    if len(calm) > 1:
+        slope = float(np.polyfit([at for at, _ in calm], [mb for _, mb in calm], 1)[0])
+        print(f"slope {slope:+.2f} MB/h of data")
+    print("\n".join(faults) if faults else "all logs are the same")
+    return 1 if faults else 0
+
+
+def _followed_to_the_end(plant: Plant, expected: int) -> list[str]:
+    """Let the follower go on until it has everything, and return what it wrote down."""
+    path = plant.folder / "followed.jsonl"
+    if plant.follower is None:
+        plant.toggle_follower()
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        if len(lines) >= expected:
+            return lines
+        time.sleep(0.1)
+    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+
+
+if __name__ == "__main__":
+    main()
