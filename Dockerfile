@@ -17,6 +17,8 @@ RUN /opt/venv/bin/pip install --constraint constraints.txt --no-deps .
 FROM python:3.11.13-slim-bookworm
 ENV PATH=/opt/venv/bin:$PATH PYTHONDONTWRITEBYTECODE=1 PYTHONUNBUFFERED=1
 RUN useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin rotorwatch
+# A volume that is mounted here belongs to whoever owns the folder.
+RUN install -d -o 10001 -g 10001 -m 0700 /var/lib/rotorwatch
 COPY --from=build /opt/venv /opt/venv
 COPY deploy/healthcheck.py /opt/healthcheck.py
 USER 10001:10001
