@@ -44,7 +44,7 @@ def accepted(stream: Iterable[SampleBlock], gate: Gate | None = None) -> list[tu
     """Accepted blocks and what the gate says of each."""
     gate = Gate(MACHINE) if gate is None else gate
     verdicts = [(one, gate.judge(one)) for one in stream]
-    return [(*told([one]), verdict.text) for one, verdict in verdicts if verdict.accepted]
+    return [(told([one])[0], verdict.text) for one, verdict in verdicts if verdict.accepted]
 
 
 def refused(stream: Iterable[SampleBlock]) -> list[Reason]:
