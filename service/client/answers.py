@@ -1,0 +1,53 @@
+"""What the service answers: models, or problems as exceptions."""
+
+from typing import TypeVar
+
+import httpx
+from pydantic import BaseModel, ValidationError
+
+from service.client.errors import AccessRefused, ClientError, Conflict, NotFound, RequestRefused, Unavailable
+from service.schemas import Problem
+
+__all__ = ["refusal", "understood"]
+
+M = TypeVar("M", bound=BaseModel)
+
+_KINDS: dict[int, type[RequestRefused]] = {
+    401: AccessRefused,
+    403: AccessRefused,
+    404: NotFound,
+    409: Conflict,
+    412: Conflict,
+    429: Unavailable,
+    503: Unavailable,
+}
+_SHOWN = 200
+
+
+def refusal(answer: httpx.Response) -> RequestRefused:
+    """Turn an answer that has been read, and is not what was asked for, into an exception with the problem's text."""
+    try:
+        detail = Problem.model_validate_json(answer.content).detail
+    except ValidationError:  # from something in between, a proxy for example
+        detail = answer.text.strip()[:_SHOWN] or answer.reason_phrase
+    text = f"{answer.request.method} {answer.request.url.path}: {detail}"
+    return _KINDS.get(answer.status_code, RequestRefused)(answer.status_code, text)
+
+
+def understood(model: type[M], text: str | bytes, place: str) -> M:
+    """Read JSON as a model.
+
+    Raises
+    ------
+    ClientError
+        If it is another JSON, which happens if service and client are of different versions.
+    """
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        field = ".".join(str(part) for part in fault["loc"])
+        raise ClientError(
+            f"{place}: what was received is not what this version understands; do versions differ? "
+            f"{field}: {fault['msg']}"
+        ) from error

@@ -1,0 +1,378 @@
+"""A monitor's HTTP API in Python."""
+
+import os
+import re
+import ssl
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+import httpx
+from pydantic import BaseModel
+
+from service.alarm_schemas import Alarm, AlarmCloudEvent, AlarmStates
+from service.alarms.alarm import EventKind, Severity
+from service.alarms.life_cycle import AlarmState
+from service.alarms.operation import OperationKind
+from service.api_schemas import (
+    AlarmEventList,
+    AuditList,
+    AuditRecord,
+    MachineConfiguration,
+    MachineList,
+    OperationDone,
+    Reading,
+    ReadingBucket,
+    ReadingList,
+    ReportList,
+)
+from service.client.answers import refusal, understood
+from service.client.errors import ClientError, NoAnswer
+from service.client.event_stream import ServiceEvent, service_events
+from service.schemas import DetectableChanges, Health, MachineDescription, Report
+from service.snapshots.choice import Units
+from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+
+__all__ = ["TOKEN_VARIABLE", "Rotorwatch"]
+
+TOKEN_VARIABLE = "ROTORWATCH_TOKEN"  # noqa: S105  # the name of a variable
+_PAGE = 500
+
+_MACHINES = "/api/v1/machines"
+_PLACE = re.compile(r"[A-Za-z0-9_-]+/[A-Za-z0-9_-]+")
+_BELOW = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
+
+M = TypeVar("M", bound=BaseModel)
+_Parameter = str | int | float | bool | None | Sequence[str]
+
+
+class Rotorwatch:
+    """A connection to a monitor.
+
+    Machines are named as ``<site>/<machine>``. What changes an alarm takes the `Alarm` as it was seen: it is done only
+    if nothing has happened to the alarm since, and otherwise raises `Conflict`.
+
+    Parameters
+    ----------
+    url : str
+        Where the monitor's API is.
+    token : str, optional
+        Access token; if left out, what the environment variable ``ROTORWATCH_TOKEN`` holds.
+    ca : Path, optional
+        Certificates (PEM) of the authority that issued the monitor's; if left out, those this computer trusts.
+    certificate : tuple of Path, optional
+        Own certificate and its key (PEM), where the monitor asks for one.
+    timeout_s : float
+        How long to wait for an answer, in seconds.
+
+    Raises
+    ------
+    ClientError
+        If a certificate cannot be read, or the token cannot be one. Every method raises `NoAnswer` if nobody answers
+        in time, and `RequestRefused` or one of its kinds with the service's own words if it says no.
+
+    Examples
+    --------
+    >>> with Rotorwatch("http://127.0.0.1:8080") as plant:
+    ...     print(plant.health("demo/lab").state)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8080",
+        token: str | None = None,
+        *,
+        ca: Path | None = None,
+        certificate: tuple[Path, Path] | None = None,
+        timeout_s: float = 30.0,
+    ) -> None:
+        text = (os.environ.get(TOKEN_VARIABLE, "") if token is None else token).strip()
+        if not text.isascii() or not text.isprintable() or " " in text:
+            raise ClientError("the token has characters that no token has; expected rw_ and what follows, on one line")
+        self._http = httpx.Client(
+            base_url=url,
+            headers={"Authorization": f"Bearer {text}"} if text else {},
+            verify=_tls(ca, certificate),
+            timeout=timeout_s,
+            trust_env=False,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._http.close()
+
+    # What there is
+
+    def machines(self) -> tuple[MachineDescription, ...]:
+        """Every monitored machine with its state."""
+        return understood(MachineList, self._ask("GET", _MACHINES).content, _MACHINES).machines
+
+    def machine(self, place: str) -> MachineDescription:
+        """One machine: stream, channels, keys, state."""
+        return self._get(MachineDescription, place)
+
+    def configuration(self, place: str) -> MachineConfiguration:
+        """The machine file as it is in use."""
+        return self._get(MachineConfiguration, place, "configuration")
+
+    def health(self, place: str) -> Health:
+        """Where a machine stands now."""
+        return self._get(Health, place, "health")
+
+    def detectable(self, place: str, change: float | None = None) -> DetectableChanges:
+        """What would be found on the machine as it runs now, and the data that a wished relative change takes."""
+        return self._get(DetectableChanges, place, "detectable", change=change)
+
+    # Alarms
+
+    def alarms(
+        self, place: str, *, states: Sequence[AlarmState] = (), names: Sequence[str] = (), everything: bool = False
+    ) -> AlarmStates:
+        """Alarms that are not normal, or those in some states, of some names, or all there have been."""
+        wanted = [AlarmState(state).value for state in states]
+        return self._get(AlarmStates, place, "alarms", state=wanted, name=names, all=everything)
+
+    def alarm(self, place: str, name: str) -> Alarm:
+        """One alarm as it is now."""
+        return self._get(Alarm, place, f"alarms/{name}")
+
+    def acknowledge(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
+        """Say that an alarm has been seen."""
+        return self._operate(place, seen, "acknowledge", reason=reason)
+
+    def reset(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
+        """Let a latched alarm go."""
+        return self._operate(place, seen, "reset", reason=reason)
+
+    def shelve(
+        self, place: str, seen: Alarm, reason: str, *, duration_s: float | None = None, one_shot: bool = False
+    ) -> OperationDone:
+        """Silence an alarm for some seconds of data time, or until its condition clears (`one_shot`)."""
+        limits = {} if duration_s is None else {"duration_s": duration_s}
+        return self._operate(place, seen, "shelve", reason=reason, one_shot=one_shot, **limits)
+
+    def unshelve(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
+        """End the shelving of an alarm."""
+        return self._operate(place, seen, "unshelve", reason=reason)
+
+    def remove_from_service(self, place: str, seen: Alarm, reason: str) -> OperationDone:
+        """Take an alarm out of service, until it is returned."""
+        return self._operate(place, seen, "remove-from-service", reason=reason)
+
+    def return_to_service(self, place: str, seen: Alarm, reason: str = "") -> OperationDone:
+        """Return an alarm to service."""
+        return self._operate(place, seen, "return-to-service", reason=reason)
+
+    # History
+
+    def alarm_events(
+        self,
+        place: str,
+        *,
+        after: int | None = None,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        name: str | None = None,
+        kind: EventKind | None = None,
+        severity: Severity | None = None,
+    ) -> Iterator[AlarmCloudEvent]:
+        """Alarm events, fetched page by page: newest first, or after a sequence number in the order of the log.
+
+        Parameters
+        ----------
+        place : str
+        after : int, optional
+            -1 for the whole log. Ends with the latest event there is.
+        since_ns, until_ns : int, optional
+            Only those with since_ns ≤ time_ns < until_ns.
+        name, kind, severity : optional
+            Only of this alarm, kind, severity.
+        """
+        chosen = {"since_ns": since_ns, "until_ns": until_ns, "name": name, "kind": kind, "severity": severity}
+        before: int | None = None
+        while True:
+            page = self._get(AlarmEventList, place, "alarms/events", after=after, before=before, limit=_PAGE, **chosen)
+            yield from page.events
+            if after is not None:
+                after = page.next_after
+                if len(page.events) < _PAGE:
+                    return
+            elif page.next_before is None:
+                return
+            before = page.next_before
+
+    def reports(self, place: str, *, since_ns: int | None = None, until_ns: int | None = None) -> Iterator[Report]:
+        """Window reports, the latest to arrive first, fetched page by page."""
+        before: int | None = None
+        while True:
+            page = self._get(
+                ReportList, place, "reports", since_ns=since_ns, until_ns=until_ns, before=before, limit=_PAGE
+            )
+            yield from page.reports
+            if page.next_before is None:
+                return
+            before = page.next_before
+
+    def readings(
+        self, place: str, quantity: str, name: str = "", *, since_ns: int | None = None, until_ns: int | None = None
+    ) -> Iterator[Reading]:
+        """Every reading of a parameter, equation, misfit or speed, oldest first, fetched page by page."""
+        after: int | None = None
+        while True:
+            page = self._get(
+                ReadingList,
+                place,
+                "readings",
+                quantity=quantity,
+                name=name or None,
+                since_ns=since_ns,
+                until_ns=until_ns,
+                after=after,
+            )
+            yield from page.readings
+            if page.next_after is None:
+                return
+            after = page.next_after
+
+    def trend(
+        self,
+        place: str,
+        quantity: str,
+        names: Sequence[str] = (),
+        *,
+        points: int = 300,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+    ) -> tuple[ReadingBucket, ...]:
+        """Readings reduced to at most so many points for each name; all names if none is given."""
+        wanted: dict[str, _Parameter] = {"quantity": quantity, "name": names, "points": points}
+        return self._get(ReadingList, place, "readings", since_ns=since_ns, until_ns=until_ns, **wanted).buckets
+
+    def audit(self, *, machine: str | None = None, actor: str | None = None) -> Iterator[AuditRecord]:
+        """Who asked for what and what came of it, newest first, fetched page by page."""
+        before: int | None = None
+        while True:
+            answer = self._ask("GET", "/api/v1/audit", before=before, machine=machine, actor=actor, limit=_PAGE)
+            page = understood(AuditList, answer.content, "/api/v1/audit")
+            yield from page.entries
+            if page.next_before is None:
+                return
+            before = page.next_before
+
+    # What the monitor holds now
+
+    def correlations(
+        self, place: str, pairs: Sequence[tuple[str, str]] = (), *, units: Units = "channel"
+    ) -> CorrelationSnapshot:
+        """Correlation functions of the latest window, measured and as theory predicts them."""
+        first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        return self._get(CorrelationSnapshot, place, "correlations", first=first, second=second, units=units)
+
+    def spectra(
+        self,
+        place: str,
+        channels: Sequence[str] = (),
+        pairs: Sequence[tuple[str, str]] = (),
+        *,
+        from_hz: float | None = None,
+        to_hz: float | None = None,
+        units: Units = "channel",
+    ) -> SpectrumSnapshot:
+        """Power spectral densities of the latest window, cross-spectra of the pairs, and their theory."""
+        first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        chosen: dict[str, _Parameter] = {"channel": channels, "first": first, "second": second, "units": units}
+        return self._get(SpectrumSnapshot, place, "spectra", from_hz=from_hz, to_hz=to_hz, **chosen)
+
+    def orbits(self, place: str, *, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
+        """Orbits of the latest window at running speed, and some of the newest revolutions as measured."""
+        return self._get(OrbitSnapshot, place, "orbits", revolutions=revolutions, units=units)
+
+    # What happens
+
+    def events(self, *machines: str, after: str = "", from_beginning: bool = False) -> Iterator[ServiceEvent]:
+        """Alarm events and changes of health as they happen; goes on by itself after a lost connection.
+
+        Every alarm event comes once and in the order of its machine's log. Whoever keeps the cursor of the last event
+        and gives it back has all of them without a hole; of health, the latest comes first.
+
+        Parameters
+        ----------
+        *machines : str
+            Only of these.
+        after : str
+            Cursor of the last event that was taken; empty to begin now.
+        from_beginning : bool
+            Without `after`: begin with the first event there is.
+
+        Raises
+        ------
+        LogReplaced
+            If the log is not the one that was followed.
+        """
+        parameters: dict[str, str | list[str]] = {"from": "beginning" if from_beginning else "now"}
+        if machines:
+            parameters["machine"] = list(machines)
+        return service_events(self._http, parameters, after)
+
+    def _get(self, model: type[M], place: str, below: str = "", **parameters: _Parameter) -> M:
+        path = _path(place, below)
+        return understood(model, self._ask("GET", path, **parameters).content, path)
+
+    def _operate(self, place: str, seen: Alarm, kind: OperationKind, **order: str | float | bool) -> OperationDone:
+        path = _path(place, f"alarms/{seen.name}/{kind}")
+        answer = self._send("POST", path, {}, order, {"If-Match": f'"{seen.version}"'})
+        return understood(OperationDone, answer.content, path)
+
+    def _ask(self, method: str, path: str, **parameters: _Parameter) -> httpx.Response:
+        return self._send(method, path, parameters, None, {})
+
+    def _send(
+        self, method: str, path: str, parameters: dict[str, _Parameter], body: object, headers: dict[str, str]
+    ) -> httpx.Response:
+        given = {
+            name: list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
+            for name, value in parameters.items()
+            if value is not None
+        }
+        try:
+            answer = self._http.request(method, path, params=given, json=body, headers=headers)
+        except httpx.TransportError as error:
+            raise NoAnswer(f"{self._http.base_url}: {str(error) or type(error).__name__}") from error
+        if answer.status_code != httpx.codes.OK:
+            raise refusal(answer)
+        return answer
+
+
+def _path(place: str, below: str) -> str:
+    """Path of something of a machine.
+
+    Raises
+    ------
+    ClientError
+        If a name in it cannot be one: it must not lead anywhere else.
+    """
+    if not _PLACE.fullmatch(place):
+        raise ClientError(f"{place!r}: expected a machine as site/machine, such as demo/lab")
+    if below and not _BELOW.fullmatch(below):
+        raise ClientError(f"{below!r}: expected a name of letters, digits, - and _, such as k_by")
+    return f"{_MACHINES}/{place}/{below}".rstrip("/")
+
+
+def _tls(ca: Path | None, certificate: tuple[Path, Path] | None) -> ssl.SSLContext:
+    """What to trust, and what to show."""
+    try:
+        context = ssl.create_default_context(cafile=ca)
+        if certificate is not None:
+            context.load_cert_chain(*certificate)
+    except OSError as error:  # of which errors in certificates are a kind
+        raise ClientError(f"certificates {ca or ''} {certificate or ''}: {error}") from error
+    return context
