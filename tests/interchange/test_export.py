@@ -148,8 +148,8 @@ def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
     with (tmp_path / "alarms.csv").open(newline="", encoding="utf-8") as file:
         (event,) = list(csv.DictReader(file))
     said = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
-    assert (event["parameter"], event["kind"], int(event["time_ns"])) == (
-        said.data.parameter,
+    assert (event["name"], event["kind"], int(event["time_ns"])) == (
+        said.data.name,
         said.data.kind,
         said.data.time_ns,
     )

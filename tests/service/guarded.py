@@ -1,6 +1,7 @@
 """A small guarded application behind a real server, with a real store: what the tests of access talk to."""
 
 import asyncio
+import base64
 import socket
 import threading
 import time
@@ -185,4 +186,21 @@ def guarded(
         store.close()
 
 
-__all__ = ["JSON", "Clock", "Guarded", "application", "guarded", "served"]
+def basic(token: str, user: str = "x") -> dict[str, str]:
+    return {"authorization": "Basic " + base64.b64encode(f"{user}:{token}".encode()).decode()}
+
+
+def send(client: httpx.Client, method: str, path: str) -> httpx.Response:
+    body = None if method in {"GET", "DELETE"} else {"reason": "known"}
+    return client.request(method, path, json=body)
+
+
+def problem(answer: httpx.Response, status: int) -> str:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    found = answer.json()
+    assert found["status"] == status
+    return str(found["detail"])
+
+
+__all__ = ["JSON", "Clock", "Guarded", "application", "basic", "guarded", "problem", "send", "served"]

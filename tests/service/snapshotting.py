@@ -1,0 +1,95 @@
+"""What the tests of snapshots share: windows of the rotor kit as a monitor holds them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from models.commissioning.installed import Installed
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.moments import plan_for
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import MachineFile
+from models.signals.block import FloatArray, SampleBlock
+from service.snapshots.desk import LatestData, SnapshotDesk
+from service.snapshots.schemas import CorrelationPair, CorrelationSnapshot
+from simulator.scenario import Event
+from tests.commissioning.rotor_kit import LAB, stream
+
+__all__ = [
+    "K_BY",
+    "NAMES",
+    "SECONDS",
+    "SEED",
+    "S",
+    "Speaker",
+    "by_plane",
+    "desk_of",
+    "latest",
+    "numbers",
+    "synthetic",
+    "window_of",
+]
+
+SEED = 7_700_011
+SECONDS = 70.0
+S = 10**9
+K_BY = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
+NAMES = [channel.name for channel in LAB.sensors]
+
+
+@dataclass(frozen=True)
+class Speaker:
+    """Who speaks in these tests."""
+
+    site: str = "demo"
+    machine: str = "lab"
+    bundle: str | None = None
+    machine_hash: str = "9a0c41d27be8"
+
+
+def desk_of(machine: MachineFile) -> SnapshotDesk:
+    return SnapshotDesk(Installed(machine), Speaker())
+
+
+def window_of(machine: MachineFile, stream_: Sequence[SampleBlock], *, lagged: bool = True) -> WindowStatistics:
+    """The latest full window, as a monitor has it; columns are those of `machine`, by name."""
+    window = SlidingWindow(plan_for(machine, lagged=lagged))
+    columns = [NAMES.index(channel.name) for channel in machine.sensors]
+    latest: WindowStatistics | None = None
+    for block in stream_:
+        for _ in window.feed(window.plan.to_si(block.samples[:, columns]), block.start_ns):
+            latest = window.statistics() or latest
+    assert latest is not None
+    return latest
+
+
+@cache
+def latest(*faults: Event, lagged: bool = True) -> LatestData:
+    """What a monitor of the rotor kit holds after 70 s."""
+    stream_ = stream(SECONDS, SEED, *faults)
+    window = window_of(LAB, stream_, lagged=lagged)
+    return LatestData(window, 1.0, LikelihoodFit(LAB).diagnose(window).parameters, "", stream_[-20:])
+
+
+def numbers(series: Sequence[float | None] | None) -> FloatArray:
+    assert series is not None
+    return np.array([np.nan if value is None else value for value in series], dtype=np.float64)
+
+
+def by_plane(snapshot: CorrelationSnapshot, plane: str) -> list[CorrelationPair]:
+    return [pair for pair in snapshot.pairs if pair.first[0] == plane and pair.second[0] == plane]
+
+
+def synthetic(signals: dict[str, FloatArray]) -> list[SampleBlock]:
+    """Blocks of 0.1 s of the rotor kit with these samples, and nothing in other channels."""
+    n_samples = next(iter(signals.values())).size
+    samples = np.zeros((n_samples, len(NAMES)))
+    for name, values in signals.items():
+        samples[:, NAMES.index(name)] = values
+    size = round(0.1 * LAB.rate_hz)
+    return [
+        SampleBlock(k * S // 10, k, 1, LAB.rate_hz, samples[k * size : (k + 1) * size])
+        for k in range(n_samples // size)
+    ]
