@@ -393,15 +393,15 @@ def follow(
 
 
 @contextmanager
-def route(listen: tuple[str, ...], connect: tuple[str, ...] = ()) -> Iterator[None]:
-    """Run a Zenoh router.
+def route(settings: LinkSettings) -> Iterator[None]:
+    """Run a Zenoh router, whatever the role in the settings.
 
     Raises
     ------
     LinkError
         If it cannot listen.
     """
-    link = Link(LinkSettings(mode="router", listen=listen, connect=connect))
+    link = Link(settings.model_copy(update={"mode": "router"}))
     try:
         yield
     finally:
@@ -477,14 +477,9 @@ def _answering_from_log(key: str, answer: Callable[[int, int], str]) -> Callable
 
 def _explain(settings: LinkSettings, error: str) -> str:
     """Say which endpoints, and Zenoh's reason without the places in its source code."""
-    cause = error.split(" at /", maxsplit=1)[0]
-    if "Address already in use" in error:
-        cause = "address already in use: does another program listen there?"
-    elif "Timeout" in error:
-        cause = "nobody answers there"
     ends = [
         f"{what} {', '.join(where)}"
         for what, where in (("listen", settings.listen), ("connect", settings.connect))
         if where
     ]
-    return f"Zenoh session ({settings.mode}, {'; '.join(ends)}) could not be opened: {cause}"
+    return f"Zenoh session ({settings.mode}, {'; '.join(ends)}) could not be opened: {settings.explain(error)}"

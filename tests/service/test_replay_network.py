@@ -169,7 +169,7 @@ def test_a_monitor_that_starts_during_a_replay_on_the_original_keys_takes_none_o
             errors.append(str(error))
 
     callbacks = MachineCallbacks(taken.append, nothing, nothing, nothing, lambda: "{}", lambda: "{}", lambda *_: "[]")
-    with route((address,)):
+    with route(LinkSettings(listen=(address,))):
         heard = Heard()
         other = Link(LinkSettings(mode="client", connect=(address,)))
         subscriber = other.session.declare_subscriber(LAB.keys.stream, lambda sample: collect(heard, sample))
