@@ -67,9 +67,10 @@ def sensor_findings(
     findings += gain_and_delay(window, readings, bands, naming, reference)
     findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
     bad = implicated(findings)
-    findings += noisy(window, readings, bands, naming, reference, sound)
     if "theta" not in bad:
-        bad = implicated(findings)
         columns = [column for column, state in enumerate(window.states) if state not in bad]
         findings += phase_faults(window, columns, naming, reference)
+    bad = implicated(findings)
+    if "theta" not in bad:  # what a wrong angle leaves in the spectra looks like noise
+        findings += noisy(window, readings, bands, naming, reference, sound)
     return tuple(findings)

@@ -7,7 +7,6 @@ the diagnosis allows for noise, and would be given up for nothing.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,15 @@ from models.diagnosis.pairs import MotionPair
 from models.diagnosis.sensors.finding import Naming, SensorFinding
 from models.diagnosis.sensors.kinematics import Banded, PairReading
 from models.diagnosis.sensors.reference import SensorReference
-from models.diagnosis.sensors.unshared import ChannelNoise, channel_noise, channel_rms, matched, pair_noise, single
+from models.diagnosis.sensors.unshared import (
+    ChannelNoise,
+    channel_noise,
+    channel_rms,
+    floor,
+    matched,
+    pair_noise,
+    single,
+)
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
@@ -26,35 +33,22 @@ PAIR_RISE = 10.0
 """Power of the difference of two sensors of one motion over the healthy one, beyond what the others' rose by."""
 ALONE_RISE = 40.0
 """The same where no other pair says what all sensors do."""
-TOP_RISE = 1000.0
-"""Unshared power at the top of the band where a motion has one sensor: calibrated, other excitation makes up 150."""
+FLOOR_RISE, FLOOR_ALONE = 30.0, 3.0
+"""Where a motion has one sensor: floor of what the others do not explain over the healthy one, and beyond theirs."""
+FLOOR_FLAT = 0.5
+"""Part of the bands that must lie on the floor: a machine's own spectrum has resonances."""
 LINE_RISE = 4.0
 LEAST_PART = 0.02
 """Part of the channel's rms that the noise in the band must reach."""
 LEAST_LINE = 0.03
 """Part of it that a line must reach."""
-_FEWEST_OTHERS = 2
-_PAIR_SCATTER, _TOP_SCATTER = 0.05, 1.2
-"""Standard deviation of the logarithm of a healthy pair's, and of a healthy channel's rise, calibrated."""
+_PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
+"""Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated."""
 _CLEAR = 0.5
 """One of two sensors is the noisy one if its noise exceeds the other's by more than this part of both."""
 _SURE = 0.15
-
-
-@dataclass(frozen=True, slots=True)
-class _Known:
-    """Density and share of noise now and when healthy, each of shape (n, n_bands)."""
-
-    density: FloatArray
-    share: FloatArray
-    healthy_density: FloatArray
-    healthy_share: FloatArray
-
-    def rise(self) -> FloatArray:
-        """Logarithm of the rise beyond that of the others, the smaller one of both measures; shape (n, n_bands)."""
-        absolute = np.log(self.density / self.healthy_density)
-        relative = np.log(self.share / self.healthy_share)
-        return np.asarray(np.minimum(_alone(absolute), _alone(relative)), dtype=np.float64)
+_COUNTS = 2.0
+"""Bands in which the noise rose by less do not count for its size."""
 
 
 def _alone(rise: FloatArray) -> FloatArray:
@@ -114,12 +108,9 @@ def _of_pairs(
             known.append((reading, pair_noise(window, bands[reading.pair], reading), healthy))
     if not known:
         return []
-    rise = _Known(
-        np.stack([now.density for _, now, _ in known]),
-        np.stack([now.share for _, now, _ in known]),
-        np.array([healthy.density for _, _, healthy in known]),
-        np.array([healthy.share for _, _, healthy in known]),
-    ).rise()
+    absolute = np.log([now.density / np.array(healthy.density) for _, now, healthy in known])
+    relative = np.log([now.share / np.array(healthy.share) for _, now, healthy in known])
+    rise = np.minimum(_alone(absolute), _alone(relative))
     limit = np.log(PAIR_RISE if len(known) > 1 else ALONE_RISE)
     rms, findings = channel_rms(window), []
     for row, (reading, now, _) in enumerate(known):
@@ -129,9 +120,9 @@ def _of_pairs(
         pair, own = reading.pair, bands[reading.pair]
         guilty = _guilty(own, reading, risen)
         width_hz = (window.frequencies_hz[-1] - window.frequencies_hz[0]) / own.w.size
-        excess = 2 * width_hz * now.density[risen] * -np.expm1(-rise[row, risen])
+        excess = 2 * width_hz * now.density * -np.expm1(-rise[row]) * (rise[row] > np.log(_COUNTS))
         # What is seen as the second shows it, as the first would.
-        first = float(np.sqrt(np.sum(excess / own.w[risen] ** (2 * pair.order)))) * float(np.exp(-reading.log_gain))
+        first = float(np.sqrt(np.sum(excess / own.w ** (2 * pair.order)))) * float(np.exp(-reading.log_gain))
         sizes = {pair.first: first, pair.second: float(np.sqrt(excess.sum()))}
         columns = [pair.first, pair.second] if guilty is None else [guilty]
         column = min((sizes[one] / rms[one], one) for one in columns)[1]
@@ -188,30 +179,29 @@ def _of_single(
             known.append((now, healthy))
     if not known:
         return []
-    rise = _Known(
-        np.stack([now.density for now, _ in known]),
-        np.stack([now.share for now, _ in known]),
-        np.array([healthy.density for _, healthy in known]),
-        np.array([healthy.share for _, healthy in known]),
-    ).rise()
+    absolute = np.array([floor(np.log(now.density)) - floor(np.log(then.density)) for now, then in known])
+    relative = np.array([floor(np.log(now.share)) - floor(np.log(then.share)) for now, then in known])
+    rise, alone = np.minimum(absolute, relative), np.minimum(_alone(absolute), _alone(relative))
     rms, findings = channel_rms(window), []
     band_hz = float(window.frequencies_hz[-1] - window.frequencies_hz[0])
-    for row, (now, healthy) in enumerate(known):
+    for row, (now, then) in enumerate(known):
         state, own = window.states[now.column], float(rms[now.column])
-        whole, name = float(rise[row].mean()), naming.name(window.states[now.column])
-        size = float(np.sqrt(2 * band_hz * now.density.mean()))
-        if now.line_rms > max(LEAST_LINE * own, np.sqrt(LINE_RISE) * healthy.line_rms):
+        name = naming.name(state)
+        size = float(np.sqrt(2 * band_hz * np.exp(floor(np.log(now.density)))))
+        risen = rise[row] > np.log(FLOOR_RISE) and alone[row] > np.log(FLOOR_ALONE)
+        if now.line_rms > max(LEAST_LINE * own, np.sqrt(LINE_RISE) * then.line_rms):
             text = (
                 f"{name}: a line of {naming.value(state, now.line_rms)} rms at {now.line_hz:.4g} Hz that no other "
-                f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, healthy.line_rms)} on "
+                f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, then.line_rms)} on "
                 "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
             )
             findings.append(SensorFinding((state,), "noise", text, now.line_rms / own))
-        elif len(known) > _FEWEST_OTHERS and whole > np.log(TOP_RISE) and size > LEAST_PART * own:
+        elif risen and now.flat > FLOOR_FLAT and size > LEAST_PART * own:
+            factor = float(np.exp(rise[row] / 2))
             text = (
-                f"{name}: noise of about {naming.value(state, size)} rms in the band ({size / own:.0%} of what it "
-                f"shows), {np.exp(whole / 2):.3g} times the healthy one at the top of the band while the other "
-                f"channels stayed, expected less than {np.sqrt(TOP_RISE):.2g} times: cable, earthing or amplifier"
+                f"{name}: noise of {naming.value(state, size)} rms in the band ({size / own:.0%} of what it shows), "
+                f"{factor:.3g} times the healthy one, expected less than {np.sqrt(FLOOR_RISE):.2g} times: "
+                "cable, earthing or amplifier"
             )
-            findings.append(SensorFinding((state,), "noise", text, size / own, whole / _TOP_SCATTER))
+            findings.append(SensorFinding((state,), "noise", text, size / own, float(rise[row]) / _FLOOR_SCATTER))
     return findings

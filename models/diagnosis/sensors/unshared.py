@@ -1,8 +1,9 @@
 """What a channel shows that no other one shares: the noise of a sensor, as far as it can be told from the machine.
 
 Two sensors of one motion differ by their noise alone, whatever moves the machine: |v - hjωx|². Where a motion has one
-sensor, what the other places do not explain of it holds the noise and a part of the machine. At the top of the band,
-above the machine's resonances, that part is smallest. A line that stands in one channel alone is none of the machine's.
+sensor, what the other channels do not explain of it holds the noise and a part of the machine. That part has the
+machine's resonances in it; noise lies under it like a floor. A line that stands in one channel alone is none of the
+machine's.
 """
 
 from collections.abc import Sequence
@@ -21,22 +22,24 @@ __all__ = [
     "PairNoise",
     "channel_noise",
     "channel_rms",
+    "floor",
     "matched",
     "pair_noise",
     "single",
 ]
 
-_TOP = 3
-"""The top of the band is this part of it: a third."""
+_FLAT = 2.0
+"""Bands within this factor of the lowest lie on the floor."""
 _LINE_BINS, _BLOCK = 3, 24
 """Bins that hold a line in Hann segments, and bins of its surroundings."""
 _STANDS_OUT = 6.0
 """A bin this far above the median of its surroundings may hold a line."""
 _OWN = 4.0
 """So far it must stand out still where the other channels have explained what they can."""
-_HARMONIC = 0.01
-"""Relative distance from a multiple of half the speed within which a line is the shaft's."""
+_HARMONIC = 0.002
+"""Relative distance from a multiple of half the speed within which a line is the shaft's, beside its range."""
 _RIDGE = 1e-9
+_SMOOTHED = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +68,11 @@ class ChannelNoise:
     ----------
     column : int
     density : ndarray, shape (n_bands,)
-        What is left of it at the top of the band, two-sided, SI²/Hz.
+        What is left of it, two-sided, SI²/Hz.
     share : ndarray, shape (n_bands,)
         The same over the channel's mean square, 1/Hz.
+    flat : float
+        Part of the bands that lie on the floor, 0 to 1.
     line_rms, line_hz : float
         Strongest line that it alone shows, SI, and where; 0 without one.
     """
@@ -75,13 +80,15 @@ class ChannelNoise:
     column: int
     density: FloatArray
     share: FloatArray
+    flat: float
     line_rms: float
     line_hz: float
 
 
 def channel_rms(window: WindowStatistics) -> FloatArray:
     """Root mean square of each channel about its hops' means, rotation included; shape (n,)."""
-    return np.asarray(np.sqrt((window.hop_waveform.rms[:, : len(window.states)] ** 2).mean(axis=0)), dtype=np.float64)
+    rms = np.stack([hop.rms[: len(window.states)] for hop in window.waveforms])
+    return np.asarray(np.sqrt((rms**2).mean(axis=0)), dtype=np.float64)
 
 
 def single(states: tuple[str, ...]) -> list[int]:
@@ -117,17 +124,29 @@ def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[Chan
     if not columns or n < 2 or window.n_segments < 2 * n or not np.all(rms > 0):
         return []
     edges = pair_bands(n_bins)
-    top = edges[-(edges.size // _TOP) :]
-    counts = np.diff(np.append(top, n_bins)) if top.size else np.empty(0)
-    if not top.size:
-        return []
-    spectra = np.add.reduceat(window.spectrum[top[0] :], top - top[0]) / counts[:, None, None]
+    counts = np.diff(np.append(edges, n_bins))
+    spectra = np.add.reduceat(window.spectrum, edges) / counts[:, None, None]
     left = _conditional(np.asarray(spectra, dtype=np.complex128))
+    if left.shape[0] < _SMOOTHED:
+        return []
+    flat = (np.log(left) < floor(np.log(left)) + np.log(_FLAT)).mean(axis=0)
     lines = _lines(window, columns)
     return [
-        ChannelNoise(column, left[:, column], left[:, column] / rms[column] ** 2, *lines.get(column, (0.0, 0.0)))
+        ChannelNoise(
+            column,
+            left[:, column],
+            left[:, column] / rms[column] ** 2,
+            float(flat[column]),
+            *lines.get(column, (0.0, 0.0)),
+        )
         for column in columns
     ]
+
+
+def floor(log_density: FloatArray) -> FloatArray:
+    """Lowest mean of three neighbouring bands of log densities; shape (n_bands, ...) becomes (...)."""
+    log_density = np.asarray(log_density, dtype=np.float64)
+    return np.asarray(((log_density[:-2] + log_density[1:-1] + log_density[2:]) / _SMOOTHED).min(axis=0))
 
 
 def _conditional(spectra: ComplexArray) -> FloatArray:
@@ -135,7 +154,8 @@ def _conditional(spectra: ComplexArray) -> FloatArray:
     power = np.maximum(np.einsum("...ii->...i", spectra).real, np.finfo(float).tiny)
     scale = 1 / np.sqrt(power)
     unit = spectra * scale[..., :, None] * scale[..., None, :] + _RIDGE * np.eye(spectra.shape[-1])
-    return np.asarray(power / np.einsum("...ii->...i", np.linalg.inv(unit)).real, dtype=np.float64)
+    precision = np.maximum(np.einsum("...ii->...i", np.linalg.inv(unit)).real, 1.0)
+    return np.asarray(power / precision, dtype=np.float64)
 
 
 def _lines(window: WindowStatistics, columns: Sequence[int]) -> dict[int, tuple[float, float]]:
@@ -146,12 +166,14 @@ def _lines(window: WindowStatistics, columns: Sequence[int]) -> dict[int, tuple[
     power = np.einsum("fii->fi", window.spectrum).real[: count * _BLOCK, list(columns)]
     usual = np.median(power.reshape(count, _BLOCK, -1), axis=1)
     high = power > _STANDS_OUT * np.repeat(usual, _BLOCK, axis=0)
-    speed_hz = float(np.nanmean(window.hop_speed_rad_s)) / (2 * np.pi) if np.isfinite(window.speed_rad_s) else np.inf
+    half_hz, (slowest, fastest) = abs(window.speed_rad_s) / (4 * np.pi), window.speed_range
     found: dict[int, tuple[float, float]] = {}
     for number, column in enumerate(columns):
         at = np.flatnonzero(high[:, number])
-        half_turns = np.abs(np.round(2 * f[at] / speed_hz) * speed_hz / 2 - f[at])
-        at = at[(half_turns > _HARMONIC * f[at]) | ~np.isfinite(half_turns)]
+        at = at[(at >= _LINE_BINS) & (at < f.size - _LINE_BINS)]
+        if np.isfinite(half_hz) and half_hz > 0:
+            reach = f[1] - f[0] + (_HARMONIC + abs(fastest - slowest) / abs(window.speed_rad_s)) * f[at]
+            at = at[np.abs(np.round(f[at] / half_hz) * half_hz - f[at]) > reach]
         if not at.size:
             continue
         peak = int(at[power[at, number].argmax()])
