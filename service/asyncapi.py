@@ -70,11 +70,12 @@ def asyncapi(truth: type[BaseModel]) -> dict[str, Any]:
     dict
         Plain JSON values. Schemas are of JSON Schema draft 7, the default of AsyncAPI 3.0.
     """
+    topics: dict[str, tuple[_Topic, type[BaseModel] | None]]
     topics = {name: (topic, truth if name == "truth" else topic.model) for name, topic in _TOPICS.items()}
     models = [model for _, model in topics.values() if model is not None]
-    _, schemas = models_json_schema(
-        [(model, "serialization") for model in (*models, AlarmLogPage)], ref_template="#/components/schemas/{model}"
-    )
+    models.append(AlarmLogPage)
+    sent: list[tuple[type[BaseModel], Literal["serialization"]]] = [(model, "serialization") for model in models]
+    _, schemas = models_json_schema(sent, ref_template="#/components/schemas/{model}")
     document: dict[str, Any] = {
         "asyncapi": "3.0.0",
         "info": {"title": "rotorwatch", "version": PROGRAM_VERSION, "description": _DESCRIPTION},
