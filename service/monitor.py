@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from models.alarm_names import CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST, data_alarm
-from models.arrivals import Arrivals
+from models.arrivals import Arrivals, Arrived
 from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
 from models.commissioning.installed import Installed
 from models.diagnosis.moments import HopMoments, plan_for
@@ -60,6 +60,7 @@ class MachineMonitor:
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
         self._arrivals = Arrivals(machine.ingest.reorder_blocks)
+        self._due: deque[Arrived] = deque()
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
         settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
@@ -69,6 +70,7 @@ class MachineMonitor:
         self._refused: Counter[str] = Counter()
         self._latest: WindowReport | None = None
         self._end_ns: int | None = None
+        self._kept_is_valid = True
         self._statistics: WindowStatistics | None = None
         self._newest: deque[SampleBlock] = deque()
         self._newest_samples = 0
@@ -87,11 +89,21 @@ class MachineMonitor:
         except WireError as error:
             name = f"{self.machine.site}/{self.machine.name}"
             return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
-        return tuple(self.step(one.block, one.schema_hash) for one in self._arrivals.take(block, schema_hash))
+        self._due.extend(self._arrivals.take(block, schema_hash))
+        return self._step_due()
 
     def flush(self) -> tuple[MonitorReport, ...]:
         """Take the blocks that wait for earlier ones: those will not come any more."""
-        return tuple(self.step(one.block, one.schema_hash) for one in self._arrivals.flush())
+        self._due.extend(self._arrivals.flush())
+        return self._step_due()
+
+    def _step_due(self) -> tuple[MonitorReport, ...]:
+        """Take what is due; a defect that one block brings to light leaves the others for the next time."""
+        found = []
+        while self._due:
+            one = self._due.popleft()
+            found.append(self.step(one.block, one.schema_hash))
+        return tuple(found)
 
     def step(self, block: SampleBlock, schema_hash: str = "") -> MonitorReport:
         """Take one block: gate, window, evaluation, alarms.
@@ -116,6 +128,7 @@ class MachineMonitor:
         self._keep(block, continuous=verdict.continuous and not verdict.clock_step_s)
         if verdict.clock_step_s:
             self._window.clear()
+            self._kept_is_valid = False  # hops may end at the same times as before
             self._test.clear()
             self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
         windows: list[WindowReport] = []
@@ -174,6 +187,8 @@ class MachineMonitor:
             Ends of the hops that are stored already and need not be handed over again.
         """
         hops = self._window.hops
+        known = kept if self._kept_is_valid else ()
+        self._kept_is_valid = True
         return MonitorState(
             alarms=self._alarms.checkpoint(),
             state=to_bytes(
@@ -185,7 +200,7 @@ class MachineMonitor:
                     "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
                 }
             ),
-            new_hops=tuple((hop.end_ns, to_bytes(hop.checkpoint())) for hop in hops if hop.end_ns not in kept),
+            new_hops=tuple((hop.end_ns, to_bytes(hop.checkpoint())) for hop in hops if hop.end_ns not in known),
             hops=tuple(hop.end_ns for hop in hops),
             end_ns=self._end_ns,
         )
@@ -196,7 +211,7 @@ class MachineMonitor:
         Raises
         ------
         CheckpointError
-            If the bytes are damaged or of another form; nothing is restored then.
+            If the bytes are damaged or of another form; this monitor is of no use then.
         """
         arrays = from_bytes(state)
         moments = tuple(HopMoments.restored(from_bytes(hop)) for hop in hops)

@@ -176,7 +176,7 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
 
         late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
         with late as joined:
-            joined.wait_for("ALERT (active): bearing stiffness, vertical")
+            joined.wait_for("ALERT (unacknowledged): bearing stiffness, vertical")
             assert joined.stop() == 0
         found = run("status", "--url", runtime.http_url)
         assert found.returncode == 1
@@ -251,7 +251,7 @@ def test_lines_for_terminals() -> None:
     assert alarm_event_line(event).startswith("00:03:25  lab  ALERT: bearing stiffness, horizontal (k_by)")
     states = AlarmStates.model_validate(example(AlarmStates))
     assert alarm_state_lines(states) == (
-        "00:03:25  lab  ALERT (active): bearing stiffness, horizontal  k_by −24.7±1.4 %",
+        "00:03:25  lab  ALERT (unacknowledged): bearing stiffness, horizontal  k_by −24.7±1.4 %",
     )
     health = Health.model_validate(example(Health))
     assert health_line(health) == "00:03:25  lab  state is alert"

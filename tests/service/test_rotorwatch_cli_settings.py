@@ -136,7 +136,7 @@ def fields_of(model: type[BaseModel], table: str = "") -> list[tuple[str, str, s
 
 
 def test_every_setting_is_described_and_documented() -> None:
-    page = (ROOT / "docs" / "service.md").read_text(encoding="utf-8")
+    page = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("service.md", "access.md"))
     for table, name, description in fields_of(ServiceSettings):
         assert description, f"{table}.{name} has no description"
         assert f"`{name}`" in page or f"[[{name}]]" in page, f"docs/service.md does not mention {table}.{name}"
