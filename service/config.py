@@ -17,6 +17,7 @@ from models.machine import MachineFile, load_machine_file, read_toml, validation
 from models.signals.link import LinkSettings
 from service.access_settings import AccessSettings, check_access
 from service.store.retention import Retention
+from service.webhook_settings import WebhookSettings, repeated_name
 
 __all__ = [
     "DEFAULT_LISTEN",
@@ -196,12 +197,15 @@ class ServiceSettings(BaseSettings):
     history: HistorySettings = Field(default=HistorySettings(), description="reports, alarms, restarts")
     recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
     replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
+    webhooks: tuple[WebhookSettings, ...] = Field(default=(), description="who is told of alarm events")
     log: LogSettings = Field(default=LogSettings(), description="log")
 
     @model_validator(mode="after")
     def _reachable(self) -> Self:
         if not self.link.listen and not self.link.connect:
             raise ValueError("link has neither listen nor connect: no stream could reach the monitor")
+        if (name := repeated_name(self.webhooks)) is not None:
+            raise ValueError(f"webhooks: two are called {name}, expected different names")
         return self
 
     @classmethod
@@ -259,6 +263,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
             "history": history,
             "link": settings.link.beside(folder),
             "access": settings.access.beside(folder),
+            "webhooks": tuple(webhook.beside(folder) for webhook in settings.webhooks),
         }
     )
     check_distinct(place, settings)

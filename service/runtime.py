@@ -40,6 +40,8 @@ from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
 from service.event_feed import EventFeed
 from service.logs import logger
+from service.pulse import Pulse
+from service.readiness import readiness_of
 from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder
 from service.replays_api import ReplayDesk
@@ -47,6 +49,7 @@ from service.schemas import Health, MachineReadiness, Readiness
 from service.store.audit import AuditLog
 from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
+from service.webhooks.desk import WebhookDesk
 from service.worker import MachineWorker
 
 __all__ = ["HttpError", "Runtime", "StopRequest", "running", "stop_request"]
@@ -82,6 +85,10 @@ class Runtime:
         self.settings = settings
         self._installed = [install(entry.load(), entry.bundle) for entry in settings.machines]
         self._workers: list[MachineWorker] = []
+        self._pulses: list[Pulse] = []
+        self._history_open = False
+        # What is heard in a namespace is a replay, of which nobody must be told.
+        self.webhooks = WebhookDesk(() if settings.link.namespace else settings.webhooks)
         self.store = Store(settings.history.database, settings.history.retention)
         self.feed = EventFeed()
         directory = settings.recording.directory
@@ -116,8 +123,7 @@ class Runtime:
         return None
 
     def readiness(self) -> Readiness:
-        """Whether the session is open and every worker runs."""
-        session_open = self._link is not None and self._link.is_open
+        """Whether everything that monitoring needs works, and what does not."""
         machines = tuple(
             MachineReadiness(
                 site=worker.machine.site,
@@ -126,12 +132,19 @@ class Runtime:
                 worker_alive=worker.alive,
                 worker_errors=worker.errors,
                 last_worker_error=worker.last_error,
+                worker_busy_s=round(pulse.busy_s, 1),
+                history_waiting=worker.history.waiting,
                 recording=self._recording_state(worker.machine),
             )
-            for worker in self._workers
+            for worker, pulse in zip(self._workers, self._pulses, strict=True)
         )
-        ready = session_open and all(machine.worker_alive for machine in machines)
-        return Readiness(ready=ready, session_open=session_open, machines=machines)
+        return readiness_of(
+            session_open=self._link is not None and self._link.is_open,
+            machines=machines,
+            history_open=self._history_open,
+            history_trouble=self.store.trouble,
+            failing_webhooks=self.webhooks.failing(),
+        )
 
     def start(self) -> None:
         """Open the session, start the threads, serve HTTP.
@@ -154,15 +167,21 @@ class Runtime:
             undo.callback(self._link.close)
             self.store.open()
             undo.callback(self.store.close)
+            self._history_open = True
             links = []
             for installed in self._installed:
                 machine = installed.machine
                 history = self.store.machine(machine.site, machine.name)
-                self._workers.append(MachineWorker(installed, self.settings.queue, history, on_events=self.feed.wake))
+                worker = MachineWorker(installed, self.settings.queue, history, on_events=self._alarm_events)
+                self._workers.append(worker)
+                self._pulses.append(Pulse(worker.inbox.call))
+            undo.callback(self.webhooks.close)
+            logs = {f"{worker.machine.site}/{worker.machine.name}": worker.history for worker in self._workers}
+            self.webhooks.start(logs, self.store.webhooks)
             for worker in self._workers:
                 self._record(worker.machine, self._link, undo)
                 links.append(self._connect(worker, self._link, undo))
-            supervisor = _Supervisor(list(zip(self._workers, links, strict=True)), self.feed)
+            supervisor = _Supervisor(list(zip(self._workers, links, self._pulses, strict=True)), self.feed)
             undo.callback(supervisor.stop)
             supervisor.start()
             undo.callback(self.replays.close)
@@ -171,6 +190,10 @@ class Runtime:
             server.start(create_app(self, guard))
             self._undo = undo.pop_all()
         _log.info("running", http=server.url, machines=len(self._workers))
+
+    def _alarm_events(self) -> None:
+        self.feed.wake()
+        self.webhooks.wake()
 
     def _record(self, machine: MachineFile, link: Link, undo: ExitStack) -> None:
         """Record the machine, if that is wanted; trouble with the disk is the recorder's own affair."""
@@ -276,7 +299,7 @@ def stop_request() -> Iterator[StopRequest]:
 class _Supervisor:
     """Publishes health when it has changed, silence included."""
 
-    def __init__(self, watched: list[tuple[MachineWorker, MachineLink]], feed: EventFeed) -> None:
+    def __init__(self, watched: list[tuple[MachineWorker, MachineLink, Pulse]], feed: EventFeed) -> None:
         self._watched = watched
         self._feed = feed
         self._stop = threading.Event()
@@ -295,8 +318,9 @@ class _Supervisor:
 
     def _run(self) -> None:
         while True:
-            for number, (worker, link) in enumerate(self._watched):
+            for number, (worker, link, pulse) in enumerate(self._watched):
                 try:
+                    pulse.beat()
                     worker.tick()
                     self._look(number, worker, link)
                 except Exception:

@@ -266,6 +266,10 @@ class MachineReadiness(BaseModel):
     worker_alive: bool = Field(description="the thread that evaluates the machine's blocks runs", examples=[True])
     worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
     last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
+    worker_busy_s: float = Field(
+        description="how long the thread has been at work on the same block; more than 60 is a reason", examples=[0.0]
+    )
+    history_waiting: int = Field(description="steps that are not in the history yet", examples=[0])
     recording: str = Field(
         description="off, idle (nothing has arrived), recording, or failing: why. Monitoring goes on all the same",
         examples=["recording"],
@@ -277,8 +281,15 @@ class Readiness(BaseModel):
 
     model_config = JSON
 
-    ready: bool = Field(description="session open and every worker alive", examples=[True])
+    ready: bool = Field(description="there is no reason against it", examples=[True])
+    reasons: tuple[str, ...] = Field(description="what is wrong, one sentence each; empty if ready", examples=[()])
     session_open: bool = Field(description="the Zenoh session is open", examples=[True])
+    history_open: bool = Field(description="the database is connected, its tables are up to date", examples=[True])
+    history_trouble: str = Field(description="why the history cannot be written; empty if it can", examples=[""])
+    failing_webhooks: tuple[str, ...] = Field(
+        description="webhooks that fail or are disabled, each with what is wrong; no reason against readiness",
+        examples=[()],
+    )
     machines: tuple[MachineReadiness, ...] = Field(description="machine by machine")
 
 

@@ -1,0 +1,54 @@
+"""``rotorwatch webhook``: secrets, and whether a receiver can be reached."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from models.errors import MachineFileError
+from service.commands.running import exit_codes
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    webhooks = typer.Typer(no_args_is_help=True, help="Programs that are told of alarm events.")
+    webhooks.command("secret")(secret)
+    webhooks.command("test")(test)
+    app.add_typer(webhooks, name="webhook")
+
+
+def secret() -> None:
+    """Make a secret, with which events are signed; the receiver needs the same.
+
+    [bold]Example[/bold]
+
+    [cyan](umask 077; rotorwatch webhook secret > pager.secret)[/cyan]
+    """
+    from service.webhooks.signature import new_secret  # noqa: PLC0415  # keeps --help quick
+
+    typer.echo(new_secret())
+
+
+def test(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Which webhook of the settings.")],
+    config: Annotated[Path, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor.")],
+) -> None:
+    """Send a test event, which is no alarm, and say whether the receiver took it; exit code 1 if it did not.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch webhook test pager --config plant.toml[/cyan]
+    """
+    with exit_codes():
+        from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
+        from service.webhooks.desk import send_test  # noqa: PLC0415
+
+        webhooks = load_settings(config).webhooks
+        settings = next((webhook for webhook in webhooks if webhook.name == name), None)
+        if settings is None:
+            there = ", ".join(webhook.name for webhook in webhooks) or "none"
+            raise MachineFileError(f"{config}: no webhook {name}; there are: {there}")
+        took_s = send_test(settings)
+        typer.echo(f"{name}: {settings.target} took the test event, in {took_s:.2f} s")

@@ -1,0 +1,151 @@
+"""Settings of webhooks: who is told of alarm events, of which, and how patiently."""
+
+from pathlib import Path
+from typing import Any, Literal, Self
+from urllib.parse import SplitResult, urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from service.access_settings import is_loopback
+
+__all__ = ["WebhookKind", "WebhookSettings", "repeated_name"]
+
+WebhookKind = Literal[
+    "raised",
+    "escalated",
+    "cleared",
+    "acknowledged",
+    "reset",
+    "shelved",
+    "unshelved",
+    "suppressed",
+    "unsuppressed",
+    "removed-from-service",
+    "returned-to-service",
+]
+
+
+class WebhookSettings(BaseModel):
+    """One receiver of alarm events; an event is sent if machine, kind and severity are all among those wanted."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
+
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",
+        description="what it is called; how far it has been served is remembered under this name",
+    )
+    url: str = Field(description="where events are posted: https, or http on this computer")
+    insecure: bool = Field(
+        default=False, description="allow http to another computer, where everybody on the way can read along"
+    )
+    secret_file: Path | None = Field(
+        default=None,
+        description="file of mode 600 with the secret (whsec_...), relative to the settings file; of several lines, "
+        "each is signed with",
+    )
+    secret_variable: str | None = Field(
+        default=None,
+        pattern=r"^[A-Za-z_][A-Za-z0-9_]*$",
+        description="environment variable with the secret, instead of a file",
+    )
+    ca_file: Path | None = Field(
+        default=None, description="authority of the receiver's certificate (PEM), if not one of the well-known ones"
+    )
+    machines: tuple[str, ...] = Field(
+        default=("*/*",), min_length=1, description="only of these machines, as site/machine with * and ?"
+    )
+    kinds: tuple[WebhookKind, ...] = Field(default=(), description="only these kinds of event; all if left out")
+    severities: tuple[Literal["alert", "danger"], ...] = Field(
+        default=(), description="only of these severities; all if left out"
+    )
+    annunciated_only: bool = Field(
+        default=False,
+        description="leave out what happens to alarms that are shelved, suppressed or out of service",
+    )
+    timeout_s: float = Field(
+        default=10.0, ge=0.1, le=300.0, description="how long one attempt may take altogether, in seconds"
+    )
+    longest_pause_s: float = Field(
+        default=300.0, ge=1.0, le=86_400.0, description="longest pause between attempts, in seconds"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _no_secret(cls, fields: Any) -> Any:  # whatever the file has; checked field by field afterwards
+        if isinstance(fields, dict) and "secret" in fields:
+            # Raised here, so that the value is in no message.
+            raise ValueError(
+                "secret does not belong into settings, which many may read: put it into a file of mode 600 and name "
+                "that in secret_file, or name an environment variable in secret_variable"
+            )
+        return fields
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if (self.secret_file is None) == (self.secret_variable is None):
+            raise ValueError("expected the secret by one of secret_file and secret_variable")
+        self._check_url()
+        for pattern in self.machines:
+            if pattern.count("/") != 1 or not all(pattern.split("/")):
+                raise ValueError(f"machines: {pattern!r} is not site/machine such as demo/lab or demo/*")
+        return self
+
+    def _check_url(self) -> None:
+        # The text of the address may hold a secret and is in no message.
+        try:
+            parts = urlsplit(self.url)
+            host, port = parts.hostname, parts.port
+        except ValueError as error:
+            raise ValueError(f"url cannot be read: {error}") from error
+        if parts.scheme not in {"https", "http"} or not host or not self.url.isprintable() or " " in self.url:
+            raise ValueError("url is not a web address, expected https://host/path")
+        if port == 0:
+            raise ValueError("url has port 0, expected 1 to 65535")
+        if parts.username is not None or parts.password is not None:
+            raise ValueError("url holds a user name, expected one without: receivers know us by the signature")
+        if parts.scheme == "http" and not self.insecure and not is_loopback(host):
+            raise ValueError(
+                "url is http and not on this computer, so everybody on the way could read along: expected https, or "
+                "insecure = true"
+            )
+        if self.ca_file is not None and parts.scheme == "http":
+            raise ValueError("ca_file is for https, and url is http")
+
+    @property
+    def _parts(self) -> SplitResult:
+        return urlsplit(self.url)
+
+    @property
+    def target(self) -> str:
+        """The address without path and query, which may hold a secret.
+
+        Examples
+        --------
+        >>> hook = WebhookSettings(name="a", url="https://hooks.example/T0/key?x=1", secret_variable="S")
+        >>> hook.target
+        'https://hooks.example'
+        """
+        return f"{self._parts.scheme}://{self._parts.netloc}"
+
+    @property
+    def on_this_computer(self) -> bool:
+        """Whether the receiver runs on this computer."""
+        return is_loopback(self._parts.hostname or "")
+
+    def beside(self, folder: Path) -> Self:
+        """Resolve the paths against the folder of the settings file."""
+        files = {name: getattr(self, name) for name in ("secret_file", "ca_file")}
+        return self.model_copy(update={name: folder / path for name, path in files.items() if path is not None})
+
+
+def repeated_name(webhooks: tuple[WebhookSettings, ...]) -> str | None:
+    """A name that two webhooks have; None if there is none.
+
+    Examples
+    --------
+    >>> hook = WebhookSettings(name="pager", url="https://pager.example/", secret_variable="S")
+    >>> repeated_name((hook,)), repeated_name((hook, hook))
+    (None, 'pager')
+    """
+    names = [hook.name for hook in webhooks]
+    return next((name for name in names if names.count(name) > 1), None)
