@@ -33,15 +33,15 @@ PAIR_RISE = 10.0
 """Power of the difference of two sensors of one motion over the healthy one, beyond what the others' rose by."""
 ALONE_RISE = 40.0
 """The same where no other pair says what all sensors do."""
-FLOOR_RISE, FLOOR_ALONE = 30.0, 3.0
+FLOOR_RISE, FLOOR_ALONE = 50.0, 4.0
 """Where a motion has one sensor: floor of what the others do not explain over the healthy one, and beyond theirs."""
 FLOOR_FLAT = 0.5
 """Part of the bands that must lie on the floor: a machine's own spectrum has resonances."""
 LINE_RISE = 4.0
-LEAST_PART = 0.02
-"""Part of the channel's rms that the noise in the band must reach."""
-LEAST_LINE = 0.03
-"""Part of it that a line must reach."""
+LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.08, 0.03
+"""Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line."""
+_FEWEST = 3
+"""Channels that are needed to tell which of them rose alone."""
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
 """Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated."""
 _CLEAR = 0.5
@@ -188,7 +188,7 @@ def _of_single(
         state, own = window.states[now.column], float(rms[now.column])
         name = naming.name(state)
         size = float(np.sqrt(2 * band_hz * np.exp(floor(np.log(now.density)))))
-        risen = rise[row] > np.log(FLOOR_RISE) and alone[row] > np.log(FLOOR_ALONE)
+        risen = len(known) >= _FEWEST and rise[row] > np.log(FLOOR_RISE) and alone[row] > np.log(FLOOR_ALONE)
         if now.line_rms > max(LEAST_LINE * own, np.sqrt(LINE_RISE) * then.line_rms):
             text = (
                 f"{name}: a line of {naming.value(state, now.line_rms)} rms at {now.line_hz:.4g} Hz that no other "
@@ -196,7 +196,7 @@ def _of_single(
                 "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
             )
             findings.append(SensorFinding((state,), "noise", text, now.line_rms / own))
-        elif risen and now.flat > FLOOR_FLAT and size > LEAST_PART * own:
+        elif risen and now.flat > FLOOR_FLAT and size > LEAST_FLOOR * own:
             factor = float(np.exp(rise[row] / 2))
             text = (
                 f"{name}: noise of {naming.value(state, size)} rms in the band ({size / own:.0%} of what it shows), "

@@ -29,7 +29,7 @@ LEAST_JITTER = 0.05
 LEAST_WILD_JITTER = 0.2
 """The same where the speed changes, because a machine's own run-up leaves something, too."""
 _JITTER_ERRORS = 6.0
-_STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.1
+_STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.05
 """Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number."""
 _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
 _ALIKE = 0.25
@@ -90,7 +90,7 @@ def _lost(window: WindowStatistics, name: str) -> SensorFinding | None:
     turns = window.hop_speed_rad_s * (window.duration_s / hops) / (2 * np.pi)
     off = turns - np.median(turns)
     steady = np.abs(off) < 3 * _STEADY_TURNS
-    if steady.all() or 2 * steady.sum() < hops or steady[0] + steady[-1] < 1:
+    if steady.all() or 2 * steady.sum() < hops or not (steady[0] and steady[-1]):
         return None
     spread = float(1.4826 * np.median(np.abs(off[steady])))
     strange = np.flatnonzero(~steady)
@@ -236,17 +236,16 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
     if first is None or last is None or not np.all(out > 0):
         return None
     step_hz, hop_s = window.frequencies_hz[1] - window.frequencies_hz[0], window.duration_s / len(own)
-    share, z = 0.0, 0.0
     # A jitter of more than half a radian loses turns at random: then the line is somewhere between the hops' speeds.
-    for middle in range(first, last + 1):
-        left, beside = _surroundings(window, columns, middle)
-        if not window.removed_by_hop:
-            # Amplitudes that really changed leave a line, too; their scatter by the vibration around it does not.
-            moved = (np.abs(own - own.mean(axis=0)) ** 2).mean(axis=0) / 2 - 2 * beside / hop_s
-            left = left - 2 * np.maximum(moved, 0.0)
-        error = 2 * step_hz * beside * np.sqrt((2 * _LINE_BINS + 1) * 2.0 / window.n_segments)
-        if float(np.median(left / error)) > z:
-            share, z = float(np.median(left / out)), float(np.median(left / error))
+    power = np.einsum("fii->fi", window.spectrum[first : last + 1]).real[:, list(columns)]
+    middle = first + int((power / np.maximum(power.mean(axis=0), np.finfo(float).tiny)).sum(axis=1).argmax())
+    left, beside = _surroundings(window, columns, middle)
+    if not window.removed_by_hop:
+        # Amplitudes that really changed leave a line, too; their scatter by the vibration around it does not.
+        moved = (np.abs(own - own.mean(axis=0)) ** 2).mean(axis=0) / 2 - 2 * beside / hop_s
+        left = left - 2 * np.maximum(moved, 0.0)
+    error = 2 * step_hz * beside * np.sqrt((2 * _LINE_BINS + 1) * 2.0 / window.n_segments)
+    share, z = float(np.median(left / out)), float(np.median(left / error))
     if share < (LEAST_WILD_JITTER if window.removed_by_hop else LEAST_JITTER) or z < _JITTER_ERRORS:
         return None
     jitter_rad = float(np.sqrt(2 * np.arcsinh(np.sqrt(share) / 2)))
