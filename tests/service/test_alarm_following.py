@@ -4,6 +4,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
@@ -11,13 +12,14 @@ from hypothesis import given, settings
 
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
+from models.signals.link_access import Grant
 from service.alarm_schemas import AlarmCloudEvent, AlarmLogPage, AlarmStates
 from service.client.alarm_log import follow_alarms
 from service.client.errors import ClientError, LogReplaced
 from service.client.log_order import LogOrder
 from service.schemas import example
 from service.store.errors import StoreError
-from service.transport import Link, LinkError, MachineCallbacks, MachineLink
+from service.transport import Link, LinkError, MachineCallbacks, MachineLink, route
 from tests.service.live import LAB, endpoint, until
 
 PLACE = "demo/lab"
@@ -170,7 +172,12 @@ class Following:
     """`follow_alarms` in a thread."""
 
     def __init__(
-        self, address: str, machines: str = PLACE, after: int = -1, every_s: float = 30.0, fail_at: int | None = None
+        self,
+        where: str | LinkSettings,
+        machines: str = PLACE,
+        after: int = -1,
+        every_s: float = 30.0,
+        fail_at: int | None = None,
     ) -> None:
         self.taken: list[AlarmCloudEvent] = []
         self.error: Exception | None = None
@@ -182,7 +189,7 @@ class Following:
             self.taken.append(one)
 
         def run() -> None:
-            link = LinkSettings(connect=(address,))
+            link = where if isinstance(where, LinkSettings) else LinkSettings(connect=(where,))
             try:
                 follow_alarms(link, [machines], {PLACE: after}, take, stop=self._stop, ask_every_s=every_s)
             except (ClientError, OSError) as error:
@@ -330,3 +337,38 @@ def test_client_without_anybody_to_talk_to_is_told() -> None:
         follow_alarms(LinkSettings(mode="client", connect=(address,)), [PLACE], {}, lambda _: None)
     assert f"connect {address}) could not be opened: nobody answers there" in str(caught.value)
     assert LAB.keys.root == f"rotorwatch/{PLACE}"
+
+
+def test_viewer_with_a_grant_can_follow(tmp_path: Path) -> None:
+    """Through a router that lets a viewer read this machine and nothing else."""
+    address = endpoint()
+    passwords = tmp_path / "passwords"
+    passwords.write_text("monitor:m\nviewer:v\n", encoding="utf-8")
+    secrets = {}
+    for name, password in (("monitor", "m"), ("viewer", "v")):
+        secrets[name] = tmp_path / name
+        secrets[name].write_text(f"{password}\n", encoding="utf-8")
+    for file in (passwords, *secrets.values()):
+        file.chmod(0o600)
+    grants = (Grant(who=("monitor",), monitors=("*/*",)), Grant(who=("viewer",), views=(PLACE,)))
+    router = LinkSettings(mode="router", listen=(address,), passwords_file=passwords, grants=grants)
+
+    def user(name: str) -> LinkSettings:
+        return LinkSettings(mode="client", connect=(address,), user=name, password_file=secrets[name])
+
+    with route(router):
+        link = Link(user("monitor"))
+        lab, pump = Monitor(link), Monitor(link, "demo/pump")
+        for machine in (lab, pump):
+            machine.happen(published=False)
+        with Following(user("viewer")) as following, Following(user("viewer"), machines="demo/pump") as refused:
+            following.reaches(0)
+            for machine in (lab, pump):
+                machine.happen(published=False)
+                machine.happen()
+            following.reaches(2)
+        for machine in (lab, pump):
+            machine.link.close()
+        link.close()
+    assert following.sequences() == [0, 1, 2]
+    assert refused.taken == []
