@@ -3,7 +3,7 @@
 import json
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -331,6 +331,7 @@ def test_event_that_could_not_be_kept_is_not_taken() -> None:
         assert following.sequences() == [0, 1]
 
 
+@pytest.mark.slow
 def test_client_without_anybody_to_talk_to_is_told() -> None:
     address = endpoint()
     with pytest.raises(LinkError) as caught:
@@ -372,3 +373,27 @@ def test_viewer_with_a_grant_can_follow(tmp_path: Path) -> None:
         link.close()
     assert following.sequences() == [0, 1, 2]
     assert refused.taken == []
+
+
+@pytest.mark.slow
+def test_connection_that_was_cut_is_made_again() -> None:
+    """The router between monitor and follower goes and comes back; what happened meanwhile is asked for."""
+    address = endpoint()
+    through = LinkSettings(mode="client", connect=(address,))
+    with ExitStack() as stack:
+        with route(LinkSettings(listen=(address,))):
+            link = Link(through)
+            stack.callback(link.close)
+            machine = Monitor(link)
+            stack.callback(machine.link.close)
+            following = stack.enter_context(Following(through, every_s=0.5))
+            machine.happen()
+            following.reaches(0)
+        machine.happen()
+        machine.happen()
+        with route(LinkSettings(listen=(address,))):
+            following.reaches(2)
+            machine.happen()
+            following.reaches(3)
+            stack.close()
+    assert following.taken == machine.log
