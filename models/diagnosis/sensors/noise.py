@@ -33,14 +33,14 @@ PAIR_RISE = 10.0
 """Power of the difference of two sensors of one motion over the healthy one, beyond what the others' rose by."""
 ALONE_RISE = 40.0
 """The same where no other pair says what all sensors do."""
-FLOOR_RISE, FLOOR_ALONE = 50.0, 4.0
+FLOOR_RISE, FLOOR_ALONE = 80.0, 5.0
 """Where a motion has one sensor: floor of what the others do not explain over the healthy one, and beyond theirs."""
 FLOOR_FLAT = 0.5
 """Part of the bands that must lie on the floor: a machine's own spectrum has resonances."""
 LINE_RISE = 4.0
-LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.08, 0.03
+LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
 """Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line."""
-_FEWEST = 3
+_FEWEST = 4
 """Channels that are needed to tell which of them rose alone."""
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
 """Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated."""
@@ -108,8 +108,8 @@ def _of_pairs(
             known.append((reading, pair_noise(window, bands[reading.pair], reading), healthy))
     if not known:
         return []
-    absolute = np.log([now.density / np.array(healthy.density) for _, now, healthy in known])
-    relative = np.log([now.share / np.array(healthy.share) for _, now, healthy in known])
+    absolute = np.log([now.density / (np.array(then.density) + now.leakage) for _, now, then in known])
+    relative = np.log([now.density / (np.array(then.share) * now.scale + now.leakage) for _, now, then in known])
     rise = np.minimum(_alone(absolute), _alone(relative))
     limit = np.log(PAIR_RISE if len(known) > 1 else ALONE_RISE)
     rms, findings = channel_rms(window), []

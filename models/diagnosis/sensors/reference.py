@@ -156,7 +156,7 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
 
 def _noise(noises: Sequence[PairNoise | ChannelNoise]) -> NoiseReference | None:
     """Mean of the windows' noise."""
-    density = np.mean([one.density for one in noises], axis=0)
+    density = np.mean([one.noise if isinstance(one, PairNoise) else one.density for one in noises], axis=0)
     share = np.mean([one.share for one in noises], axis=0)
     if not (np.all(density > 0) and np.all(share > 0) and np.all(np.isfinite(share))):
         return None

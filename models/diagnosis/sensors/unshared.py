@@ -39,6 +39,9 @@ _OWN = 4.0
 _HARMONIC = 0.002
 """Relative distance from a multiple of half the speed within which a line is the shaft's, beside its range."""
 _RIDGE = 1e-9
+_LEAKAGE = 1.0
+_LEFT = 0.1
+"""Least part of a difference that is still called noise after leakage was taken out."""
 _SMOOTHED = 3
 
 
@@ -51,13 +54,26 @@ class PairNoise:
     pair : MotionPair
     density : ndarray, shape (n_bands,)
         Power of their difference as the second shows it, two-sided, SI²/Hz.
-    share : ndarray, shape (n_bands,)
-        The same over the power that noise of the channels' own rms would have, 1/Hz.
+    leakage : ndarray, shape (n_bands,)
+        The part of it that two perfect sensors would show in segments of this length.
+    scale : ndarray, shape (n_bands,)
+        Power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI².
     """
 
     pair: MotionPair
     density: FloatArray
-    share: FloatArray
+    leakage: FloatArray
+    scale: FloatArray
+
+    @property
+    def noise(self) -> FloatArray:
+        """Power of the difference without the leakage."""
+        return np.maximum(self.density - self.leakage, _LEFT * self.density)
+
+    @property
+    def share(self) -> FloatArray:
+        """`noise` over `scale`, 1/Hz."""
+        return self.noise / self.scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +130,11 @@ def pair_noise(window: WindowStatistics, bands: Banded, reading: PairReading) ->
     density = np.maximum(power - 2 * (cross * h.conj()).real, 1e-12 * power)
     rms, pair = channel_rms(window), reading.pair
     scale = rms[pair.second] ** 2 + bands.w ** (2 * pair.order) * rms[pair.first] ** 2
-    return PairNoise(pair, np.asarray(density, dtype=np.float64), np.asarray(density / scale, dtype=np.float64))
+    # v = jωx holds for the motion, not for its windowed segments: F{w dx/dt} = jω F{w x} - F{x dw/dt}. With a Hann
+    # window of length T the last term has 1 / 3 (2π / ωT)² of the power.
+    step_rad_s = 2 * np.pi * (window.frequencies_hz[1] - window.frequencies_hz[0])
+    leakage = _LEAKAGE * v * (pair.order * step_rad_s / bands.w) ** 2 / 3
+    return PairNoise(pair, np.asarray(density, dtype=np.float64), np.asarray(leakage, dtype=np.float64), scale)
 
 
 def channel_noise(window: WindowStatistics, columns: Sequence[int]) -> list[ChannelNoise]:
