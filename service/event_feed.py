@@ -172,7 +172,8 @@ class EventFeed:
                         yield f"event: health\ndata: {said.text}\n\n"
                 quiet = not await _woken(listener.news, _AGAIN_S if waits else _KEEP_ALIVE_S)
                 if quiet:
-                    yield ": still there\n\n"
+                    # No empty line: some readers take that for the end of an event without data.
+                    yield ": still there\n"
                 if time.monotonic() - asked_s >= _KEEP_ALIVE_S:
                     if not await admitted():
                         return
