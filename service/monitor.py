@@ -18,7 +18,7 @@ import numpy as np
 
 from models.alarm_names import CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST, data_alarm
 from models.arrivals import Arrivals, Arrived
-from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
+from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
 from models.commissioning.installed import Installed
 from models.diagnosis.moments import HopMoments, plan_for
 from models.diagnosis.readings import Diagnosis
@@ -69,6 +69,7 @@ class MachineMonitor:
         self._quality = DataQuality()
         self._refused: Counter[str] = Counter()
         self._latest: WindowReport | None = None
+        self._calm = HealthState.WARMING
         self._end_ns: int | None = None
         self._kept_is_valid = True
         self._statistics: WindowStatistics | None = None
@@ -197,6 +198,7 @@ class MachineMonitor:
                     **prefixed("window", self._window.checkpoint()),
                     **prefixed("test", self._test.state.checkpoint()),
                     **prefixed("evaluator", self._evaluator.checkpoint()),
+                    "calm": np.array([self._calm.value]),
                     "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
                 }
             ),
@@ -216,12 +218,13 @@ class MachineMonitor:
         arrays = from_bytes(state)
         moments = tuple(HopMoments.restored(from_bytes(hop)) for hop in hops)
         test = SequentialState.restored(unprefixed("test", arrays))
-        end_ns = int(arrays["end_ns"][0]) if arrays["end_ns"].size else None
+        calm = HealthState(*texts(arrays, "calm"))
+        end_ns = next(iter(checked(arrays, "end_ns", np.int64, (None,)).tolist()), None)
         self._gate.restore(unprefixed("gate", arrays))
         self._window.restore(unprefixed("window", arrays), moments)
         self._evaluator.restore(unprefixed("evaluator", arrays))
         self._test.state = test
-        self._end_ns = end_ns
+        self._end_ns, self._calm = end_ns, calm
         self._arrivals.resume(self._gate.courses)
 
     def restore_alarms(self, alarms: str, next_sequence: int = 0) -> None:
@@ -230,7 +233,8 @@ class MachineMonitor:
 
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
-        state = HealthState.WARMING if self._latest is None else self._latest.state
+        # What operators did since the latest window counts at once.
+        state = self._state(self._calm)
         return MachineHealth(
             state,
             self._window.filled,
@@ -406,6 +410,7 @@ class MachineMonitor:
 
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
+        self._calm = otherwise
         match self._alarms.severity:
             case Severity.DANGER:
                 return HealthState.DANGER
