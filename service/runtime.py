@@ -40,12 +40,15 @@ from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
 from service.event_feed import EventFeed
 from service.logs import logger
+from service.metrics.collector import Metrics
+from service.metrics.requests import RequestCounts, RequestMeter
 from service.pulse import Pulse
 from service.readiness import readiness_of
 from service.recording.catalogue import Catalogue
-from service.recording.recorder import MachineRecorder
+from service.recording.recorder import MachineRecorder, RecorderStatus
 from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
+from service.service_api import add_service_routes
 from service.store.audit import AuditLog
 from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
@@ -89,6 +92,8 @@ class Runtime:
         self._history_open = False
         # What is heard in a namespace is a replay, of which nobody must be told.
         self.webhooks = WebhookDesk(() if settings.link.namespace else settings.webhooks)
+        self._requests = RequestCounts()
+        self.metrics = Metrics(self, self._requests)
         self.store = Store(settings.history.database, settings.history.retention)
         self.feed = EventFeed()
         directory = settings.recording.directory
@@ -122,6 +127,11 @@ class Runtime:
                 return worker
         return None
 
+    def recorder_status(self, worker: MachineWorker) -> RecorderStatus | None:
+        """How a machine's recorder stands; None without one."""
+        recorder = self._recorders.get((worker.machine.site, worker.machine.name))
+        return None if recorder is None else recorder.status()
+
     def readiness(self) -> Readiness:
         """Whether everything that monitoring needs works, and what does not."""
         machines = tuple(
@@ -134,7 +144,7 @@ class Runtime:
                 last_worker_error=worker.last_error,
                 worker_busy_s=round(pulse.busy_s, 1),
                 history_waiting=worker.history.waiting,
-                recording=self._recording_state(worker.machine),
+                recording="off" if (recorder := self.recorder_status(worker)) is None else recorder.text,
             )
             for worker, pulse in zip(self._workers, self._pulses, strict=True)
         )
@@ -175,6 +185,7 @@ class Runtime:
                 worker = MachineWorker(installed, self.settings.queue, history, on_events=self._alarm_events)
                 self._workers.append(worker)
                 self._pulses.append(Pulse(worker.inbox.call))
+                self.metrics.watch(worker)
             undo.callback(self.webhooks.close)
             logs = {f"{worker.machine.site}/{worker.machine.name}": worker.history for worker in self._workers}
             self.webhooks.start(logs, self.store.webhooks)
@@ -187,7 +198,10 @@ class Runtime:
             undo.callback(self.replays.close)
             undo.callback(self.feed.close)
             self._server = server
-            server.start(create_app(self, guard))
+            app = create_app(self, guard)
+            add_service_routes(app, self, guard)
+            app.add_middleware(RequestMeter, counts=self._requests)  # around all others, so that refusals count
+            server.start(app)
             self._undo = undo.pop_all()
         _log.info("running", http=server.url, machines=len(self._workers))
 
@@ -208,10 +222,6 @@ class Runtime:
         # Before anything is published for the machine, and undeclared after everything is.
         undo.callback(MachineTap(link, machine.keys, recorder.put).close)
         self._recorders[machine.site, machine.name] = recorder
-
-    def _recording_state(self, machine: MachineFile) -> str:
-        recorder = self._recorders.get((machine.site, machine.name))
-        return "off" if recorder is None else recorder.status().text
 
     def _connect(self, worker: MachineWorker, link: Link, undo: ExitStack) -> MachineLink:
         machine: MachineFile = worker.machine

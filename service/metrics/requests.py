@@ -1,0 +1,82 @@
+"""Counts HTTP requests by route and answer."""
+
+from collections import Counter
+from collections.abc import Mapping
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+__all__ = ["NO_ROUTE", "REASONS", "RequestCounts", "RequestMeter"]
+
+NO_ROUTE = "-"
+"""Route of a request that was refused before one was looked for, or whose path is none."""
+
+REASONS = ("token", "scope", "origin", "rate")
+_METHODS = frozenset(("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"))
+
+
+class RequestCounts:
+    """Requests that were answered; written by the server's event loop alone, read by any thread."""
+
+    def __init__(self) -> None:
+        self._answered: Counter[tuple[str, str, str]] = Counter()
+        self._refused: Counter[str] = Counter()
+
+    def count(self, method: str, route: str, status: int) -> None:
+        """Count a request."""
+        self._answered[method if method in _METHODS else "other", route, str(status)] += 1
+        if status == 401:
+            self._refused["token"] += 1
+        elif status == 429:
+            self._refused["rate"] += 1
+        elif status == 403:
+            # Scopes are looked at when the route is known, where a request comes from before that.
+            self._refused["origin" if route == NO_ROUTE else "scope"] += 1
+
+    def answered(self) -> Mapping[tuple[str, str, str], int]:
+        """Requests by method, route and status."""
+        return dict(self._answered)
+
+    def refused(self) -> Mapping[str, int]:
+        """Requests that were refused: without a valid token, without the scope, for their origin, or too many."""
+        return {reason: self._refused[reason] for reason in REASONS}
+
+
+class RequestMeter:
+    """Middleware around all others; what it counts are answers as they leave.
+
+    Parameters
+    ----------
+    app : callable
+        The application inside.
+    counts : RequestCounts
+        Where to count.
+    """
+
+    def __init__(self, app: ASGIApp, counts: RequestCounts) -> None:
+        self._app = app
+        self._counts = counts
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        counted = False
+
+        def count(status: int) -> None:
+            nonlocal counted
+            if not counted:
+                counted = True
+                route = getattr(scope.get("route"), "path", NO_ROUTE)
+                self._counts.count(scope["method"], str(route), status)
+
+        async def watched(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                count(message["status"])
+            await send(message)
+
+        try:
+            await self._app(scope, receive, watched)
+        except BaseException:
+            count(500)  # what the server answers then
+            raise
