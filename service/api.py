@@ -9,6 +9,7 @@ from models.machine import MachineFile
 from service.access.guard import Guard
 from service.api_schemas import Alive, MachineConfiguration, MachineList, configuration_example
 from service.api_views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
+from service.description import DescribedApp
 from service.events_api import add_event_routes
 from service.history_api import add_history_routes
 from service.operations_api import add_operation_routes
@@ -52,7 +53,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     guard : Guard
         Who may call what.
     """
-    app = FastAPI(
+    app = DescribedApp(
         title="rotorwatch",
         description=_DESCRIPTION,
         openapi_tags=_TAGS,

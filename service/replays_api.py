@@ -19,7 +19,7 @@ from service.recordings_api import RecordingIndex, found_recording
 from service.replay.choice import is_shipped_bundle, is_shipped_machine
 from service.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
 from service.replay.schemas import ReplayJob, ReplayRequest, ReplaySeek
-from service.schemas import AlarmCloudEvent, Report
+from service.schemas import AlarmCloudEvent, Report, example
 
 __all__ = ["ReplayAlarmList", "ReplayDesk", "ReplayList", "ReplayReportList", "add_replay_routes"]
 
@@ -39,6 +39,12 @@ class ReplayList(BaseModel):
 
 
 _NEXT = "pass it as offset to go on; null if there is no more yet"
+
+
+class NoOrder(BaseModel):
+    """An empty object: that a request is sent as JSON shows that no page from elsewhere has sent it."""
+
+    model_config = _JSON
 
 
 class ReplayReportList(BaseModel):
@@ -177,6 +183,7 @@ def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     app.include_router(router)
 
 
+_NoOrder = Annotated[NoOrder | None, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
 _Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldest")]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
@@ -223,38 +230,48 @@ def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> No
 
 def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
     guarded = [guard.operate, Depends(_switch(desk))]
-    problems = (403, 404, 415, 422)
+    problems = (400, 404, 413, 415, 422)
 
     @router.post(
         "",
         status_code=201,
         dependencies=guarded,
-        responses=responses(ReplayJob, *problems, 409, 429, 503, status_code=201),
+        responses=responses(ReplayJob, *problems, 409, status_code=201),
     )
-    def start(request: ReplayRequest) -> ReplayJob:
+    def start(
+        request: Annotated[ReplayRequest, Body(openapi_examples=_shown("an hour of yesterday", ReplayRequest))],
+    ) -> ReplayJob:
         """Start a replay, in a process of its own."""
         return desk.start(request)
 
-    @router.delete("/{replay_id}", dependencies=guarded, responses=responses(ReplayJob, 403, 404, 422))
+    @router.delete("/{replay_id}", dependencies=guarded, responses=responses(ReplayJob, 404, 422))
     def stop(replay_id: str) -> ReplayJob:
         """Stop a replay; what it found so far stays."""
         _job(desk, replay_id)
         return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
 
     @router.post("/{replay_id}/pause", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def pause(replay_id: str) -> ReplayJob:
+    def pause(replay_id: str, order: _NoOrder = None) -> ReplayJob:
         """Pause a paced replay."""
+        _ = order
         return _order(desk, replay_id, "pause")
 
     @router.post("/{replay_id}/resume", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def resume(replay_id: str) -> ReplayJob:
+    def resume(replay_id: str, order: _NoOrder = None) -> ReplayJob:
         """Let a paused replay go on."""
+        _ = order
         return _order(desk, replay_id, "resume")
 
     @router.post("/{replay_id}/seek", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def seek(replay_id: str, place: Annotated[ReplaySeek, Body()]) -> ReplayJob:
+    def seek(
+        replay_id: str, place: Annotated[ReplaySeek, Body(openapi_examples=_shown("to a time", ReplaySeek))]
+    ) -> ReplayJob:
         """Let a paced replay go on elsewhere; a monitor ignores what it has heard already."""
         return _order(desk, replay_id, f"seek {place.to_ns if place.by_s is None else f'{place.by_s:+f}'}")
+
+
+def _shown(summary: str, model: type[BaseModel]) -> Any:
+    return {"example": {"summary": summary, "value": example(model)}}
 
 
 def _switch(desk: ReplayDesk) -> Callable[[], None]:

@@ -1,0 +1,242 @@
+"""The whole description of the API against a running service with data, tokens on.
+
+Every route of the application is asked without a token, with a wrong one, and with one that lacks nothing but the
+scope. Then requests of all kinds are made up out of the description, valid and invalid ones, and every answer must be
+as it says. In the ordinary run there are few, the same every time; for a long search with others::
+
+    ROTORWATCH_API_CASES=2000 python -m pytest tests/service/test_openapi.py -k made_up -s
+"""
+
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import hypothesis
+import jsonschema_rs
+import pytest
+import schemathesis
+from fastapi import FastAPI
+from fastapi.routing import iter_route_contexts
+from schemathesis.core.result import Ok
+from schemathesis.specs.openapi import checks
+
+from service.access.guard import Guard
+from service.access.scopes import Scope
+from service.api import create_app
+from service.runtime import Runtime
+from tests.service.monitored import GUARDED, client, faulty, problem, token
+
+READ, OPERATE, CONFIGURE = Scope
+STREAMS = {"/api/v1/events", "/api/v1/replays/{replay_id}/events"}
+PUBLIC = {("GET", "/healthz")}
+#: What is there and in no description of an interface for programs.
+UNDESCRIBED = {("GET", "/"), ("GET", "/openapi.json")}
+VALUES = {"site": "demo", "machine": "lab", "name": "k_by", "replay_id": "0123456789ab"}
+CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
+#: Of the checks there are, those that a description can be held to.
+CHECKS = [
+    schemathesis.checks.not_a_server_error,
+    checks.status_code_conformance,
+    checks.content_type_conformance,
+    checks.response_headers_conformance,
+    checks.response_schema_conformance,
+    checks.negative_data_rejection,
+]
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
+    with faulty(tmp_path_factory.mktemp("machine"), GUARDED) as (running, _):
+        yield running
+
+
+@pytest.fixture(scope="module")
+def http(runtime: Runtime) -> Iterator[httpx.Client]:
+    with client(runtime, token(runtime)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def description(http: httpx.Client) -> dict[str, Any]:
+    found: dict[str, Any] = http.get("/openapi.json").json()
+    return found
+
+
+def application(runtime: Runtime) -> FastAPI:
+    """The application as it is served."""
+    store = runtime.store
+    return create_app(runtime, Guard(store.tokens, store.audit, runtime.settings.access, runtime.settings.http.host))
+
+
+def routes(app: FastAPI) -> set[tuple[str, str]]:
+    """Method and path of every route."""
+    return {
+        (method, context.path or "") for context in iter_route_contexts(app.routes) for method in context.methods or ()
+    }
+
+
+def needed(method: str, path: str) -> Scope:
+    """Which scope a route must ask for."""
+    if path == "/api/v1/audit" or path.endswith(("/remove-from-service", "/return-to-service")):
+        return CONFIGURE
+    return READ if method == "GET" else OPERATE
+
+
+def ask(http: httpx.Client, method: str, path: str) -> httpx.Response:
+    """Send a request that would be understood; of streams only the beginning is read."""
+    body = {"reason": "x", "expected_state": "shelved"} if "/alarms/" in path else {"recordings": ["a/b/c.mcap"]}
+    with http.stream(method, path.format(**VALUES), json=body if method == "POST" else None) as answer:
+        if not answer.headers["content-type"].startswith("text/event-stream"):
+            answer.read()
+    return answer
+
+
+def test_every_route_is_described(runtime: Runtime, description: dict[str, Any]) -> None:
+    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+    assert routes(application(runtime)) <= described | UNDESCRIBED
+    assert len(described) >= 30
+
+
+def test_no_route_answers_without_a_valid_token(runtime: Runtime, description: dict[str, Any]) -> None:
+    asked = 0
+    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+    for text in ("", "rw_000000000000_" + 43 * "0", "secret"):
+        with client(runtime, text) as nobody:
+            for method, path in sorted(described | UNDESCRIBED - PUBLIC):
+                if (method, path) in PUBLIC:
+                    assert ask(nobody, method, path).status_code == 200
+                    continue
+                answer = ask(nobody, method, path)
+                assert answer.headers["www-authenticate"].startswith("Bearer"), path
+                problem(answer, 401)
+                asked += 1
+    assert asked >= 3 * 30
+
+
+def test_every_route_asks_for_its_scope(runtime: Runtime, http: httpx.Client, description: dict[str, Any]) -> None:
+    """With all scopes but the one a route is refused, with that one alone it is not."""
+    with_scope = {scope: token(runtime, scope, name=f"only {scope}") for scope in Scope}
+    without = {scope: token(runtime, *(one for one in Scope if one != scope), name=f"no {scope}") for scope in Scope}
+    described = {(method.upper(), path) for path, methods in description["paths"].items() for method in methods}
+    for method, path in sorted(described | UNDESCRIBED):
+        if (method, path) in PUBLIC:
+            continue
+        scope = needed(method, path)
+        with client(runtime, without[scope]) as wrong, client(runtime, with_scope[scope]) as right:
+            found = problem(ask(wrong, method, path), 403)
+            assert found.detail.startswith(f"this needs the scope {scope}; no {scope} has "), path
+            assert ask(right, method, path).status_code not in (401, 403), path
+    for path, methods in description["paths"].items():
+        for method, route in methods.items():
+            declared = [part.get("token") for part in route.get("security", []) if "token" in part]
+            public = (method.upper(), path) in PUBLIC
+            assert declared == ([] if public else [[needed(method.upper(), path)]]), path
+    assert http.get("/openapi.json").status_code == 200
+
+
+def test_everything_is_described_with_examples(description: dict[str, Any]) -> None:
+    """Every argument in words, every body and answer with an example that its own schema accepts."""
+    schemas = description["components"]["schemas"]
+    for path, methods in description["paths"].items():
+        for method, route in methods.items():
+            place = f"{method.upper()} {path}"
+            assert route["summary"], place
+            assert route["description"], place
+            assert len(route["tags"]) == 1, place
+            for argument in route.get("parameters", []):
+                if argument["in"] != "path":
+                    assert argument.get("description"), f"{place}: {argument['name']}"
+            for part in route.get("requestBody", {}).get("content", {}).values():
+                shown = [one["value"] for one in part.get("examples", {}).values()] or [part["example"]]
+                for one in shown:
+                    check(schemas, part["schema"], one, place)
+            for status, answer in route["responses"].items():
+                assert answer["description"], f"{place}: {status}"
+                ((kind, part),) = answer["content"].items()
+                assert (kind == "application/problem+json") == (not status.startswith("2")), place
+                if kind in ("application/json", "application/problem+json"):
+                    check(schemas, part["schema"], part["example"], f"{place}: {status}")
+                else:
+                    assert kind in ("text/event-stream", "application/octet-stream", "text/plain")
+                if not status.startswith("2"):
+                    assert part["example"]["status"] == int(status), place
+
+
+def check(schemas: dict[str, Any], schema: dict[str, Any], shown: object, place: str) -> None:
+    whole = {**schema, "components": {"schemas": schemas}}
+    error = next(iter(jsonschema_rs.validator_for(whole).iter_errors(shown)), None)
+    assert error is None, f"{place}: {error}"
+
+
+def test_tags_are_described(description: dict[str, Any]) -> None:
+    there = {one["name"] for one in description["tags"]}
+    used = {tag for methods in description["paths"].values() for route in methods.values() for tag in route["tags"]}
+    assert used == there
+    assert set(description["components"]["securitySchemes"]) == {"token", "browser"}
+
+
+def validated(case: schemathesis.Case[Any], url: str, text: str) -> int:
+    """Send a request that was made up, and hold the answer to the description."""
+    headers = {"Authorization": f"Bearer {text}"}
+    if case.operation.path in STREAMS:
+        arguments = case.as_transport_kwargs(base_url=url, headers=headers)
+        with httpx.stream(
+            arguments["method"],
+            arguments["url"],
+            params=arguments.get("params"),
+            headers={name: value for name, value in arguments["headers"].items() if value is not None},
+            trust_env=False,
+        ) as streamed:
+            body = b"" if streamed.status_code == 200 else streamed.read()
+        whole = httpx.Response(streamed.status_code, headers=streamed.headers, content=body, request=streamed.request)
+        whole.elapsed = streamed.elapsed
+        case.validate_response(whole, checks=CHECKS, headers=headers)
+        return whole.status_code
+    response = case.call(base_url=url, headers=headers)
+    case.validate_response(response, checks=CHECKS, headers=headers)
+    return int(response.status_code)
+
+
+@pytest.mark.slow
+def test_requests_made_up_out_of_the_description(runtime: Runtime, description: dict[str, Any]) -> None:
+    schema = schemathesis.openapi.from_dict(json.loads(json.dumps(description)))
+    text = token(runtime, name="made up")
+    seen: Counter[tuple[str, int]] = Counter()
+    looked_at = 0
+    for found in schema.get_all_operations():
+        assert isinstance(found, Ok)
+        operation = found.ok()
+        known = {one.name: VALUES[one.name] for one in operation.path_parameters if one.name in VALUES}
+        for mode, share in ((schemathesis.GenerationMode.POSITIVE, 12), (schemathesis.GenerationMode.NEGATIVE, 8)):
+            for fixed in [known, None] if known else [None]:
+
+                @hypothesis.seed(20260101)
+                @hypothesis.settings(
+                    max_examples=CASES or share,
+                    derandomize=not CASES,
+                    database=None,
+                    deadline=None,
+                    phases=[hypothesis.Phase.generate],
+                    suppress_health_check=list(hypothesis.HealthCheck),
+                )
+                @hypothesis.given(case=operation.as_strategy(mode, path_parameters=fixed))
+                def run(case: schemathesis.Case[Any]) -> None:
+                    seen[case.operation.label, validated(case, runtime.http_url, text)] += 1
+
+                try:
+                    run()
+                except hypothesis.errors.Unsatisfiable:  # nothing about it can be invalid
+                    assert mode is schemathesis.GenerationMode.NEGATIVE
+        looked_at += 1
+    statuses = Counter[int]()
+    for (_, status), count in seen.items():
+        statuses[status] += count
+    print(f"{sum(statuses.values())} requests to {looked_at} routes: {dict(sorted(statuses.items()))}")  # noqa: T201  # what a long search is for
+    assert looked_at == sum(len(methods) for methods in description["paths"].values())
+    # Each was answered as asked, or would have been if there were such a machine, recording or replay.
+    assert {label for label, status in seen if status in (200, 404)} == {label for label, _ in seen}
+    # 401 where what is invalid is the token; 503 would be documented, but nothing was wrong with the service.
+    assert set(statuses) == {200, 400, 401, 404, 409, 415, 422, 428}
