@@ -14,7 +14,14 @@ import pytest
 from pydantic import BaseModel
 
 from models.signals.link import LinkSettings
-from service.config import HttpSettings, MachineEntry, RecordingSettings, ReplaySettings, ServiceSettings
+from service.config import (
+    HistorySettings,
+    HttpSettings,
+    MachineEntry,
+    RecordingSettings,
+    ReplaySettings,
+    ServiceSettings,
+)
 from service.recordings_api import RecordingDetail, RecordingList
 from service.replay.schemas import ReplayJob
 from service.replays_api import ReplayAlarmList, ReplayDesk, ReplayList, ReplayReportList
@@ -22,6 +29,7 @@ from service.runtime import Runtime, running
 from service.schemas import Problem
 from simulator.scenario import parse_fault
 from tests.service.live import START_NS, endpoint, scenario_blocks, until
+from tests.service.monitored import OPEN
 from tests.service.replaying import recording
 
 M = TypeVar("M", bound=BaseModel)
@@ -43,6 +51,8 @@ def plan(directory: Path | None, **replay: object) -> ServiceSettings:
     return ServiceSettings(
         link=LinkSettings(listen=(endpoint(),)),
         http=HttpSettings(port=0),
+        history=HistorySettings(url="sqlite:///:memory:"),
+        access=OPEN,
         machines=(MachineEntry(file="lab", bundle="lab"),),
         # The service records there too; recordings of January stay.
         recording=RecordingSettings(directory=None if directory is None else str(directory), keep_days=36_500.0),
