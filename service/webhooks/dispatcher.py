@@ -268,10 +268,10 @@ class Dispatcher:
             pause = pause_s(answer, self._failures, self.settings.longest_pause_s, self._chance())
             self._due_s = self._clock() + pause
         if (withheld := self._limiter.admit("attempt")) is not None:
+            more = {"withheld": withheld} if withheld else {}
             self._log.warning(
-                "not delivered, trying again", id=event.id, why=answer.text, pause_s=round(pause, 1),
-                withheld=withheld,
-            )  # fmt: skip
+                "not delivered, trying again", id=event.id, why=answer.text, pause_s=round(pause, 1), **more
+            )
 
     def _conclude(self, lane: _Lane, event: StoredEvent) -> None:
         if self._failures or lane.failures:
@@ -297,7 +297,9 @@ class Dispatcher:
     def _unwell(self, error: StoreError) -> None:
         self._note(str(error))
         if (withheld := self._limiter.admit("history")) is not None:
-            self._log.warning("the history cannot be used", why=str(error), withheld=withheld)
+            self._log.warning(
+                "the history cannot be used", why=str(error), **({"withheld": withheld} if withheld else {})
+            )
 
     def _note(self, error: str) -> None:
         self._last_error, self._last_error_ns = error, self._now_ns()
