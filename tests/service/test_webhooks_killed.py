@@ -1,4 +1,4 @@
-"""A monitor that is killed while it tells a receiver of alarms: each arrives, in order, and nothing secret is logged."""
+"""A monitor is killed while it tells a receiver of alarms: each arrives, in order, and nothing secret is logged."""
 
 import threading
 from collections.abc import Iterator, Mapping
