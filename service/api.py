@@ -4,6 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse
+from pydantic import AfterValidator
 
 from models.machine import MachineFile
 from service.access.guard import Guard
@@ -18,6 +19,7 @@ from service.problems import add_problems, problem_answer, responses
 from service.recordings_api import add_recording_routes
 from service.replays_api import add_replay_routes
 from service.schemas import DetectableChanges, Health, MachineDescription, Readiness
+from service.service_api import add_service_routes
 from service.snapshots_api import add_snapshot_routes
 
 __all__ = ["MachineView", "ServiceView", "create_app"]
@@ -37,8 +39,17 @@ _TAGS = [
     {"name": "replays", "description": "Recordings sent through a monitor of their own, apart from what is live."},
     {"name": "service", "description": "The monitor itself."},
 ]
+_SMALLEST_CHANGE = 1e-6
+
+
+def _sizeable(change: float) -> float:
+    if abs(change) < _SMALLEST_CHANGE:
+        raise ValueError(f"{change:g} is no change that could be found, expected at least 0.000001 up or down")
+    return change
+
+
 _Change = Annotated[
-    float | None,
+    Annotated[float, AfterValidator(_sizeable)] | None,
     Query(gt=-1, le=10, allow_inf_nan=False, description="relative change to be found, -0.05 for a loss of 5 %"),
 ]
 
@@ -70,7 +81,8 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_event_routes(app, service, guard)
     add_recording_routes(app, service.catalogue, guard)
     add_replay_routes(app, service.replays, guard)
-    _add_service_routes(app, service, guard)
+    add_service_routes(app, service, guard)
+    _add_readiness_routes(app, service, guard)
     guard.protect(app)
     return app
 
@@ -112,10 +124,10 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     @app.get(f"{PLACE}/detectable", responses=responses(DetectableChanges, 404, 422), **common)
     def detectable(site: SiteName, machine: MachineName, change: _Change = None) -> DetectableChanges:
         """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
-        return found_machine(service, site, machine).detectable(change or None)
+        return found_machine(service, site, machine).detectable(change)
 
 
-def _add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     @app.get("/healthz", tags=["service"], responses=responses(Alive, guarded=False))
     def healthz() -> Alive:
         """Whether the process answers."""

@@ -15,6 +15,7 @@ from service.event_feed import EventFeed
 from service.recordings_api import RecordingIndex
 from service.replays_api import ReplayDesk
 from service.schemas import DetectableChanges, Health, MachineDescription, Readiness
+from service.service_api import MeasuredView
 from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.audit import AuditLog
 from service.store.machine import MachineStore
@@ -96,7 +97,7 @@ class MachineView(Protocol):
         """
 
 
-class ServiceView(Protocol):
+class ServiceView(MeasuredView, Protocol):
     """What the API needs to know about the service; `service.runtime.Runtime` is one."""
 
     def machines(self) -> Sequence[MachineView]:

@@ -48,7 +48,6 @@ from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder, RecorderStatus
 from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
-from service.service_api import add_service_routes
 from service.store.audit import AuditLog
 from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
@@ -199,7 +198,6 @@ class Runtime:
             undo.callback(self.feed.close)
             self._server = server
             app = create_app(self, guard)
-            add_service_routes(app, self, guard)
             app.add_middleware(RequestMeter, counts=self._requests)  # around all others, so that refusals count
             server.start(app)
             self._undo = undo.pop_all()

@@ -333,6 +333,14 @@ def test_wrong_argument_is_a_problem_that_names_it(http: httpx.Client, query: st
     assert found.detail.startswith(f"{field}: Input should be")
 
 
+def test_a_change_too_small_to_be_one_is_refused(http: httpx.Client) -> None:
+    for change in ("0", "1e-300", "-9e-7"):
+        found = problem(http.get(f"{PLACE}/detectable?change={change}"), 422)
+        assert found.detail.endswith("is no change that could be found, expected at least 0.000001 up or down")
+    found = answered(http.get(f"{PLACE}/detectable?change=1e-6"), DetectableChanges)
+    assert all(one.length_s is not None and one.length_s > 1e6 for one in found.parameters)
+
+
 def test_unknown_alarm_in_a_filter_is_named(http: httpx.Client) -> None:
     assert "no alarm 'nose'; there are: k_by" in problem(http.get(f"{PLACE}/alarms?name=nose"), 422).detail
     assert "no alarm 'nose'" in problem(http.get(f"{PLACE}/alarms/events?name=nose"), 422).detail
