@@ -35,7 +35,8 @@ def sensor_findings(
     Returns
     -------
     tuple of SensorFinding
-        Empty if nothing was found. A channel that is stuck or clipped is not looked at further.
+        Empty if nothing was found. A channel that is stuck or clipped is not looked at further; where the shaft angle
+        jumps, slips or jitters, channels are not compared: what turns with the shaft stays among what they share.
     """
     naming = Naming(channels)
     findings = [*stuck(window, naming), *clipped(window, naming)]
@@ -45,6 +46,11 @@ def sensor_findings(
     def sound(*columns: int) -> bool:
         return not {window.states[column] for column in columns} & bad
 
+    if "theta" not in bad:
+        columns = [column for column, state in enumerate(window.states) if state not in bad]
+        wrong_angle = phase_faults(window, columns, naming, reference)
+        if wrong_angle:
+            return (*findings, *wrong_angle)
     bands = {pair: banded(window, pair) for pair in motion_pairs(window.states) if sound(pair.first, pair.second)}
     exchanged, explained = swapped(window, suspect_pairs(window.states, bands, reference), naming, reference)
     findings += exchanged
@@ -66,10 +72,6 @@ def sensor_findings(
     bad = implicated(findings)
     findings += gain_and_delay(window, readings, bands, naming, reference)
     findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]
-    bad = implicated(findings)
-    if "theta" not in bad:
-        columns = [column for column, state in enumerate(window.states) if state not in bad]
-        findings += phase_faults(window, columns, naming, reference)
     bad = implicated(findings)
     if "theta" not in bad:  # what a wrong angle leaves in the spectra looks like noise
         findings += noisy(window, readings, bands, naming, reference, sound)

@@ -26,8 +26,12 @@ LEAST_SLIP_RAD = 0.2
 """Slip from hop to hop; thermal bending turns vectors, too, but by less."""
 LEAST_JITTER = 0.05
 """Power of the line left at the speed over that of the line taken out: jitter of 0.47 rad."""
-LEAST_WILD_JITTER = 0.2
-"""The same where the speed changes, because a machine's own run-up leaves something, too."""
+LEAST_WILD_JITTER = 0.1
+"""The same where jitter makes the speed jump about, and the line is taken out hop by hop."""
+_ERRATIC = 2.5
+"""Ups and downs of the speed over its range: 1 for a run-up, 2 there and back."""
+_WILD_SPEEDS = (0.7, 1.5)
+"""Range in which the shaft's true speed is looked for then, relative to the slowest and fastest hop."""
 _JITTER_ERRORS = 6.0
 _STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.05
 """Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number."""
@@ -229,14 +233,19 @@ def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
 
 def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, name: str) -> SensorFinding | None:
     """A line stays in the spectrum at the speed although what is steady with the angle was taken out."""
-    at = [_bin(window, speed) for speed in sorted(map(abs, window.speed_range))]
-    first, last = at
+    speeds = np.abs(window.hop_speed_rad_s)
+    edges = [window.speed_rad_s, window.speed_rad_s]
+    if window.removed_by_hop:
+        if np.abs(np.diff(speeds)).sum() < _ERRATIC * np.ptp(speeds):
+            return None
+        edges = [_WILD_SPEEDS[0] * speeds.min(), _WILD_SPEEDS[1] * speeds.max()]
+    first, last = (_bin(window, edge) for edge in edges)
     own = vectors[:, list(columns)]
     out = (np.abs(own if window.removed_by_hop else own.mean(axis=0, keepdims=True)) ** 2).mean(axis=0) / 2
     if first is None or last is None or not np.all(out > 0):
         return None
     step_hz, hop_s = window.frequencies_hz[1] - window.frequencies_hz[0], window.duration_s / len(own)
-    # A jitter of more than half a radian loses turns at random: then the line is somewhere between the hops' speeds.
+    # A jitter of more than half a radian miscounts turns at random: then the line is somewhere near the hops' speeds.
     power = np.einsum("fii->fi", window.spectrum[first : last + 1]).real[:, list(columns)]
     middle = first + int((power / np.maximum(power.mean(axis=0), np.finfo(float).tiny)).sum(axis=1).argmax())
     left, beside = _surroundings(window, columns, middle)
