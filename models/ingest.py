@@ -31,6 +31,9 @@ EARLIER_COURSES = 64
 """Courses that are remembered, so that repetitions of their blocks are known as such."""
 
 
+_LATEST_NS = 7_258_118_400_000_000_000
+"""The year 2200: a clock that says more is broken, and times beyond 2262 fit nowhere."""
+
 _SURELY_S = 1.0
 """A block that is next in sequence but later than this has a wrong time rather than a gap before it."""
 
@@ -186,7 +189,7 @@ class Gate:
     def _refuse(self, reason: Reason, text: str) -> Verdict:
         return Verdict(reason, f"{self._name}: {text}")
 
-    def _form(self, block: SampleBlock, schema_hash: str) -> Verdict | None:
+    def _form(self, block: SampleBlock, schema_hash: str) -> Verdict | None:  # noqa: PLR0911  # one return per reason
         """Refuse a block whose form is wrong, whatever its time."""
         settings, n_samples = self._settings, block.samples.shape[0]
         if schema_hash and schema_hash != self._schema_hash:
@@ -204,6 +207,11 @@ class Gate:
         if abs(block.rate_hz / self._rate_hz - 1) > settings.rate_tolerance:
             return self._refuse(
                 Reason.RATE, f"block {block.sequence} has rate_hz {block.rate_hz:g}, expected {self._rate_hz:g}"
+            )
+        if not 0 <= block.start_ns < _LATEST_NS:
+            return self._refuse(
+                Reason.MALFORMED,
+                f"start_ns of block {block.sequence} is {block.start_ns}, expected a time from 1970 to 2199",
             )
         length_s = n_samples / self._rate_hz
         if not settings.block_from_s <= length_s <= settings.block_to_s:

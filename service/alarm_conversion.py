@@ -149,7 +149,7 @@ def _evidence(evidence: Evidence | None) -> EvidenceJson | None:
 
 
 def finite(value: float | None) -> float | None:
-    """JSON has no infinity and no NaN: both become null."""
+    """Neither JSON nor the history has infinity and NaN: both become null."""
     return value if value is not None and math.isfinite(value) else None
 
 

@@ -61,6 +61,7 @@ class MachineMonitor:
         self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
         self._arrivals = Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
+        self._done: list[MonitorReport] = []
         self._gate = Gate(machine)
         self._window = SlidingWindow(self._plan)
         settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
@@ -71,6 +72,7 @@ class MachineMonitor:
         self._latest: WindowReport | None = None
         self._calm = HealthState.WARMING
         self._end_ns: int | None = None
+        self._reached_ns: int | None = None
         self._kept_is_valid = True
         self._statistics: WindowStatistics | None = None
         self._newest: deque[SampleBlock] = deque()
@@ -100,11 +102,11 @@ class MachineMonitor:
 
     def _step_due(self) -> tuple[MonitorReport, ...]:
         """Take what is due; a defect that one block brings to light leaves the others for the next time."""
-        found = []
         while self._due:
             one = self._due.popleft()
-            found.append(self.step(one.block, one.schema_hash))
-        return tuple(found)
+            self._done.append(self.step(one.block, one.schema_hash))
+        done, self._done = tuple(self._done), []
+        return done
 
     def step(self, block: SampleBlock, schema_hash: str = "") -> MonitorReport:
         """Take one block: gate, window, evaluation, alarms.
@@ -121,7 +123,7 @@ class MachineMonitor:
         MonitorReport
             Immutable; refused blocks and gaps are stated in it, never raised.
         """
-        verdict = self._count(self._gate.judge(block, schema_hash))
+        verdict = self._judged(block, schema_hash)
         if not verdict.accepted:
             return MonitorReport(verdict)
         if not verdict.continuous:
@@ -132,14 +134,16 @@ class MachineMonitor:
             self._kept_is_valid = False  # hops may end at the same times as before
             self._test.clear()
             self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
-        windows: list[WindowReport] = []
-        events = list(self._stream_alarms(verdict, block.start_ns))
+        elif self._end_ns is None and self._reached_ns is not None:
+            # Until now the time of day was all there was; shelving goes on by the time of the data.
+            self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
+        self._alarms.passed(block.start_ns)
+        self._stream_alarms(verdict, block.start_ns)
         self._end_ns = block.end_ns
-        for end_ns in self._window.feed(self._plan.to_si(block.samples), block.start_ns):
-            report, heard = self._evaluate(end_ns)
-            windows.append(report)
-            events.extend(heard)
-        return MonitorReport(verdict, tuple(windows), tuple(events), float(block.samples.shape[0] / block.rate_hz))
+        windows = tuple(
+            self._evaluate(end_ns) for end_ns in self._window.feed(self._plan.to_si(block.samples), block.start_ns)
+        )
+        return MonitorReport(verdict, windows, self._alarms.take(), float(block.samples.shape[0] / block.rate_hz))
 
     def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Take note of time that has passed, with data or without.
@@ -149,16 +153,21 @@ class MachineMonitor:
         time_ns : int
             Data time that has been reached by now, as far as anybody knows.
         """
-        events = self._alarms.passed(time_ns)
-        lost_ns = round(self.machine.ingest.no_data_after_s * 1e9)
-        if self._end_ns is not None and time_ns - self._end_ns >= lost_ns:
-            events += self._lost(self._end_ns + lost_ns)
-        return events
+        self._reached_ns = time_ns
+        self._alarms.passed(time_ns)
+        if self._end_ns is not None and time_ns - self._end_ns >= self._lost_ns:
+            self._lost(self._end_ns)
+        return self._alarms.take()
 
     @property
     def end_ns(self) -> int | None:
         """End of the newest data; None before the first."""
         return self._end_ns
+
+    @property
+    def hops(self) -> tuple[int, ...]:
+        """Ends of the hops in the window."""
+        return tuple(hop.end_ns for hop in self._window.hops)
 
     @property
     def window(self) -> WindowStatistics | None:
@@ -177,7 +186,13 @@ class MachineMonitor:
 
     def operate(self, operation: Operation, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Do what an operator asks for, see `AlarmBook.operate`."""
-        return self._alarms.operate(operation, time_ns)
+        self._reached_ns = time_ns
+        self._alarms.operate(operation, time_ns)
+        return self._alarms.take()
+
+    def take_events(self) -> tuple[AlarmEvent, ...]:
+        """What has happened and was never handed over, because a defect came in between."""
+        return self._alarms.take()
 
     def state(self, kept: Collection[int] = ()) -> MonitorState:
         """Everything that is remembered, to be put into another monitor.
@@ -203,7 +218,7 @@ class MachineMonitor:
                 }
             ),
             new_hops=tuple((hop.end_ns, to_bytes(hop.checkpoint())) for hop in hops if hop.end_ns not in known),
-            hops=tuple(hop.end_ns for hop in hops),
+            hops=self.hops,
             end_ns=self._end_ns,
         )
 
@@ -227,9 +242,19 @@ class MachineMonitor:
         self._end_ns, self._calm = end_ns, calm
         self._arrivals.resume(self._gate.courses)
 
-    def restore_alarms(self, alarms: str, next_sequence: int = 0) -> None:
-        """Go on with the alarms of another monitor, see `AlarmBook.restore`."""
+    def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:
+        """Go on with the alarms of another monitor, see `AlarmBook.restore`.
+
+        Parameters
+        ----------
+        alarms : str
+        next_sequence : int, optional
+        end_ns : int, optional
+            End of the newest data of the other monitor, where nothing else of it was restored: the times of the alarms
+            are of the same clock.
+        """
         self._alarms.restore(alarms, next_sequence)
+        self._end_ns = end_ns if self._end_ns is None else self._end_ns
 
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
@@ -254,6 +279,21 @@ class MachineMonitor:
         while self._newest_samples - self._newest[0].samples.shape[0] >= _NEWEST_SAMPLES:
             self._newest_samples -= self._newest.popleft().samples.shape[0]
 
+    def _judged(self, block: SampleBlock, schema_hash: str) -> Verdict:
+        """What the gate says; of the data that another monitor had before this one it knows nothing."""
+        anew = not self._gate.courses
+        verdict = self._gate.judge(block, schema_hash)
+        if anew and verdict.accepted and self._end_ns is not None:
+            name, ingest = f"{self.machine.site}/{self.machine.name}", self.machine.ingest
+            late_s = (block.start_ns - self._end_ns) / 1e9
+            if abs(late_s) > ingest.max_jump_s:
+                text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
+                verdict = Verdict(text=text, clock_step_s=late_s)
+            elif late_s > ingest.time_tolerance_s:
+                text = f"{name}: {late_s:.6g} s of data are missing over the restart"
+                verdict = Verdict(text=text, gap_s=late_s)
+        return self._count(verdict)
+
     def _count(self, verdict: Verdict) -> Verdict:
         quality = self._quality
         if verdict.reason is not None:
@@ -272,27 +312,38 @@ class MachineMonitor:
             )
         return verdict
 
-    def _stream_alarms(self, verdict: Verdict, start_ns: int) -> tuple[AlarmEvent, ...]:
+    def _stream_alarms(self, verdict: Verdict, start_ns: int) -> None:
         """Alarms on the stream itself, at an accepted block."""
         alarms, settings = self._alarms, self.machine
-        events: tuple[AlarmEvent, ...] = ()
+        before_ns = start_ns - round(verdict.gap_s * 1e9)
         if verdict.gap_s >= settings.ingest.no_data_after_s:
-            events += self._lost(start_ns - round((verdict.gap_s - settings.ingest.no_data_after_s) * 1e9))
-        events += alarms.update_state(STREAM_LOST, False, start_ns, at_once=True)
+            self._lost(before_ns)
+        alarms.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
         if verdict.gap_s > 0 and verdict.gap_s >= settings.alarms.gap_s:
-            events += alarms.update_state(GAP, True, start_ns, verdict.text, at_once=True)
+            missing = Evidence(before_ns, start_ns)
+            alarms.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
         if verdict.clock_step_s:
-            events += alarms.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
-        return events
+            alarms.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
+        alarms.suppress(None, start_ns)
 
-    def _lost(self, time_ns: int) -> tuple[AlarmEvent, ...]:
+    @property
+    def _lost_ns(self) -> int:
+        return round(self.machine.ingest.no_data_after_s * 1e9)
+
+    def _lost(self, end_ns: int) -> None:
         """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
-        note = f"no data for {self.machine.ingest.no_data_after_s:g} s; what was raised stays raised"
-        return self._alarms.update_state(STREAM_LOST, True, time_ns, note, at_once=True)
+        note = f"no usable data for {self.machine.ingest.no_data_after_s:g} s; what was raised stays raised"
+        due_ns = end_ns + self._lost_ns
+        self._alarms.update_state(STREAM_LOST, True, due_ns, note, evidence=Evidence(end_ns, due_ns), at_once=True)
+        self._alarms.suppress(None, due_ns)
 
-    def _sensor_alarms(
-        self, findings: tuple[SensorFinding, ...], statistics: WindowStatistics
-    ) -> tuple[AlarmEvent, ...]:
+    def _found_again_ns(self, start_ns: int) -> int:
+        """When the silence ended; data that came late, but without a gap, are older than the alarm on them."""
+        raised_ns = next((one.raised_ns for one in self._alarms.alarms if one.name == STREAM_LOST), None)
+        late = raised_ns is not None and 0 <= raised_ns - start_ns <= self._lost_ns
+        return raised_ns if raised_ns is not None and late else start_ns
+
+    def _sensor_alarms(self, findings: tuple[SensorFinding, ...], statistics: WindowStatistics) -> None:
         """One alarm for each kind of fault, with a sentence for each channel it is found in."""
         said: dict[str, list[str]] = {}
         for found in findings:
@@ -300,27 +351,29 @@ class MachineMonitor:
             name = PHASE_REFERENCE if found.states == ("theta",) else data_alarm(found.kind)
             said.setdefault(name, []).append(found.text)
         evidence = Evidence(statistics.start_ns, statistics.end_ns)
-        events: tuple[AlarmEvent, ...] = ()
         for name in (PHASE_REFERENCE, *map(data_alarm, FAULT_KINDS)):
             note = "; ".join(said.get(name, ()))
-            events += self._alarms.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
-        return events
+            self._alarms.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
 
-    def _evaluate(self, end_ns: int) -> tuple[WindowReport, tuple[AlarmEvent, ...]]:
+    def _evaluate(self, end_ns: int) -> WindowReport:
         """Evaluate the window as it is after a completed hop."""
+        report = self._latest = self._evaluated(end_ns)
+        self._alarms.suppress(None, end_ns)
+        return report
+
+    def _evaluated(self, end_ns: int) -> WindowReport:
         filled = self._window.filled
-        events = self._alarms.update_state(GAP, False, end_ns) + self._alarms.update_state(CLOCK, False, end_ns)
+        self._alarms.update_state(GAP, False, end_ns)
+        self._alarms.update_state(CLOCK, False, end_ns)
         statistics = self._statistics = self._window.statistics()
         if statistics is None:
-            report = WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
-            self._latest = report
-            return report, events
+            return WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
         speed_rad_s = statistics.speed_rad_s
-        events += self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
+        self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
-        events += self._sensor_alarms(findings, statistics)
+        self._sensor_alarms(findings, statistics)
         if findings:
-            report = WindowReport(
+            return WindowReport(
                 statistics.start_ns,
                 end_ns,
                 self._state(HealthState.DATA_HEALTH),
@@ -328,30 +381,26 @@ class MachineMonitor:
                 sensors=findings,
                 reason="; ".join(each.text for each in findings),
             )
-            self._latest = report
-            return report, events
         short = {hops: self._window.statistics(hops) for hops in self._test.wanted()}
         present = {hops: latest for hops, latest in short.items() if latest is not None}
         try:
             evaluation = self._evaluator.evaluate(statistics, present)
         except EstimationError as error:
-            report = WindowReport(
+            return WindowReport(
                 statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
             )
-            self._latest = report
-            return report, events
         evaluation = self._named(evaluation)
         looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
         whole = self._test.settings.window_hops
         looks[whole] = _stretch(evaluation.deciding, statistics)
         verdict = self._test.update(looks)
         changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
-        events += self._alarm(verdict, evaluation.deciding.suspect, end_ns)
+        self._alarm(verdict, evaluation.deciding.suspect, end_ns)
         if evaluation.shapes:
             evidence = Evidence(statistics.start_ns, end_ns)
-            events += self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
+            self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
         outside = verdict.isolation.outside
-        report = WindowReport(
+        return WindowReport(
             start_ns=statistics.start_ns,
             end_ns=end_ns,
             state=self._state(_calm_state(evaluation, outside=outside)),
@@ -369,8 +418,6 @@ class MachineMonitor:
             reason="" if evaluation.deciding.evaluable else _why_nothing(evaluation.deciding),
             shapes=evaluation.shapes,
         )
-        self._latest = report
-        return report, events
 
     def _named(self, evaluation: Evaluation) -> Evaluation:
         """The same with sentences in the names of this machine's channels."""
@@ -384,29 +431,25 @@ class MachineMonitor:
             ),
         )
 
-    def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> tuple[AlarmEvent, ...]:
+    def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> None:
         """Bring what was found to the alarms; without clean data they stay where they are."""
         named = {finding.name for finding in verdict.findings}
         evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.isolation.confidence)
-        events: list[AlarmEvent] = []
         for reading in verdict.current:
             if reading.change is not None and reading.standard_error is not None:
-                events.extend(
-                    self._alarms.update(
-                        reading.name,
-                        reading.change,
-                        reading.standard_error,
-                        end_ns,
-                        named=reading.name in named,
-                        low_confidence=verdict.isolation.outside,
-                        evidence=evidence,
-                    )
+                self._alarms.update(
+                    reading.name,
+                    reading.change,
+                    reading.standard_error,
+                    end_ns,
+                    named=reading.name in named,
+                    low_confidence=verdict.isolation.outside,
+                    evidence=evidence,
                 )
         if verdict.current:
             note = f"best explained by: {suspect}" if suspect else ""
             outside = verdict.isolation.outside
-            events.extend(self._alarms.update_state(MODEL, outside, end_ns, note, evidence=evidence))
-        return tuple(events)
+            self._alarms.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 
 from models.errors import CheckpointError
-from service.alarm_conversion import PROGRAM_VERSION, Identity, alarm_cloud_event, rfc3339
+from service.alarm_conversion import PROGRAM_VERSION, Identity, alarm_cloud_event, finite, rfc3339
 from service.alarms.alarm import AlarmEvent
 from service.alarms.book import NO_ALARMS
 from service.conversion import report as report_json
@@ -34,9 +34,9 @@ def stored_readings(windows: Iterable[WindowReport]) -> tuple[StoredReading, ...
         points += [("parameter", one.name, one.change, one.standard_error) for one in window.parameters]
         points += [("equation", one.equation, one.msd, None) for one in window.equations]
         found += [
-            StoredReading(window.end_ns, quantity, name, value, error)
+            StoredReading(window.end_ns, quantity, name, value, finite(error))
             for quantity, name, value, error in points
-            if value is not None
+            if finite(value) is not None and value is not None
         ]
     return tuple(found)
 
@@ -90,7 +90,7 @@ def restored(
     checkpoint : Checkpoint
         From the history.
     next_sequence : int
-        Lowest number the next alarm event may have.
+        Number of the next alarm event, by the log.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def restored(
         except CheckpointError as error:
             monitor, differs = build(), [str(error)]
     try:
-        monitor.restore_alarms(head.alarms, next_sequence)
+        monitor.restore_alarms(head.alarms, next_sequence, head.end_ns or None)
     except CheckpointError as error:
         monitor.restore_alarms(NO_ALARMS, next_sequence)
         return monitor, f"all alarms begin anew: {error}"

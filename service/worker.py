@@ -6,7 +6,7 @@ anything published.
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -29,11 +29,13 @@ from service.schemas import DetectableChanges, Health, MachineDescription, Strea
 from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.errors import StoreError
 from service.store.machine import MachineStore
-from service.store.records import Step, StoredEvent
+from service.store.records import Step, StoredEvent, StoredReport
 
 __all__ = ["Clocks", "MachineWorker", "Outlet", "Tally"]
 
 _OPERATION_S = 10.0
+_HELD_UP_S = 2.0
+"""Time passes in steps of a fraction of this; if not, the program itself stood still."""
 _LATEST = 100
 
 
@@ -137,11 +139,14 @@ class MachineWorker:
         self._kept: tuple[int, ...] = ()
         self._unpublished: tuple[StoredEvent, ...] = ()
         self._asleep_s = 0.0
+        self._owed: tuple[AlarmEvent, ...] = ()
         self._monitor, self.restart = self._restored(installed)
         self._snapshot: MachineHealth = self._monitor.health()
         self._begin_s = clocks.monotonic_s()
         self._latest_data_s: float | None = None
         self._operated_ns = 0
+        self._told = self._monitor.next_sequence
+        self._ticked_s = self._held_up_s = clocks.monotonic_s()
         self._missed = 0
         self._publisher_alive = False
         self._mismatch: tuple[str, ...] = ()
@@ -161,7 +166,7 @@ class MachineWorker:
                 monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
         monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
-        self._kept = tuple(end_ns for end_ns, _ in checkpoint.hops) if monitor.end_ns is not None else ()
+        self._kept = monitor.hops
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
         # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
@@ -177,7 +182,9 @@ class MachineWorker:
     def start(self, outlet: Outlet) -> None:
         """Start the thread; it publishes to `outlet`."""
         self._outlet = outlet
-        self._begin_s = self._clocks.monotonic_s()
+        self._begin_s = self._ticked_s = self._clocks.monotonic_s()
+        if self._monitor.end_ns is None:
+            self._owed = self._monitor.passed(self._data_now_ns())
         for event in self._unpublished:
             outlet.publish_alarm_event(event.text)
         self._thread.start()
@@ -321,16 +328,20 @@ class MachineWorker:
 
     def _tick(self) -> None:
         self._ticking = False
-        if len(self.inbox) or self._monitor.end_ns is None:
+        now_s, limit_s = self._clocks.monotonic_s(), self.machine.ingest.no_data_after_s
+        if now_s - self._ticked_s > _HELD_UP_S:
+            self._held_up_s = now_s
+        self._ticked_s = now_s
+        if len(self.inbox):
             return  # time passes with the blocks that wait
-        silent_s = self._clocks.monotonic_s() - (self._begin_s if self._latest_data_s is None else self._latest_data_s)
-        if silent_s < self.machine.ingest.no_data_after_s:
-            # After a restart the publishers get as long to come back as a silence may last.
-            if self._latest_data_s is not None:
-                self._conclude((), self._monitor.passed(self._data_now_ns()))
-            return
-        for report in self._monitor.flush():
-            self._conclude_report(report)
+        if self._monitor.end_ns is not None:
+            latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
+            if now_s - max(latest_s, self._held_up_s) >= limit_s:
+                self._conclude_reports(self._monitor.flush())
+            elif self._latest_data_s is None or now_s - latest_s >= limit_s:
+                # After a restart, or where this program stood still, publishers get as long to be heard again as a
+                # silence may last.
+                return
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
     def _run(self) -> None:
@@ -342,6 +353,8 @@ class MachineWorker:
                     item()
             except Exception as error:  # one bad block must not end the monitoring of the machine
                 self._failed(error)
+        # An orderly end keeps where the monitor stands to the last block: going on needs no publisher's cache.
+        self._conclude((), (), always=True)
 
     def _failed(self, error: Exception) -> None:
         self.errors += 1
@@ -354,26 +367,56 @@ class MachineWorker:
         reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding)
         tally = self.tally
         self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
+        self._conclude_reports(reports)
+
+    def _conclude_reports(self, reports: Sequence[MonitorReport]) -> None:
+        """Conclude what came of one message, in one step: the monitor's state is that after the last of the blocks."""
         for report in reports:
-            self._conclude_report(report)
+            self._explain(report)
+            if report.verdict.clock_step_s:
+                self._operated_ns = 0
+            if report.verdict.accepted:
+                self._latest_data_s = self._clocks.monotonic_s()
+                self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
+        self._conclude(
+            tuple(window for report in reports for window in report.windows),
+            tuple(event for report in reports for event in report.events),
+        )
 
-    def _conclude_report(self, report: MonitorReport) -> None:
-        self._explain(report)
-        if report.verdict.accepted:
-            self._latest_data_s = self._clocks.monotonic_s()
-            self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
-        self._conclude(report.windows, report.events)
+    def _conclude(
+        self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...], *, always: bool = False
+    ) -> tuple[str, ...]:
+        """Commit, then let it be seen and publish; returns the events as they are published."""
+        # Also what was refused, or left behind by a defect: without it the log would have a hole, and end there.
+        self._owed += (*events, *self._monitor.take_events())
+        snapshot, owed = self._monitor.health(), self._owed
+        reports: tuple[StoredReport, ...] = ()
+        told: tuple[StoredEvent, ...] = ()
+        try:
+            if windows or self._owed or always:
+                reports, told = self._commit(windows)
+        finally:
+            self._snapshot = snapshot
+            self.latest = self._held()
+        texts = tuple(one.text for one in told if one.sequence >= self._told)
+        for event in owed:
+            if event.sequence >= self._told:
+                self._told = event.sequence + 1
+                self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
+        if texts:
+            self._on_events()
+        try:
+            self._publish([one.text for one in reports], texts)
+        except Exception as error:  # the network's, of whatever kind; who lacks an event asks for it
+            self._failed(error)
+        return texts
 
-    def _conclude(self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...]) -> tuple[str, ...]:
-        """Commit, then publish; returns the events as they are published."""
-        self._snapshot = self._monitor.health()
-        self.latest = self._held()
-        if not windows and not events:
-            return ()
+    def _commit(self, windows: tuple[WindowReport, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
+        """Bring windows, owed events and the monitor's state into the history; returns what is to be heard."""
         recorded_ns = self._clocks.utc_ns()
         state = self._monitor.state(self._kept)
         reports = tuple(stored_report(self.identity, window) for window in windows)
-        told = tuple(stored_event(self.identity, event, recorded_ns) for event in events)
+        told = tuple(stored_event(self.identity, event, recorded_ns) for event in self._owed)
         step = Step(
             reports=reports,
             readings=stored_readings(windows),
@@ -384,21 +427,18 @@ class MachineWorker:
         try:
             if not self.history.commit(step):
                 self._warn("history", "the history cannot be written; what happened waits in memory and is published")
-        except StoreError as error:  # refused for good; operators must hear of it all the same
+        except StoreError as error:  # operators must hear of it all the same
+            self._kept = ()
             self._failed(error)
-        self._kept = state.hops
+        else:
+            self._kept, self._owed = state.hops, ()
         tally = self.tally
         self.tally = replace(
             tally,
             windows=tally.windows + len(windows),
             commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s,
         )
-        self._publish([one.text for one in reports], [one.text for one in told])
-        for event in events:
-            self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
-        if events:
-            self._on_events()
-        return tuple(one.text for one in told)
+        return reports, told
 
     def _held(self) -> LatestData:
         """What the monitor holds, for snapshots."""

@@ -32,6 +32,7 @@ class _Page:
 
 
 _PAGE = TypeAdapter(_Page)
+_REASONS = "; "
 
 NO_ALARMS = _PAGE.dump_json(_Page((), 0)).decode()
 """What `AlarmBook.checkpoint` gives where nothing has happened yet."""
@@ -50,6 +51,7 @@ class AlarmBook:
         self._settings = settings
         self._alarms: dict[str, Alarm] = {}
         self._next_sequence = 0
+        self._untold: list[AlarmEvent] = []
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
@@ -72,6 +74,15 @@ class AlarmBook:
     def present(self, name: str) -> bool:
         """Whether the condition of an alarm is there."""
         return name in self._alarms and self._alarms[name].present
+
+    def take(self) -> tuple[AlarmEvent, ...]:
+        """Hand over, in order and once, everything that has happened.
+
+        An event has its number as soon as it has happened. If whoever made it happen comes to grief before passing it
+        on, the next one does: otherwise the number would be missing from the log for ever.
+        """
+        told, self._untold = tuple(self._untold), []
+        return told
 
     # What the data say
 
@@ -119,7 +130,8 @@ class AlarmBook:
             evidence=evidence,
         )
         beyond, small = named and size > limits.raise_above, size < limits.clear_below
-        return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=size > limits.danger_above)
+        danger = beyond and size > limits.danger_above
+        return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
     def update_state(
         self,
@@ -151,11 +163,14 @@ class AlarmBook:
         if not present and name not in self._alarms:
             return ()
         known = self._known(name, time_ns)
-        alarm = replace(known, note=note, evidence=evidence) if present else known
+        evidence = evidence or known.evidence
+        alarm = replace(known, note=note if present else known.note, evidence=evidence)
         return self._judge(alarm, time_ns, beyond=present, small=not present, danger=False, at_once=at_once)
 
     def suppress(self, speed_rpm: float | None, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Follow the rules of suppression; where the speed is unknown, what depends on it stays as it is.
+
+        An alarm that no rule is about any more, because the machine file has changed, comes back.
 
         Parameters
         ----------
@@ -165,12 +180,12 @@ class AlarmBook:
             Data time.
         """
         events: list[AlarmEvent] = []
-        for name in dict.fromkeys(name for rule in self._settings.suppress for name in rule.alarms):
+        ruled = [name for rule in self._settings.suppress for name in rule.alarms]
+        left = [alarm.name for alarm in self.alarms if alarm.suppressed_by]
+        for name in dict.fromkeys((*ruled, *left)):
             alarm = self._known(name, time_ns)
             rules = [rule for rule in self._settings.suppress if name in rule.alarms]
-            if any(rule.while_alarm is None for rule in rules) and speed_rpm is None and alarm.suppressed_by:
-                continue
-            because = "; ".join(rule.because for rule in rules if self._applies(rule, speed_rpm))
+            because = _REASONS.join(rule.because for rule in rules if self._applies(rule, alarm, speed_rpm))
             if because == alarm.suppressed_by:
                 continue
             alarm = replace(alarm, suppressed_by=because)
@@ -250,15 +265,15 @@ class AlarmBook:
         """Everything as JSON."""
         return _PAGE.dump_json(_Page(self.alarms, self._next_sequence)).decode()
 
-    def restore(self, text: str, next_sequence: int = 0) -> None:
+    def restore(self, text: str, next_sequence: int | None = None) -> None:
         """Go on from what `checkpoint` gave.
 
         Parameters
         ----------
         text : str
             JSON.
-        next_sequence : int
-            Lowest number the next event may have: what is in the log already is not numbered again.
+        next_sequence : int, optional
+            Number of the next event by the log, which is the truth; without it what was remembered.
 
         Raises
         ------
@@ -270,7 +285,8 @@ class AlarmBook:
         except ValueError as error:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
         self._alarms = {alarm.name: alarm for alarm in page.alarms}
-        self._next_sequence = max(page.next_sequence, next_sequence)
+        self._next_sequence = page.next_sequence if next_sequence is None else next_sequence
+        self._untold = []
 
     # Inside
 
@@ -280,11 +296,11 @@ class AlarmBook:
     def _latches(self, alarm: Alarm) -> bool:
         return alarm.name in self._settings.latching
 
-    def _applies(self, rule: SuppressRule, speed_rpm: float | None) -> bool:
+    def _applies(self, rule: SuppressRule, alarm: Alarm, speed_rpm: float | None) -> bool:
         if rule.while_alarm is not None:
             return self.present(rule.while_alarm)
         if speed_rpm is None:
-            return False
+            return f"{_REASONS}{rule.because}{_REASONS}" in f"{_REASONS}{alarm.suppressed_by}{_REASONS}"
         if rule.below_rpm is not None:
             return speed_rpm < rule.below_rpm
         return rule.above_rpm is not None and speed_rpm > rule.above_rpm
@@ -368,6 +384,7 @@ class AlarmBook:
         event = AlarmEvent(kind, time_ns, self._next_sequence, alarm, before, actor, reason)
         self._next_sequence += 1
         self._alarms[alarm.name] = alarm
+        self._untold.append(event)
         return (event,)
 
 
