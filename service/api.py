@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any
 
-from fastapi import FastAPI, Query, Request
+from fastapi import Depends, FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import AfterValidator
 
@@ -10,7 +10,7 @@ from models.machine import MachineFile
 from service.access.guard import Guard
 from service.api_schemas import Alive, MachineConfiguration, MachineList, configuration_example
 from service.api_views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
-from service.description import DescribedApp
+from service.description import DescribedApp, only_known_arguments
 from service.events_api import add_event_routes
 from service.history_api import add_history_routes
 from service.operations_api import add_operation_routes
@@ -68,7 +68,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
         title="rotorwatch",
         description=_DESCRIPTION,
         openapi_tags=_TAGS,
-        dependencies=[guard.gate],
+        dependencies=[guard.gate, Depends(only_known_arguments)],
         openapi_url=None,  # the guard serves it
         docs_url=None,  # the usual pages load their scripts from elsewhere
         redoc_url=None,

@@ -1,15 +1,38 @@
-"""The application's description of itself (OpenAPI), with whole examples."""
+"""The application's description of itself (OpenAPI), with whole examples; nothing else can be asked for."""
 
+from collections.abc import Mapping
 from typing import Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 
-__all__ = ["DescribedApp"]
+__all__ = ["DescribedApp", "only_known_arguments"]
+
+_STRICT = "/api/"
 
 
 class DescribedApp(FastAPI):
     """An application whose examples keep their nulls, which FastAPI leaves out wherever they are."""
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(**arguments)
+        self._arguments: Mapping[Any, frozenset[str]] | None = None
+
+    def arguments(self, endpoint: object) -> frozenset[str]:
+        """Names of the query arguments that an endpoint takes."""
+        if self._arguments is None:
+            paths = self.openapi()["paths"]
+            self._arguments = {
+                context.endpoint: frozenset(
+                    one["name"]
+                    for method in context.methods or ()
+                    for one in paths.get(context.path_format, {}).get(method.lower(), {}).get("parameters", [])
+                    if one["in"] == "query"
+                )
+                for context in iter_route_contexts(self.routes)
+            }
+        return self._arguments.get(endpoint, frozenset())
 
     def openapi(self) -> dict[str, Any]:
         """Return the description; made once."""
@@ -23,6 +46,28 @@ class DescribedApp(FastAPI):
                 if described is not None:
                     _restore(described["responses"], context.responses)
         return description
+
+
+def only_known_arguments(request: Request) -> None:
+    """Refuse a query argument that the route does not take: misspelt, it would be left out without a word.
+
+    Raises
+    ------
+    RequestValidationError
+        Naming it, and those that there are.
+    """
+    given = request.query_params.keys()
+    if not given or not request.scope["path"].startswith(_STRICT) or not isinstance(request.app, DescribedApp):
+        return
+    known = request.app.arguments(request.scope.get("endpoint"))
+    expected = f"expected one of {', '.join(sorted(known))}" if known else "expected none"
+    faults = [
+        {"loc": ("query", name[:64]), "msg": f"no argument of this route, {expected}"}
+        for name in given
+        if name not in known
+    ]
+    if faults:
+        raise RequestValidationError(faults)
 
 
 def _restore(described: dict[str, Any], declared: dict[int | str, dict[str, Any]]) -> None:

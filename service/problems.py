@@ -18,7 +18,7 @@ from service.store.errors import StoreError
 __all__ = ["add_problems", "problem_answer", "problem_responses", "responses"]
 
 _PROBLEM = "application/problem+json"
-_ANYWHERE = (429, 500)
+_ANYWHERE = (422, 429, 500)
 _GUARDED = (401, 403, 503)
 _HEADERS: dict[int, dict[str, Any]] = {
     401: {"WWW-Authenticate": {"description": "how to show who you are", "schema": {"type": "string"}}},

@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Annotated, Protocol
 
-from fastapi import FastAPI, HTTPException, Query
+from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
+from starlette.types import Message, Receive, Scope, Send
 
 from models.signals.recording import summarize_recording
 from service.access.guard import Guard
-from service.problems import problem_responses, responses
+from service.problems import problem_answer, problem_responses, responses
 from service.recording.catalogue import Recording
 
 __all__ = [
@@ -22,6 +23,7 @@ __all__ = [
 ]
 
 _JSON = ConfigDict(extra="forbid", frozen=True)
+_NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
 _NONE = "no recordings: the settings name no directory for them ([recording] directory)"
 
 
@@ -119,14 +121,37 @@ def add_recording_routes(app: FastAPI, index: RecordingIndex | None, guard: Guar
         tags=["recordings"],
         dependencies=[guard.read],
         response_class=FileResponse,
-        responses={200: {"content": {"application/octet-stream": {}}}, **problem_responses(404, 409, 422)},
+        responses={
+            200: {"content": {"application/octet-stream": {}}},
+            206: {"description": "The ranges asked for", "content": {"application/octet-stream": {}}},
+            **problem_responses(400, 404, 409, 416, 422),
+        },
     )
     def download(site: str, machine: str, name: str) -> FileResponse:
         """The file itself; ranges may be asked for."""
         found = found_recording(index, f"{site}/{machine}/{name}")
         if not found.complete:
             raise HTTPException(409, f"{found.id} is incomplete: it is being written, or was left by a crash")
-        return FileResponse(found.path, media_type="application/octet-stream", filename=found.path.name)
+        return _RecordingFile(found.path, media_type="application/octet-stream", filename=found.path.name)
+
+
+class _RecordingFile(FileResponse):
+    """A file, or a range of it; a range that cannot be had is a problem like any other."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        refused: int | None = None
+
+        async def watched(message: Message) -> None:
+            nonlocal refused
+            if message["type"] == "http.response.start" and message["status"] in _NO_RANGE:
+                refused = message["status"]
+            if refused is None:
+                await send(message)
+
+        await super().__call__(scope, receive, watched)
+        if refused is not None:
+            await problem_answer(Request(scope), refused, _NO_RANGE[refused])(scope, receive, send)
 
 
 def found_recording(index: RecordingIndex | None, recording_id: str) -> Recording:

@@ -337,8 +337,16 @@ def test_a_change_too_small_to_be_one_is_refused(http: httpx.Client) -> None:
     for change in ("0", "1e-300", "-9e-7"):
         found = problem(http.get(f"{PLACE}/detectable?change={change}"), 422)
         assert found.detail.endswith("is no change that could be found, expected at least 0.000001 up or down")
-    found = answered(http.get(f"{PLACE}/detectable?change=1e-6"), DetectableChanges)
-    assert all(one.length_s is not None and one.length_s > 1e6 for one in found.parameters)
+    tiny = answered(http.get(f"{PLACE}/detectable?change=1e-6"), DetectableChanges)
+    assert all(one.length_s is not None and one.length_s > 1e6 for one in tiny.parameters)
+
+
+def test_a_misspelt_argument_is_not_passed_over(http: httpx.Client) -> None:
+    found = problem(http.get(f"{PLACE}/reports?sinse_ns=5&limit=3"), 422)
+    assert found.detail == ("sinse_ns: no argument of this route, expected one of before, limit, since_ns, until_ns")
+    assert problem(http.get("/api/v1/machines?a=1"), 422).detail == "a: no argument of this route, expected none"
+    for path in ("/healthz?a=1", "/readyz?a=1", "/?a=1"):
+        assert http.get(path).status_code == 200
 
 
 def test_unknown_alarm_in_a_filter_is_named(http: httpx.Client) -> None:

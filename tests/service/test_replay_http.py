@@ -123,6 +123,8 @@ def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, direct
     answer = client.get(f"{RECORDINGS}/{ID}/download").raise_for_status()
     assert answer.content == whole
     assert 'filename="20260101T000000Z.mcap"' in answer.headers["content-disposition"]
+    for wish, status in (("bytes=999999999-", 416), ("bytes", 400), ("bytes=9-1", 400)):
+        problem(client.get(f"{RECORDINGS}/{ID}/download", headers={"Range": wish}), status)
     part = client.get(f"{RECORDINGS}/{ID}/download", headers={"Range": "bytes=100-299"})
     assert (part.status_code, part.content) == (206, whole[100:300])
     found = problem(client.get(f"{RECORDINGS}/demo/pump/20260101T020000Z.mcap.part/download"), 409)
