@@ -28,7 +28,7 @@ from models.diagnosis.verdict.detectable import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
 from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.errors import EstimationError, WireError
+from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Gate, Reason, Verdict
 from models.signals.block import SampleBlock
 from models.signals.channels import with_channel_names
@@ -233,13 +233,15 @@ class MachineMonitor:
         arrays = from_bytes(state)
         moments = tuple(HopMoments.restored(from_bytes(hop)) for hop in hops)
         test = SequentialState.restored(unprefixed("test", arrays))
-        calm = HealthState(*texts(arrays, "calm"))
+        calm = texts(arrays, "calm")
+        if calm not in {(state.value,) for state in HealthState}:
+            raise CheckpointError(f"calm is {calm}, expected one of {', '.join(HealthState)}")
         end_ns = next(iter(checked(arrays, "end_ns", np.int64, (None,)).tolist()), None)
         self._gate.restore(unprefixed("gate", arrays))
         self._window.restore(unprefixed("window", arrays), moments)
         self._evaluator.restore(unprefixed("evaluator", arrays))
         self._test.state = test
-        self._end_ns, self._calm = end_ns, calm
+        self._end_ns, self._calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
 
     def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:

@@ -183,8 +183,7 @@ class MachineWorker:
         """Start the thread; it publishes to `outlet`."""
         self._outlet = outlet
         self._begin_s = self._ticked_s = self._clocks.monotonic_s()
-        if self._monitor.end_ns is None:
-            self._owed = self._monitor.passed(self._data_now_ns())
+        self.tick()  # before any block: what time it is so far
         for event in self._unpublished:
             outlet.publish_alarm_event(event.text)
         self._thread.start()
@@ -373,9 +372,9 @@ class MachineWorker:
         """Conclude what came of one message, in one step: the monitor's state is that after the last of the blocks."""
         for report in reports:
             self._explain(report)
-            if report.verdict.clock_step_s:
-                self._operated_ns = 0
             if report.verdict.accepted:
+                if self._latest_data_s is None or not report.verdict.continuous:
+                    self._operated_ns = 0  # perhaps by another clock
                 self._latest_data_s = self._clocks.monotonic_s()
                 self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
         self._conclude(
@@ -387,23 +386,22 @@ class MachineWorker:
         self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...], *, always: bool = False
     ) -> tuple[str, ...]:
         """Commit, then let it be seen and publish; returns the events as they are published."""
-        # Also what was refused, or left behind by a defect: without it the log would have a hole, and end there.
-        self._owed += (*events, *self._monitor.take_events())
-        snapshot, owed = self._monitor.health(), self._owed
+        events += self._monitor.take_events()  # left behind by a defect
+        self._owed += events
+        snapshot = self._monitor.health()
         reports: tuple[StoredReport, ...] = ()
         told: tuple[StoredEvent, ...] = ()
         try:
-            if windows or self._owed or always:
+            if windows or events or always:
                 reports, told = self._commit(windows)
         finally:
             self._snapshot = snapshot
             self.latest = self._held()
         texts = tuple(one.text for one in told if one.sequence >= self._told)
-        for event in owed:
-            if event.sequence >= self._told:
-                self._told = event.sequence + 1
-                self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
+        for event in events:
+            self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
         if texts:
+            self._told = told[-1].sequence + 1
             self._on_events()
         try:
             self._publish([one.text for one in reports], texts)
@@ -412,7 +410,10 @@ class MachineWorker:
         return texts
 
     def _commit(self, windows: tuple[WindowReport, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
-        """Bring windows, owed events and the monitor's state into the history; returns what is to be heard."""
+        """Bring windows, events and the monitor's state into the history, as they are to be published.
+
+        What it refuses is tried again with the next step: the log takes no event that comes after a missing one.
+        """
         recorded_ns = self._clocks.utc_ns()
         state = self._monitor.state(self._kept)
         reports = tuple(stored_report(self.identity, window) for window in windows)

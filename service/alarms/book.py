@@ -284,7 +284,8 @@ class AlarmBook:
             page = _PAGE.validate_json(text)
         except ValueError as error:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
-        self._alarms = {alarm.name: alarm for alarm in page.alarms}
+        # Another version of the program may have known others.
+        self._alarms = {alarm.name: alarm for alarm in page.alarms if alarm.name in ALARM_TEXT}
         self._next_sequence = page.next_sequence if next_sequence is None else next_sequence
         self._untold = []
 

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from models.alarm_names import CLOCK, GAP, STREAM_LOST
+from models.checkpoint import from_bytes, to_bytes
 from models.commissioning.installed import Installed, install
+from models.errors import CheckpointError
 from models.ingest import Reason
 from models.machine import AlarmSettings, Machine
 from models.signals.block import SampleBlock
@@ -231,6 +233,22 @@ def test_the_log_says_which_number_comes_next() -> None:
     assert event.sequence == 1
 
 
+def test_alarms_of_another_version_are_left_aside() -> None:
+    book = AlarmBook(AlarmSettings())
+    book.operate(order("shelve", "k_by"), 0)
+    book.operate(order("shelve", "model"), 0)
+    again = AlarmBook(AlarmSettings())
+    again.restore(book.checkpoint().replace("k_by", "k_bx"))
+    assert [one.name for one in again.alarms] == ["model"]
+
+
+def test_a_state_of_unknown_health_is_damaged() -> None:
+    monitor = MachineMonitor(install(machine(), None))
+    arrays = from_bytes(monitor.state().state) | {"calm": np.array(["splendid"])}
+    with pytest.raises(CheckpointError, match=r"calm is .*splendid.*, expected one of warming, healthy"):
+        MachineMonitor(install(machine(), None)).restore(to_bytes(arrays), ())
+
+
 # Clocks
 
 
@@ -249,8 +267,11 @@ def test_shelving_before_any_data_is_as_long_as_it_says(tmp_path: Path) -> None:
     with bench(tmp_path) as at:
         at.worker.operate(order("shelve", "k_by", duration_s=HOUR_S))
     with bench(tmp_path) as at:  # and over a restart
+        at.worker.operate(order("remove-from-service", "e"))
         at.put(block(0))  # the data's clock is months from the time of day
+        at.worker.operate(order("shelve", "model", duration_s=HOUR_S))
         assert at.shelf_s("k_by") == pytest.approx(HOUR_S, abs=60)
+        assert at.shelf_s("model") == pytest.approx(HOUR_S, abs=60)
 
 
 def test_shelving_ends_without_data_too(tmp_path: Path) -> None:
