@@ -163,14 +163,16 @@ class SensorFault(BaseModel):
     model_config = JSON
 
     states: tuple[str, ...] = Field(description="what the channels in question measure", examples=[("y1",)])
-    kind: str = Field(description="stuck, clipped, offset, gain, delay, swapped or incoherent", examples=["gain"])
+    kind: str = Field(
+        description="stuck, clipped, offset, gain, delay, swapped, incoherent or noise", examples=["gain"]
+    )
     text: str = Field(
         description="channels, value found and what was expected, in a sentence",
         examples=["gain of y1 is 20 % lower than when it was commissioned"],
     )
     value: float | None = Field(
-        description="stuck: s; clipped: part of the samples; offset: SI; gain: relative; delay: s; otherwise the share "
-        "of motion that the sensors have in common",
+        description="stuck: s; clipped: part of the samples; offset: SI; gain: relative; delay: s; noise: its rms over "
+        "that of the channel (rad for the shaft angle); otherwise the share of motion that the sensors have in common",
         examples=[-0.2],
     )
     z: float | None = Field(description="in standard errors; null where no chance is involved", examples=[41.0])

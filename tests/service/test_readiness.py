@@ -97,7 +97,8 @@ def void(_: object) -> None:
     pass
 
 
-def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path) -> None:
+def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.webhooks.dispatcher._QUIET_S", 1e6)  # they are woken, or they sleep on
     address = endpoint()
     machine = machine_file(
         tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")

@@ -233,6 +233,29 @@ def test_a_refused_event_holds_up_its_own_machine_only(tmp_path: Path, history: 
         assert elsewhere.got == []
 
 
+def test_a_receiver_that_refuses_is_there(tmp_path: Path, history: Plant) -> None:
+    """Pauses begin anew after it."""
+    statuses = [500, 500, 500, 404, 500]
+    with (
+        hook(lambda _: (statuses.pop(0), {})) as receiver,
+        turned(settings_for(receiver, tmp_path), history) as webhook,
+    ):
+        history.happen(alarm_event(0))
+        history.happen(alarm_event(0, "demo/pump"), place="demo/pump")
+        for pause in (1.0, 2.0, 4.0, 1.0):
+            assert webhook.turns() == pause
+            webhook.clock.now_s += pause
+        assert statuses == []
+
+
+def test_how_far_it_has_come_is_remembered_at_once(tmp_path: Path, history: Plant) -> None:
+    with hook() as receiver, turned(settings_for(receiver, tmp_path), history) as webhook:
+        history.happen(alarm_event(0), alarm_event(1))
+        for number in (1, 2):
+            assert webhook.dispatcher.turn() == 0.0
+            assert history.store.webhooks.get("pager", "demo/lab") == number == len(receiver.got)
+
+
 def test_gone_disables_until_the_next_start(tmp_path: Path, history: Plant) -> None:
     with hook(lambda _: (410, {})) as receiver:
         settings = settings_for(receiver, tmp_path)
@@ -323,6 +346,9 @@ def test_a_history_that_cannot_be_read_is_looked_into_again(tmp_path: Path) -> N
             history.store.close()
             assert webhook.turns() == 1.0
             assert "history is closed" in webhook.dispatcher.status().last_error
+            assert webhook.turns() == 1.0  # not before, whatever news there are
+            webhook.clock.now_s += 0.5
+            assert webhook.turns() == 0.5
         assert receiver.got == []
 
 
