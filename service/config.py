@@ -161,9 +161,6 @@ class ReplaySettings(BaseModel):
     jobs: int = Field(default=1, ge=1, le=64, description="most that run at once")
     nice: int = Field(default=10, ge=0, le=19, description="how far they give way to the monitor, 19 is most")
     kept: int = Field(default=20, ge=1, le=10_000, description="latest replays whose results are kept")
-    hosts: tuple[str, ...] = Field(
-        default=(), description="names under which browsers reach the API, if not as localhost, the host or an address"
-    )
 
 
 class LogSettings(BaseModel):

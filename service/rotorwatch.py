@@ -13,6 +13,7 @@ from service.commands import plot as plot_commands
 from service.commands import record as record_commands
 from service.commands import replay as replay_commands
 from service.commands import watching as watching_commands
+from service.commands import webhook as webhook_commands
 from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import ENDPOINT, ConnectOption, LinkOption, ListenOption, exit_codes, one_blas_thread
 
@@ -234,6 +235,7 @@ def _checked(file: Path) -> str:
 # After the commands of this module, which are the first in the list.
 watching_commands.register(app)
 access_commands.register(app)
+webhook_commands.register(app)
 record_commands.register(app)
 replay_commands.register(app)
 interchange_commands.register(app)

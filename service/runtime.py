@@ -36,9 +36,10 @@ from models.signals.keys import MachineKeys
 from service.access.guard import Guard
 from service.access.tls import server_arguments
 from service.access_settings import AccessSettings
-from service.api import create_app
 from service.config import HttpSettings, ServiceSettings
 from service.event_feed import EventFeed
+from service.http.app import create_app
+from service.http.replays import ReplayDesk
 from service.logs import logger
 from service.metrics.collector import Metrics
 from service.metrics.requests import RequestCounts, RequestMeter
@@ -46,7 +47,6 @@ from service.pulse import Pulse
 from service.readiness import readiness_of
 from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder, RecorderStatus
-from service.replays_api import ReplayDesk
 from service.schemas import Health, MachineReadiness, Readiness
 from service.store.audit import AuditLog
 from service.store.store import Store

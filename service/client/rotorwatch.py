@@ -15,7 +15,10 @@ from service.alarm_schemas import Alarm, AlarmCloudEvent, AlarmStates
 from service.alarms.alarm import EventKind, Severity
 from service.alarms.life_cycle import AlarmState
 from service.alarms.operation import OperationKind
-from service.api_schemas import (
+from service.client.answers import refusal, understood
+from service.client.errors import ClientError, NoAnswer
+from service.client.event_stream import ServiceEvent, service_events
+from service.http.schemas import (
     AlarmEventList,
     AuditList,
     AuditRecord,
@@ -27,9 +30,6 @@ from service.api_schemas import (
     ReadingList,
     ReportList,
 )
-from service.client.answers import refusal, understood
-from service.client.errors import ClientError, NoAnswer
-from service.client.event_stream import ServiceEvent, service_events
 from service.schemas import DetectableChanges, Health, MachineDescription, Report
 from service.snapshots.choice import Units
 from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot

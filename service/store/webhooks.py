@@ -9,7 +9,7 @@ __all__ = ["WebhookCursors"]
 
 
 class WebhookCursors:
-    """The last alarm event that each webhook has had of each machine; for any thread.
+    """The alarm event that each webhook is to have next of each machine; for any thread.
 
     Both methods raise `StoreError` if the database fails.
     """
@@ -18,7 +18,7 @@ class WebhookCursors:
         self._database = database
 
     def get(self, name: str, machine_key: str) -> int:
-        """Sequence of the last event delivered; -1 if there is none."""
+        """Sequence of the event that is to be delivered next; -1 if none was ever set."""
         column = webhook_cursors.c
         query = select(column.sequence).where(column.name == name, column.machine_key == machine_key)
 
@@ -30,7 +30,7 @@ class WebhookCursors:
         return self._database.call(fetch)
 
     def set(self, name: str, machine_key: str, sequence: int) -> None:
-        """Note the sequence of the last event delivered."""
+        """Note the sequence of the event that is to be delivered next."""
         made = self._database.insert(webhook_cursors).values(name=name, machine_key=machine_key, sequence=sequence)
         made = made.on_conflict_do_update(index_elements=["name", "machine_key"], set_={"sequence": sequence})
 

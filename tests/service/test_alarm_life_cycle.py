@@ -216,9 +216,7 @@ def test_who_shelved_what_a_rule_suppresses_finds_it_suppressed_afterwards() -> 
 def test_what_was_seen_must_still_be_so() -> None:
     book, now_s = raised()
     version = book.alarms[0].version
-    with pytest.raises(
-        OperationConflict, match=r"k_by is unacknowledged \(version 0\), not as it was"
-    ):
+    with pytest.raises(OperationConflict, match=r"k_by is unacknowledged \(version 0\), not as it was"):
         book.operate(act("acknowledge", expected_state="normal"), now_s * S)
     book.update("k_by", -0.7, 0.01, (now_s + 5) * S, named=True)
     with pytest.raises(OperationConflict, match="version"):

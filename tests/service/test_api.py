@@ -10,7 +10,7 @@ from models.alarm_names import ALARM_TEXT
 from models.machine import Machine, load_machine
 from models.physics.parameters import PARAMETERS
 from service.alarm_schemas import Alarm
-from service.api_schemas import (
+from service.http.schemas import (
     AlarmEventList,
     Alive,
     AuditList,

@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from service.access.guard import Guard
-from service.api import create_app
 from service.config import ServiceSettings
+from service.http.app import create_app
 from service.runtime import Runtime
 from service.schemas import Problem, example
 from tests.service.live import ROOT, settings, until

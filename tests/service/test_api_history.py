@@ -11,7 +11,7 @@ from service import conversion
 from service.alarm_conversion import Identity, alarm_cloud_event
 from service.alarms.alarm import Alarm, AlarmEvent, EventKind
 from service.alarms.life_cycle import AlarmState
-from service.api_schemas import AlarmEventList, AuditList
+from service.http.schemas import AlarmEventList, AuditList
 from service.reports import DataQuality, HealthState, MachineHealth, WindowReport
 from service.runtime import Runtime
 from service.schemas import AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report, StreamStatus, example

@@ -11,7 +11,7 @@ import pytest
 
 from service.access.scopes import Scope
 from service.alarm_schemas import Alarm, AlarmStates
-from service.api_schemas import AlarmEventList, AuditList, OperationDone
+from service.http.schemas import AlarmEventList, AuditList, OperationDone
 from service.runtime import Runtime
 from tests.service.live import Feed, until
 from tests.service.monitored import GUARDED, PLACE, answered, client, fed, problem, token

@@ -11,8 +11,8 @@ from models.commissioning.installed import Installed
 from models.errors import BundleError
 from models.machine import AlarmSettings, MachineFile
 from models.signals.block import SampleBlock
-from service.alarms.alarm import AlarmEvent
 from service.alarm_conversion import Identity
+from service.alarms.alarm import AlarmEvent
 from service.conversion import report
 from service.monitor import MachineMonitor
 from service.reports import HealthState, WindowReport

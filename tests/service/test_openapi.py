@@ -25,7 +25,7 @@ from schemathesis.specs.openapi import checks
 
 from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.api import create_app
+from service.http.app import create_app
 from service.runtime import Runtime
 from tests.service.monitored import GUARDED, client, faulty, problem, token
 

@@ -22,9 +22,9 @@ from service.config import (
     ReplaySettings,
     ServiceSettings,
 )
-from service.recordings_api import RecordingDetail, RecordingList
+from service.http.recordings import RecordingDetail, RecordingList
+from service.http.replays import ReplayAlarmList, ReplayDesk, ReplayList, ReplayReportList
 from service.replay.schemas import ReplayJob
-from service.replays_api import ReplayAlarmList, ReplayDesk, ReplayList, ReplayReportList
 from service.runtime import Runtime, running
 from service.schemas import Problem
 from simulator.scenario import parse_fault

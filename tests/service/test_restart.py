@@ -7,7 +7,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.api_schemas import ReportList
+from service.http.schemas import ReportList
 from service.schemas import Health
 from tests.service.live import Program, endpoint, program, until
 

@@ -53,7 +53,7 @@ def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
 
 def test_the_service_never_imports_torch() -> None:
     code = (
-        "import sys, service.runtime, service.transport, service.api\n"
+        "import sys, service.runtime, service.transport, service.http.app\n"
         "from service.config import MachineEntry, ServiceSettings\n"
         "service.runtime.Runtime(ServiceSettings(machines=(MachineEntry(file='lab', bundle='lab'),)))\n"
         "assert 'numpy' in sys.modules\nassert 'torch' not in sys.modules"

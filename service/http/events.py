@@ -11,8 +11,8 @@ from models.errors import RotorwatchError
 from service.access.guard import Guard
 from service.access.scopes import Caller
 from service.alarm_schemas import AlarmCloudEvent
-from service.api_views import ServiceView
 from service.event_feed import AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
+from service.http.views import ServiceView
 from service.problems import problem_responses
 from service.schemas import example
 

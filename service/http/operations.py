@@ -22,8 +22,8 @@ from service.alarms.operation import (
     OperationRefused,
     UnknownAlarm,
 )
-from service.api_schemas import OperationDone, OperationOrder, ReasonedOrder, ShelveOrder
-from service.api_views import PLACE, AlarmName, MachineName, MachineView, ServiceView, SiteName, found_machine
+from service.http.schemas import OperationDone, OperationOrder, ReasonedOrder, ShelveOrder
+from service.http.views import PLACE, AlarmName, MachineName, MachineView, ServiceView, SiteName, found_machine
 from service.problems import responses
 from service.schemas import example
 

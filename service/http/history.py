@@ -8,8 +8,8 @@ from fastapi.responses import Response
 
 from service.access.guard import Guard
 from service.alarms.alarm import EventKind, Severity
-from service.api_schemas import AlarmEventList, AuditList, AuditRecord, Reading, ReadingBucket, ReadingList, ReportList
-from service.api_views import (
+from service.http.schemas import AlarmEventList, AuditList, AuditRecord, Reading, ReadingBucket, ReadingList, ReportList
+from service.http.views import (
     PLACE,
     AlarmName,
     Limit,

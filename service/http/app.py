@@ -8,19 +8,19 @@ from pydantic import AfterValidator
 
 from models.machine import MachineFile
 from service.access.guard import Guard
-from service.api_schemas import Alive, MachineConfiguration, MachineList, configuration_example
-from service.api_views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
-from service.description import DescribedApp, only_known_arguments
-from service.events_api import add_event_routes
-from service.history_api import add_history_routes
-from service.operations_api import add_operation_routes
-from service.page import front_page
+from service.http.description import DescribedApp, only_known_arguments
+from service.http.events import add_event_routes
+from service.http.history import add_history_routes
+from service.http.operations import add_operation_routes
+from service.http.page import front_page
+from service.http.recordings import add_recording_routes
+from service.http.replays import add_replay_routes
+from service.http.schemas import Alive, MachineConfiguration, MachineList, configuration_example
+from service.http.service import add_service_routes
+from service.http.snapshots import add_snapshot_routes
+from service.http.views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
 from service.problems import add_problems, problem_answer, responses
-from service.recordings_api import add_recording_routes
-from service.replays_api import add_replay_routes
 from service.schemas import DetectableChanges, Health, MachineDescription, Readiness
-from service.service_api import add_service_routes
-from service.snapshots_api import add_snapshot_routes
 
 __all__ = ["MachineView", "ServiceView", "create_app"]
 
@@ -141,12 +141,12 @@ def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> N
         response_model=Readiness,
     )
     def readyz(request: Request) -> Readiness | JSONResponse:
-        """Whether the session is open and every worker runs; a machine without data is listed, not counted."""
+        """Whether the service can do its work, and if not, why; a machine without data is listed, not counted."""
         readiness = service.readiness()
         if readiness.ready:
             return readiness
         return problem_answer(
-            request, 503, "the session is closed or a worker has stopped", readiness.model_dump(mode="json")
+            request, 503, "; ".join(readiness.reasons), readiness.model_dump(mode="json")
         )
 
     @app.get("/", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)

@@ -12,10 +12,10 @@ from service.alarm_conversion import Identity
 from service.alarm_schemas import AlarmCloudEvent, AlarmStates
 from service.alarms.operation import Operation
 from service.event_feed import EventFeed
-from service.recordings_api import RecordingIndex
-from service.replays_api import ReplayDesk
+from service.http.recordings import RecordingIndex
+from service.http.replays import ReplayDesk
+from service.http.service import MeasuredView
 from service.schemas import DetectableChanges, Health, MachineDescription, Readiness
-from service.service_api import MeasuredView
 from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.audit import AuditLog
 from service.store.machine import MachineStore

@@ -14,8 +14,8 @@ from models.signals.link import LinkSettings
 from service.access.guard import Guard
 from service.access_settings import is_loopback
 from service.config import MachineEntry, ServiceSettings
+from service.http.recordings import RecordingIndex, found_recording
 from service.problems import problem_responses, responses
-from service.recordings_api import RecordingIndex, found_recording
 from service.replay.choice import is_shipped_bundle, is_shipped_machine
 from service.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
 from service.replay.schemas import ReplayJob, ReplayRequest, ReplaySeek

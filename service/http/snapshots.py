@@ -5,7 +5,7 @@ from typing import Annotated, Any
 from fastapi import FastAPI, HTTPException, Query
 
 from service.access.guard import Guard
-from service.api_views import PLACE, MachineName, ServiceView, SiteName, found_machine
+from service.http.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 from service.problems import responses
 from service.snapshots.choice import SnapshotError, Units
 from service.snapshots.path import MOST_REVOLUTIONS
