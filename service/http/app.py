@@ -145,9 +145,7 @@ def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> N
         readiness = service.readiness()
         if readiness.ready:
             return readiness
-        return problem_answer(
-            request, 503, "; ".join(readiness.reasons), readiness.model_dump(mode="json")
-        )
+        return problem_answer(request, 503, "; ".join(readiness.reasons), readiness.model_dump(mode="json"))
 
     @app.get("/", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
     def page() -> str:
