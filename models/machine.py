@@ -137,6 +137,15 @@ class IngestSettings(BaseModel):
     )
     no_data_after_s: float = Field(default=5.0, gt=0, le=3600, description="silence that is called no data")
 
+    @model_validator(mode="after")
+    def _blocks_are_no_silence(self) -> Self:
+        if self.no_data_after_s <= self.block_to_s:
+            raise ValueError(
+                f"no_data_after_s is {self.no_data_after_s:g}, expected more than block_to_s, {self.block_to_s:g}: "
+                "between two blocks of that length nothing comes for as long"
+            )
+        return self
+
 
 class AlarmLimits(BaseModel):
     """Limits of one parameter's relative change."""

@@ -13,7 +13,7 @@ from models.checkpoint import from_bytes, to_bytes
 from models.commissioning.installed import Installed, install
 from models.errors import CheckpointError
 from models.ingest import Reason
-from models.machine import AlarmSettings, Machine
+from models.machine import AlarmSettings, IngestSettings, Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from service.alarm_conversion import Identity
@@ -353,6 +353,11 @@ def test_a_program_that_stood_still_calls_nobody_silent(tmp_path: Path) -> None:
             now_s[0] += 1.0
             at.tick()
         assert at.log() == [(0, "raised", STREAM_LOST)]
+
+
+def test_a_silence_is_longer_than_a_block() -> None:
+    with pytest.raises(ValueError, match="no_data_after_s is 5, expected more than block_to_s, 30"):
+        IngestSettings(block_to_s=30.0)
 
 
 def test_data_that_come_late_without_a_gap_end_the_silence_not_before_it_began() -> None:

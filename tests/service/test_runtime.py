@@ -40,7 +40,7 @@ from tests.service.live import (
     until,
 )
 
-SHORT_SILENCE = ("[operation]", "[ingest]\nno_data_after_s = 0.5\n\n[operation]")
+SHORT_SILENCE = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
 
 
 class Topics:
