@@ -5,6 +5,7 @@
 
 import json
 import re
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -92,7 +93,12 @@ def test_recipe_for_a_follower_takes_each_event_once_in_order(tmp_path: Path, mo
     address = endpoint()
     rounds: list[Callable[[], object]] = []
 
-    def sleep(_: float) -> None:
+    genuine = time.sleep
+
+    def sleep(duration_s: float) -> None:
+        if duration_s < 0.5:  # not the program's: somebody waits for a condition
+            genuine(duration_s)
+            return
         if not rounds:
             raise KeyboardInterrupt
         rounds.pop(0)()
