@@ -1,7 +1,9 @@
 """The front page: every machine's state, raised alarms and latest readings, as plain HTML without scripts or assets."""
 
 import html
+from datetime import UTC, datetime
 
+from service.alarm_schemas import Alarm
 from service.alarms.alarm import Severity
 from service.schemas import Health, Opinion, Parameter, Verdict
 
@@ -14,6 +16,7 @@ h2 { margin: 2rem 0 .3rem } h2 span { font-size: 1rem; padding: .1rem .6rem; bor
 .healthy { background: #23804b } .warming, .not-evaluable { background: #66727f } .alert { background: #b26a00 }
 .unchanged { background: #3d7f6a } .data-health { background: #7a3e9d }
 .danger { background: #b3261e } .outside-model { background: #8a5a00 } .no-data { background: #7a3e9d }
+td span { padding: 0 .5rem; border-radius: .7rem; color: #fff; font-weight: normal }
 table { border-collapse: collapse; margin: .6rem 0 }
 td, th { padding: .2rem 1rem .2rem 0; text-align: left; border-bottom: 1px solid #dde2e7 }
 td.number { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums } .raised { font-weight: bold }
@@ -45,8 +48,49 @@ def _machine(health: Health) -> str:
         f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span></h2>'
         f"{reason}{verdict}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
         f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>"
-        f"{_table(health, raised)}{_shapes(health)}"
+        f"{_alarms(health)}{_table(health, raised)}{_shapes(health)}"
     )
+
+
+def _alarms(health: Health) -> str:
+    """What is to be seen of alarms: raised ones first, then those that somebody has to look at, then silenced ones."""
+    if not health.alarms:
+        return '<p class="note">No alarm is raised, and none waits to be acknowledged.</p>'
+    rows = ""
+    for alarm in sorted(health.alarms, key=lambda one: (not one.raised, one.since_ns)):
+        what = f"{alarm.text} ({alarm.name})"
+        rows += (
+            f"<tr{' class=raised' if alarm.raised else ''}><td>{html.escape(what)}<td>{_alarm_state(alarm)}"
+            f"<td>{_clock(alarm.raised_ns or alarm.since_ns)}<td>{html.escape(_alarm_note(alarm))}</tr>"
+        )
+    return f"<table><tr><th>alarm<th>state<th>since (UTC)<th>what is known</tr>{rows}</table>"
+
+
+def _alarm_state(alarm: Alarm) -> str:
+    if alarm.pending:
+        return "pending"
+    severity = f' <span class="{alarm.severity}">{alarm.severity}</span>' if alarm.raised else ""
+    return f"{alarm.state.value}{severity}"
+
+
+def _alarm_note(alarm: Alarm) -> str:
+    """Why it is silenced, or how large the change is, or what the note says."""
+    if alarm.shelf is not None:
+        how = " or until it clears" if alarm.shelf.one_shot else ""
+        return f"shelved by {alarm.shelf.by} until {_clock(alarm.shelf.until_ns)}{how}: {alarm.shelf.reason}"
+    if alarm.out_of_service_by:
+        return f"taken out of service by {alarm.out_of_service_by}: {alarm.out_of_service_reason}"
+    if alarm.suppressed_by:
+        return f"suppressed: {alarm.suppressed_by}"
+    if alarm.relative_change is not None and alarm.interval_95 is not None:
+        low, high = alarm.interval_95
+        reserve = ", low confidence: outside the model" if alarm.low_confidence else ""
+        return f"{alarm.relative_change:+.1%} ({low:+.1%} … {high:+.1%}){reserve}"
+    return alarm.note
+
+
+def _clock(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
 def _shapes(health: Health) -> str:
