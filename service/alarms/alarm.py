@@ -125,6 +125,8 @@ class Alarm:
         Rules that suppress it now, in words; empty if none, whatever the state.
     out_of_service_by, out_of_service_reason : str
         Who took it out of service, and why; empty otherwise.
+    owed : AlarmState
+        While suppressed: where it comes back to without its condition, because somebody has to acknowledge or reset.
     version : int
         Sequence number of its latest event; -1 before the first. Who changes an alarm says which version was seen.
     """
@@ -147,6 +149,7 @@ class Alarm:
     suppressed_by: str = ""
     out_of_service_by: str = ""
     out_of_service_reason: str = ""
+    owed: AlarmState = AlarmState.NORMAL
     version: int = -1
 
     @property

@@ -17,7 +17,7 @@ from models.alarm_names import ALARM_TEXT, of_the_machine
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from service.alarms.alarm import Alarm, AlarmEvent, EventKind, Evidence, Severity, Shelf
-from service.alarms.life_cycle import AlarmState, Happening, follow
+from service.alarms.life_cycle import AlarmState, Happening, follow, owed_after
 from service.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
 
 __all__ = ["NO_ALARMS", "AlarmBook"]
@@ -373,15 +373,18 @@ class AlarmBook:
         self, alarm: Alarm, happening: Happening, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
     ) -> tuple[AlarmEvent, ...]:
         """Follow the life cycle and write the event down."""
-        before = alarm.state
-        state = follow(before, happening, present=alarm.present, latching=self._latches(alarm))
+        before, latching = alarm.state, self._latches(alarm)
+        state = follow(before, happening, present=alarm.present, latching=latching, owed=alarm.owed)
         if state is None:
             raise OperationRefused(f"{alarm.name} is {before.value}: {happening.value} is not possible")
         if state is before and happening in {Happening.SUPPRESS, Happening.UNSUPPRESS}:
             self._alarms[alarm.name] = alarm  # the rule is noted; the operator's own silence outranks it
             return ()
         since_ns = alarm.since_ns if state is before else time_ns
-        alarm = replace(alarm, state=state, since_ns=since_ns, version=self._next_sequence)
+        owed = alarm.owed if state is before else AlarmState.NORMAL
+        if happening is Happening.SUPPRESS:
+            owed = owed_after(before, latching=latching)
+        alarm = replace(alarm, state=state, since_ns=since_ns, owed=owed, version=self._next_sequence)
         event = AlarmEvent(kind, time_ns, self._next_sequence, alarm, before, actor, reason)
         self._next_sequence += 1
         self._alarms[alarm.name] = alarm

@@ -12,14 +12,15 @@
 
 A latching alarm goes to a latched state where others return, and leaves it by *reset*. From every state an alarm can be
 taken away from the operator's eyes: shelved, suppressed by design, out of service. It goes on following its condition
-there, and on leaving it is unacknowledged if the condition is there, normal if not.
+there, and on leaving it is unacknowledged if the condition is there. If not, it is normal where an operator took it
+away; where a rule did, what was owed before is owed still: an acknowledgement, or a reset.
 """
 
 from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
 
-__all__ = ["REFUSED", "STAYS", "TABLE", "AlarmState", "Cell", "Happening", "follow"]
+__all__ = ["OWED", "REFUSED", "STAYS", "TABLE", "AlarmState", "Cell", "Happening", "follow", "owed_after"]
 
 
 class AlarmState(StrEnum):
@@ -63,7 +64,10 @@ STAYS = "stays"
 REFUSED = "refused"
 """Nobody may ask for this in this state."""
 
-Cell = str | tuple[AlarmState, AlarmState]
+OWED = "as owed"
+"""Back to where somebody still has to acknowledge or reset; normal if nobody has to."""
+
+Cell = str | tuple[str, AlarmState]
 """A state, `STAYS`, `REFUSED`, or two states: for *clear* without and with latching, otherwise without and with the
 condition there."""
 
@@ -80,7 +84,7 @@ _ROWS: Mapping[Happening, tuple[Cell, ...]] = {
     Happening.SHELVE:    (_SH,     _SH,      _SH,      _SH,      _SH,      _SH,      STAYS,    REFUSED,  REFUSED),
     Happening.UNSHELVE:  (REFUSED, REFUSED,  REFUSED,  REFUSED,  REFUSED,  REFUSED,  (_N, _U), REFUSED,  REFUSED),
     Happening.SUPPRESS:  (_SU,     _SU,      _SU,      _SU,      _SU,      _SU,      STAYS,    STAYS,    STAYS),
-    Happening.UNSUPPRESS: (STAYS,  STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    (_N, _U), STAYS),
+    Happening.UNSUPPRESS: (STAYS,  STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    STAYS,    (OWED, _U), STAYS),
     Happening.REMOVE_FROM_SERVICE: (_OOS, _OOS, _OOS,  _OOS,     _OOS,     _OOS,     _OOS,     _OOS,     REFUSED),
     Happening.RETURN_TO_SERVICE: (REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, REFUSED, (_N, _U)),
 }  # fmt: skip
@@ -91,7 +95,27 @@ TABLE: Mapping[tuple[AlarmState, Happening], Cell] = MappingProxyType(
 """What becomes of an alarm in a state when something happens."""
 
 
-def follow(state: AlarmState, happening: Happening, *, present: bool, latching: bool) -> AlarmState | None:
+def owed_after(state: AlarmState, *, latching: bool) -> AlarmState:
+    """Where an alarm that a rule takes away from a state comes back to, once its condition is gone.
+
+    Examples
+    --------
+    >>> owed_after(AlarmState.UNACKNOWLEDGED, latching=False).value
+    'returned'
+    """
+    if state in {AlarmState.UNACKNOWLEDGED, AlarmState.ACKNOWLEDGED}:
+        return follow(state, Happening.CLEAR, present=False, latching=latching) or state
+    return state
+
+
+def follow(
+    state: AlarmState,
+    happening: Happening,
+    *,
+    present: bool,
+    latching: bool,
+    owed: AlarmState = AlarmState.NORMAL,
+) -> AlarmState | None:
     """The state an alarm goes to.
 
     Parameters
@@ -104,6 +128,8 @@ def follow(state: AlarmState, happening: Happening, *, present: bool, latching: 
         Whether the condition is there, after what happens.
     latching : bool
         Whether the alarm latches.
+    owed : AlarmState
+        Where it comes back to after a rule, without its condition.
 
     Returns
     -------
@@ -118,7 +144,9 @@ def follow(state: AlarmState, happening: Happening, *, present: bool, latching: 
     cell = TABLE[state, happening]
     if isinstance(cell, tuple):
         without, with_ = cell
-        return with_ if (latching if happening is Happening.CLEAR else present) else without
+        if latching if happening is Happening.CLEAR else present:
+            return with_
+        return owed if without == OWED else AlarmState(without)
     if cell == REFUSED:
         return None
     return state if cell == STAYS else AlarmState(cell)

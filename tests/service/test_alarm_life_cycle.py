@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from models.machine import AlarmSettings
 from service.alarms.alarm import Alarm, AlarmEvent, EventKind
 from service.alarms.book import AlarmBook
-from service.alarms.life_cycle import REFUSED, STAYS, TABLE, AlarmState, Cell, Happening, follow
+from service.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, AlarmState, Cell, Happening, follow
 from service.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
 
 ROOT = Path(__file__).parents[2]
@@ -55,9 +55,11 @@ def test_every_cell_leads_where_it_says(state: AlarmState, happening: Happening)
     cell = TABLE[state, happening]
     for present in (False, True):
         for latching in (False, True):
-            found = follow(state, happening, present=present, latching=latching)
+            owed = AlarmState.LATCHED_ACKNOWLEDGED
+            found = follow(state, happening, present=present, latching=latching, owed=owed)
             if isinstance(cell, tuple):
-                assert found is cell[latching if happening is Happening.CLEAR else present]
+                wanted = cell[latching if happening is Happening.CLEAR else present]
+                assert found == (AlarmState.LATCHED_ACKNOWLEDGED if wanted == OWED else wanted)
             else:
                 assert found == {REFUSED: None, STAYS: state}.get(cell, cell)
 
@@ -203,6 +205,37 @@ def test_rules_suppress_and_give_back() -> None:
     assert state_of(book, "model") is AlarmState.NORMAL
 
 
+@pytest.mark.parametrize(
+    ("name", "acknowledged", "owed"),
+    [
+        ("k_by", False, AlarmState.RETURNED),
+        ("k_by", True, AlarmState.NORMAL),
+        ("c_by", False, AlarmState.LATCHED_UNACKNOWLEDGED),
+        ("c_by", True, AlarmState.LATCHED_ACKNOWLEDGED),
+    ],
+)
+@pytest.mark.parametrize("cleared_before", [False, True])
+def test_a_rule_takes_no_acknowledgement_off_anybody(
+    name: str, acknowledged: bool, owed: AlarmState, cleared_before: bool
+) -> None:
+    book, now_s = raised(name)
+    if acknowledged:
+        book.operate(act("acknowledge", name), now_s * S)
+    if cleared_before:
+        cleared(book, name, now_s + 5)
+        assert state_of(book, name) is owed
+    rules = {"suppress": [{"alarms": [name], "while_alarm": "data-stuck", "because": "stuck"}], "latching": ["c_by"]}
+    page, book = book.checkpoint(), AlarmBook(AlarmSettings.model_validate({**rules, "off_delay_s": 15}))
+    book.restore(page)
+    book.update_state("data-stuck", True, (now_s + 40) * S, at_once=True)
+    book.suppress(None, (now_s + 40) * S)
+    assert state_of(book, name) is AlarmState.SUPPRESSED
+    cleared(book, name, now_s + 45)
+    book.update_state("data-stuck", False, (now_s + 70) * S, at_once=True)
+    assert [event.kind for event in book.suppress(None, (now_s + 70) * S)] == ["unsuppressed"]
+    assert state_of(book, name) is owed
+
+
 def test_who_shelved_what_a_rule_suppresses_finds_it_suppressed_afterwards() -> None:
     book, now_s = raised()
     book.operate(act("shelve"), now_s * S)
@@ -311,6 +344,14 @@ def test_walks_keep_what_must_hold(stories: list[tuple[str, object, object]]) ->
         assert event.alarm.version == event.sequence
         assert event.alarm.occurrence - (before.occurrence if before else 0) == (event.kind is EventKind.RAISED)
         latest[event.alarm.name] = event.alarm
+    due: set[str] = set()
+    for event in events:
+        name, state = event.alarm.name, event.alarm.state
+        if event.actor:
+            due.discard(name)  # somebody has seen to it
+        if state is AlarmState.UNACKNOWLEDGED:
+            due.add(name)
+        assert state is not AlarmState.NORMAL or name not in due, "nobody has acknowledged it"
     for alarm in book.alarms:
         known = latest.get(alarm.name)
         assert alarm.state is (AlarmState.NORMAL if known is None else known.state)
