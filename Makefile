@@ -46,8 +46,9 @@ types: $(READY)
 contracts: $(READY)
 	$(BIN)/lint-imports
 
+# Two at a time; tests that open ports and start programs stay together in one of the two (tests/conftest.py).
 tests: $(READY)
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2
 
 format: $(READY)
 	$(BIN)/ruff format .
