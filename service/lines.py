@@ -2,7 +2,7 @@
 
 from datetime import UTC, datetime
 
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, Opinion, Parameter, Report, Verdict
+from service.schemas import Alarm, AlarmCloudEvent, AlarmStates, Health, Opinion, Parameter, Report, Verdict
 
 __all__ = ["alarm_event_line", "alarm_state_lines", "health_line", "report_line"]
 
@@ -48,7 +48,7 @@ def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
     """One line per raised alarm."""
     return tuple(
         f"{_clock(alarm.raised_ns or alarm.since_ns)}  {states.machine}  {alarm.severity.upper()} ({alarm.state}): "
-        f"{alarm.text}  {_change(alarm.name, alarm.relative_change, alarm.standard_error)}"
+        f"{alarm.text}{_known(alarm)}"
         for alarm in states.alarms
         if alarm.raised
     )
@@ -66,6 +66,13 @@ def health_line(health: Health) -> str:
     at = "--:--:--" if health.window_end_ns is None else _clock(health.window_end_ns)
     why = f": {health.reason}" if health.reason else ""
     return f"{at}  {health.machine}  state is {health.state}{why}"
+
+
+def _known(alarm: Alarm) -> str:
+    """The change of a parameter; of any other alarm, what has been noted."""
+    if alarm.relative_change is not None:
+        return f"  {_change(alarm.name, alarm.relative_change, alarm.standard_error)}"
+    return f": {alarm.note}" if alarm.note else ""
 
 
 def _verdict(verdict: Verdict) -> str:

@@ -35,8 +35,8 @@ def configure_logging(settings: LogSettings) -> None:
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(settings.level.upper())
-    # httpx and the server's own chatter are of interest only when something is wrong.
-    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx"):
+    # The chatter of libraries is of interest only when something is wrong.
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
     structlog.configure(
         processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],

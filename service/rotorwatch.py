@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from models.errors import BundleError, MachineFileError
+from models.errors import RotorwatchError
 from service.commands import access as access_commands
 from service.commands import interchange as interchange_commands
 from service.commands import plot as plot_commands
@@ -113,7 +113,7 @@ def check_config(
     for file in files:
         try:
             typer.echo(f"{file}: ok, {_checked(file)}")
-        except (MachineFileError, BundleError) as error:
+        except RotorwatchError as error:
             faulty = True
             text = str(error)
             typer.echo(text if text.startswith(str(file)) else f"{file}: {text}", err=True)
@@ -219,6 +219,7 @@ def _checked(file: Path) -> str:
     from models.commissioning.installed import install  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file, read_toml  # noqa: PLC0415
     from service.config import load_settings  # noqa: PLC0415
+    from service.store.store import Store  # noqa: PLC0415
 
     if {"site", "rotor", "sensors"} & set(read_toml(file)):
         machine = load_machine_file(file)
@@ -229,6 +230,7 @@ def _checked(file: Path) -> str:
         machine = entry.load()
         install(machine, entry.bundle)
         names.append(f"{machine.site}/{machine.name}")
+    Store(settings.history.database, settings.history.retention)  # knows which addresses it can use
     return f"settings for {', '.join(names)}"
 
 

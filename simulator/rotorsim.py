@@ -92,7 +92,7 @@ def publish(
         typer.Option(
             "--link",
             metavar="FILE",
-            help="How to connect (TOML with a table [link]): endpoints, password, certificates. --mode replaces its "
+            help="How to connect (TOML with a table \\[link]): endpoints, password, certificates. --mode replaces its "
             "mode, --connect and --listen replace its endpoints.",
         ),
     ] = None,

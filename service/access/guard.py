@@ -36,6 +36,7 @@ from service.access.routes import PUBLIC_PATHS, declared_scopes, unguarded_route
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, TokenStore, parse_token, token_is_valid
 from service.access_settings import AccessSettings
+from service.logs import Limiter, logger
 from service.store.records import TokenRecord
 
 __all__ = ["ACCESS_PROBLEMS", "AccessError", "Guard"]
@@ -43,6 +44,7 @@ __all__ = ["ACCESS_PROBLEMS", "AccessError", "Guard"]
 ACCESS_PROBLEMS = (401, 403, 429, 503)
 """What any guarded route may answer besides its own; those that take a body also 413 and 415."""
 
+_log = logger(part="access")
 _KNOWN_TOKENS = 1_000
 _WITHOUT_DATABASE_S = 900.0
 _SEATS_RETRY_S = 5
@@ -112,6 +114,7 @@ class Guard:
         self._requests = MovingWindow(limits.requests_per_minute, clock=monotonic)
         self._failures = MovingWindow(limits.failures_per_minute, clock=monotonic)
         self._monotonic = monotonic
+        self._limiter = Limiter(monotonic)
         self._known: OrderedDict[bytes, _Known] = OrderedDict()
 
     def protect(self, app: FastAPI) -> None:
@@ -237,7 +240,13 @@ class Guard:
             # Just when the database fails, operators want to look at their machines.
             if known is not None and method in SAFE_METHODS and now_s - known.looked_up_s <= _WITHOUT_DATABASE_S:
                 return known.record
-            raise HTTPException(503, f"tokens cannot be looked up: {error}") from error
+            # Who asks is not known, and where the database is only concerns those who read the log.
+            withheld = self._limiter.admit("look-up")
+            if withheld is not None:
+                _log.error("tokens cannot be looked up", why=str(error), **({"withheld": withheld} if withheld else {}))
+            raise HTTPException(
+                503, "tokens cannot be looked up in the history: nothing was done; the log says why"
+            ) from error
         if record is not None and token_is_valid(record, presented, self._clock_ns()):
             self._known[presented.secret_hash] = _Known(record, now_s)
             self._known.move_to_end(presented.secret_hash)

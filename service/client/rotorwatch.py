@@ -374,5 +374,6 @@ def _tls(ca: Path | None, certificate: tuple[Path, Path] | None) -> ssl.SSLConte
         if certificate is not None:
             context.load_cert_chain(*certificate)
     except OSError as error:  # of which errors in certificates are a kind
-        raise ClientError(f"certificates {ca or ''} {certificate or ''}: {error}") from error
+        files = ", ".join(str(file) for file in (ca, *(certificate or ())) if file is not None)
+        raise ClientError(f"certificates {files}: cannot be used: {error}") from error
     return context

@@ -86,19 +86,19 @@ def list_(config: _ConfigOption = None) -> None:
     """
     with exit_codes():
         from rich.console import Console  # noqa: PLC0415  # keeps --help quick
-        from rich.table import Table  # noqa: PLC0415
+        from rich.table import Column, Table  # noqa: PLC0415
         from rich.text import Text  # noqa: PLC0415
 
         with _opened(config) as store:
             records = store.tokens.all()
         now_ns = time.time_ns()
-        table = Table("token", "name", "scopes", "created", "expires", "state")
+        table = Table(Column("token", no_wrap=True), "name", "scopes", "created", "expires", "state")
         for record in sorted(records, key=lambda one: one.created_ns):
             state = _state(record, now_ns)
             table.add_row(
                 record.token_id,
                 Text(record.name),
-                " ".join(record.scopes),
+                ", ".join(record.scopes),
                 _utc(record.created_ns),
                 "-" if record.expires_ns is None else _utc(record.expires_ns),
                 Text(state, style="green" if state == "valid" else "red"),
@@ -144,29 +144,21 @@ def audit(
 ) -> None:
     """Show who did what over HTTP, and who was refused; newest first, times in UTC.
 
-    An action whose outcome is not known was begun, and the monitor ended before it could write what came of it.
+    One entry a line: time, status, who, from where, what, and the reason given.
+    An action whose outcome is not known was begun, and the monitor ended
+    before it could write what came of it.
 
     [bold]Example[/bold]
 
     [cyan]rotorwatch audit --machine plant/pump-7 --limit 20[/cyan]
     """
     with exit_codes():
-        from rich.console import Console  # noqa: PLC0415  # keeps --help quick
-        from rich.table import Table  # noqa: PLC0415
-        from rich.text import Text  # noqa: PLC0415
-
         with _opened(config) as store:
             entries = list(_with_outcomes(store, machine, actor, limit))
-        table = Table("time", "who", "from", "request", "status", "action", "machine", "alarm", "reason")
+        who = max((len(entry.actor) for entry in entries), default=0)
+        origin = max((len(entry.address) for entry in entries), default=0)
         for entry in entries:
-            table.add_row(
-                _utc(entry.at_ns),
-                # Text, because what callers sent is not to be taken for markup.
-                *(Text(part or "-") for part in (entry.actor, entry.address, f"{entry.method} {entry.path}")),
-                str(entry.status) if entry.status else "not known",
-                *(Text(part or "-") for part in (entry.action, entry.machine, entry.alarm, entry.reason)),
-            )
-        Console(soft_wrap=True).print(table)
+            typer.echo(_audit_line(entry, who, origin))
 
 
 def _with_outcomes(store: "Store", machine: str | None, actor: str | None, limit: int) -> "Iterator[AuditEntry]":
@@ -190,6 +182,18 @@ def _with_outcomes(store: "Store", machine: str | None, actor: str | None, limit
         if len(page) < _PAGE:
             return
         before = page[-1].number
+
+
+def _audit_line(entry: "AuditEntry", who: int, origin: int) -> str:
+    """One entry in a line, which nothing is cut off from; `who` and `origin` are widths of columns."""
+    from service.access.audit import STARTED  # noqa: PLC0415  # keeps --help quick
+
+    status = str(entry.status) if entry.status else "not known"
+    done = " ".join(part for part in (entry.action, entry.machine, entry.alarm) if part and part != STARTED)
+    what = done or f"{entry.method} {entry.path}"  # an action says all that the path of its request does
+    why = f": {entry.reason}" if entry.reason else ""
+    columns = (_utc(entry.at_ns), f"{status:<9}", f"{entry.actor or '-':<{who}}", f"{entry.address or '-':<{origin}}")
+    return "  ".join((*columns, f"{what}{why}"))
 
 
 @contextmanager

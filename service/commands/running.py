@@ -34,7 +34,7 @@ ListenOption = Annotated[
 LinkOption = Annotated[
     Path | None,
     typer.Option(
-        "--link", metavar="FILE", help="How to connect: a file with the table [link], with passwords or certificates."
+        "--link", metavar="FILE", help="How to connect: a file with the table \\[link], with passwords or certificates."
     ),
 ]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from models.errors import MachineFileError, RotorwatchError
 from service.commands.replay import NamespaceOption, in_namespace
@@ -20,6 +20,7 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
 __all__ = ["register"]
 
 _BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
+_SILENT = ("shelved", "suppressed", "out-of-service")
 _STYLES = {
     "danger": "bold red",
     "alert": "bold yellow",
@@ -100,8 +101,10 @@ def status(
 ) -> None:
     """Table of all machines of a running monitor.
 
-    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if any is in alert, danger, outside the model
-    or without data, or if the monitor does not answer.
+    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if
+    any is in alert, danger, outside the model, without data or with a sensor
+    at fault, or if the monitor does not answer. Beneath the table stand the
+    reasons, and alarms kept from operators.
 
     [bold]Example[/bold]
 
@@ -109,21 +112,26 @@ def status(
     """
     with exit_codes():
         healths = _fetch_healths(url.rstrip("/"), token, ca)
-        table = Table("machine", "state", "window", "raised alarms", "data age", "refused", "gaps", "why")
+        columns = ("state", "window", "raised alarms", "data age", "refused", "gaps")
+        table = Table(Column("machine", overflow="fold"), *(Column(name, no_wrap=True) for name in columns))
+        remarks: list[str] = []
         for health in healths:
-            alarms = [f"{a.name} {a.severity}" for a in health.alarms if a.raised]
+            place = f"{health.site}/{health.machine}"
             age_s = health.stream.data_age_s
             table.add_row(
-                f"{health.site}/{health.machine}",
+                place,
                 f"[{_STYLES.get(health.state, 'default')}]{health.state}[/]",
                 f"{health.filled:.0%}",
-                ", ".join(alarms) or "-",
+                "\n".join(f"{alarm.name} {alarm.severity}" for alarm in health.alarms if alarm.raised) or "-",
                 "-" if age_s is None else f"{age_s:.1f} s",
                 str(sum(health.quality.refused_blocks.values())),
                 str(health.quality.gaps),
-                health.reason or "-",
             )
+            remarks += [f"{place}: {health.reason}"] if health.reason else []
+            remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
         Console(soft_wrap=True).print(table)
+        for remark in remarks:
+            typer.echo(remark)
         if any(health.state in _BAD_STATES for health in healths):
             raise typer.Exit(1)
 
@@ -179,8 +187,11 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
     from service.schemas import Health  # noqa: PLC0415  # keeps --help quick
 
     try:
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         verify = True if ca is None else ssl.create_default_context(cafile=ca)
+    except OSError as error:  # of which errors in certificates are a kind
+        raise MachineFileError(f"--ca {ca}: cannot be used as an authority's certificate ({error.strerror})") from error
+    try:
+        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
         with httpx.Client(base_url=url, timeout=5.0, trust_env=False, headers=headers, verify=verify) as client:
             listed = client.get("/api/v1/machines").raise_for_status().json()["machines"]
             places = [f"/api/v1/machines/{entry['site']}/{entry['machine']}/health" for entry in listed]
@@ -192,6 +203,11 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
             ) from error
         raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
+        if "CERTIFICATE_VERIFY_FAILED" in str(error):
+            raise RotorwatchError(
+                f"{url}: its certificate is not trusted under this name: {error}; --ca takes the authority (PEM) of a "
+                "certificate of your own, --url the name in it"
+            ) from error
         raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
     except (ValidationError, ValueError, KeyError, TypeError) as error:
         raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor") from error

@@ -201,7 +201,9 @@ def test_without_the_database_those_who_were_there_may_look_on(monitor: Guarded)
         assert client.get("/health").status_code == 200
         monitor.store.close()
         assert client.get("/health").status_code == 200
-        assert "looked up" in problem(client.delete("/machine"), 503)
+        refused = problem(client.delete("/machine"), 503)
+        assert "looked up" in refused
+        assert "sqlite" not in refused
         problem(late.get("/health"), 503)
         monitor.clock.now_s += 901.0
         problem(client.get("/health"), 503)

@@ -152,6 +152,18 @@ def test_watch_and_status_without_a_monitor_say_so() -> None:
     assert f"{url}: the monitor's HTTP API does not answer" in found.stderr
 
 
+def test_status_names_a_certificate_it_cannot_use(tmp_path: Path) -> None:
+    url = f"https://{endpoint().removeprefix('tcp/')}"
+    found = run("status", "--url", url, "--ca", str(tmp_path / "ca.pem"))
+    assert found.returncode == 2
+    assert f"--ca {tmp_path / 'ca.pem'}: cannot be used" in found.stderr
+
+
+def test_help_shows_the_names_of_tables() -> None:
+    for command in ("run", "watch", "router"):
+        assert "[link]" in run(command, "--help").stdout
+
+
 def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
     address = endpoint()
     file = machine_file(
@@ -252,6 +264,10 @@ def test_lines_for_terminals() -> None:
     states = AlarmStates.model_validate(example(AlarmStates))
     assert alarm_state_lines(states) == (
         "00:03:25  lab  ALERT (unacknowledged): bearing stiffness, horizontal  k_by −24.7±1.4 %",
+    )
+    lost = {"name": "stream-lost", "text": "stream lost", "relative_change": None, "note": "no usable data for 5 s"}
+    assert alarm_state_lines(states.model_copy(update={"alarms": (states.alarms[0].model_copy(update=lost),)})) == (
+        "00:03:25  lab  ALERT (unacknowledged): stream lost: no usable data for 5 s",
     )
     health = Health.model_validate(example(Health))
     assert health_line(health) == "00:03:25  lab  state is alert"

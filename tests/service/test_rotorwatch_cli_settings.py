@@ -104,6 +104,15 @@ def test_two_entries_for_one_machine_are_refused(tmp_path: Path) -> None:
     assert "machine.toml and lab both describe rotorwatch/demo/lab" in str(caught.value)
 
 
+def test_check_config_knows_which_history_can_be_used(tmp_path: Path) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text('[history]\nurl = "mysql://plant:secret@db/rotorwatch"\n', encoding="utf-8")
+    found = run("check-config", str(path))
+    assert found.returncode == 2
+    assert f"{path}: history: the URL begins with mysql; expected sqlite" in found.stderr
+    assert "secret" not in found.stderr
+
+
 def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     good = written(tmp_path, GOOD)
     wrong_machine = tmp_path / "wrong.toml"
