@@ -278,8 +278,12 @@ def _beside(folder: Path, url: str) -> str:
 
 def _blame(place: Path, error: ValidationError) -> str:
     """Fault by fault, say whether the file or an environment variable is to be changed."""
-    lines = validation_text(place, error).splitlines()
-    faults = error.errors()
+    text, faults = validation_text(place, error), error.errors()
+    for fault in faults:
+        found = f" (found {fault['input']!r})"
+        if "://" in found:  # an address, which may hold a password
+            text = text.replace(found, "")
+    lines = text.splitlines()
     if len(lines) != len(faults):  # a message of several lines: leave the text as it is
         return "\n".join(lines)
     for number, fault in enumerate(faults):

@@ -180,7 +180,7 @@ def test_commands_in_the_page_work(served: tuple[str, str], tmp_path: Path) -> N
         assert "http://127.0.0.1:8080" in command
         done = subprocess.run(
             ["/bin/sh", "-c", command.replace("http://127.0.0.1:8080", url)],
-            env={"TOKEN": text, "PATH": "/usr/local/bin:/usr/bin:/bin"},
+            env={"ROTORWATCH_TOKEN": text, "PATH": "/usr/local/bin:/usr/bin:/bin"},
             cwd=tmp_path,
             capture_output=True,
             text=True,

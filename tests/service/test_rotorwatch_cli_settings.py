@@ -104,6 +104,23 @@ def test_two_entries_for_one_machine_are_refused(tmp_path: Path) -> None:
     assert "machine.toml and lab both describe rotorwatch/demo/lab" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[history]\nurll = "postgresql://plant:bolt@db/rotorwatch"\n',
+        '[history]\nurl = ["postgresql://plant:bolt@db/rotorwatch"]\n',
+        'history = "postgresql://plant:bolt@db/rotorwatch"\n',
+        '[[webhooks]]\nname = "pager"\nulr = "https://pager.example/?key=bolt"\n',
+    ],
+)
+def test_a_mistake_shows_no_password(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "plant.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(MachineFileError, match=r"plant.toml: (history|webhooks)") as caught:
+        load_settings(path)
+    assert "bolt" not in str(caught.value)
+
+
 def test_check_config_knows_which_history_can_be_used(tmp_path: Path) -> None:
     path = tmp_path / "plant.toml"
     path.write_text('[history]\nurl = "mysql://plant:secret@db/rotorwatch"\n', encoding="utf-8")
