@@ -18,7 +18,7 @@ def report_line(report: Report) -> str:
     --------
     >>> from service.schemas import Report, example
     >>> report_line(Report.model_validate(example(Report)))
-    '00:03:25  lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
+    '00:03:25  demo/lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
     """
     if report.parameters:
         verdict = report.verdict
@@ -29,7 +29,7 @@ def report_line(report: Report) -> str:
         tail = "  |  ".join(parts)
     else:
         tail = report.reason or f"window {report.filled:.0%} full"
-    return f"{_clock(report.end_ns)}  {report.machine}  {report.state:<13}  {tail}"
+    return f"{_clock(report.end_ns)}  {report.site}/{report.machine}  {report.state:<13}  {tail}"
 
 
 def alarm_event_line(event: AlarmCloudEvent) -> str:
@@ -39,15 +39,19 @@ def alarm_event_line(event: AlarmCloudEvent) -> str:
     --------
     >>> from service.schemas import AlarmCloudEvent, example
     >>> alarm_event_line(AlarmCloudEvent.model_validate(example(AlarmCloudEvent)))
-    '00:03:25  lab  ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%'
+    '00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%'
     """
-    return f"{_clock(event.data.time_ns)}  {event.data.machine}  {event.data.text}"
+    data = event.data
+    # Where the text has no name, as that of some that cleared, it must be seen which alarm it is about.
+    name = "" if f"({data.name})" in data.text else f" ({data.name})"
+    return f"{_clock(data.time_ns)}  {data.site}/{data.machine}  {data.text}{name}"
 
 
 def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
     """One line per raised alarm."""
+    place = f"{states.site}/{states.machine}"
     return tuple(
-        f"{_clock(alarm.raised_ns or alarm.since_ns)}  {states.machine}  {alarm.severity.upper()} ({alarm.state}): "
+        f"{_clock(alarm.raised_ns or alarm.since_ns)}  {place}  {alarm.severity.upper()} ({alarm.state}): "
         f"{alarm.text}{_known(alarm)}"
         for alarm in states.alarms
         if alarm.raised
@@ -61,11 +65,11 @@ def health_line(health: Health) -> str:
     --------
     >>> from service.schemas import Health, example
     >>> health_line(Health.model_validate(example(Health)))
-    '00:03:25  lab  state is alert'
+    '00:03:25  demo/lab  state is alert'
     """
     at = "--:--:--" if health.window_end_ns is None else _clock(health.window_end_ns)
     why = f": {health.reason}" if health.reason else ""
-    return f"{at}  {health.machine}  state is {health.state}{why}"
+    return f"{at}  {health.site}/{health.machine}  state is {health.state}{why}"
 
 
 def _known(alarm: Alarm) -> str:

@@ -183,8 +183,8 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
         send(address, scenario_blocks(77.0, parse_fault("k_bz=-0.3@0")), worker.machine)
         text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by -")
         until(lambda: "org.rotorwatch.alarm.raised" in lines.output(), "alarm event as JSON")
-        until(lambda: "00:01:12  lab  alert" in text.output(), "line of the last window")
-        assert "00:01:02  lab  healthy        k_by " in text.output()
+        until(lambda: "00:01:12  demo/lab  alert" in text.output(), "line of the last window")
+        assert "00:01:02  demo/lab  healthy        k_by " in text.output()
 
         late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
         with late as joined:
@@ -241,7 +241,7 @@ def test_router_runs_until_it_is_told_to_stop(tmp_path: Path) -> None:
 
 def test_lines_for_terminals() -> None:
     report = Report.model_validate(example(Report))
-    start, tail = "00:03:25  lab  alert          ", "  |  changed: k_by  |  relation agrees"
+    start, tail = "00:03:25  demo/lab  alert          ", "  |  changed: k_by  |  relation agrees"
     assert report_line(report) == f"{start}k_by −24.7±1.4 %{tail}"
     assert report.verdict is not None
     settled = report.model_copy(update={"verdict": report.verdict.model_copy(update={"settled": True})})
@@ -257,19 +257,23 @@ def test_lines_for_terminals() -> None:
     shown = report_line(report.model_copy(update={"verdict": calm, "opinions": (apart,)}))
     assert shown.endswith("no change, outside the model  |  relation disagrees on k_by")
     early = report.model_copy(update={"parameters": (), "filled": 0.25, "state": "warming"})
-    assert report_line(early) == "00:03:25  lab  warming        window 25% full"
+    assert report_line(early) == "00:03:25  demo/lab  warming        window 25% full"
     assert report_line(early.model_copy(update={"reason": "too fast"})).endswith("too fast")
     event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
-    assert alarm_event_line(event).startswith("00:03:25  lab  ALERT: bearing stiffness, horizontal (k_by)")
+    assert alarm_event_line(event).startswith("00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by)")
+    back = event.data.model_copy(update={"name": "stream-lost", "text": "cleared: data come again"})
+    assert alarm_event_line(event.model_copy(update={"data": back})) == (
+        "00:03:25  demo/lab  cleared: data come again (stream-lost)"
+    )
     states = AlarmStates.model_validate(example(AlarmStates))
     assert alarm_state_lines(states) == (
-        "00:03:25  lab  ALERT (unacknowledged): bearing stiffness, horizontal  k_by −24.7±1.4 %",
+        "00:03:25  demo/lab  ALERT (unacknowledged): bearing stiffness, horizontal  k_by −24.7±1.4 %",
     )
     lost = {"name": "stream-lost", "text": "stream lost", "relative_change": None, "note": "no usable data for 5 s"}
     assert alarm_state_lines(states.model_copy(update={"alarms": (states.alarms[0].model_copy(update=lost),)})) == (
-        "00:03:25  lab  ALERT (unacknowledged): stream lost: no usable data for 5 s",
+        "00:03:25  demo/lab  ALERT (unacknowledged): stream lost: no usable data for 5 s",
     )
     health = Health.model_validate(example(Health))
-    assert health_line(health) == "00:03:25  lab  state is alert"
+    assert health_line(health) == "00:03:25  demo/lab  state is alert"
     unseen = health.model_copy(update={"window_end_ns": None, "state": "no-data", "reason": "silence"})
-    assert health_line(unseen) == "--:--:--  lab  state is no-data: silence"
+    assert health_line(unseen) == "--:--:--  demo/lab  state is no-data: silence"
