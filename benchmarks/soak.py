@@ -20,7 +20,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import islice, zip_longest
 from pathlib import Path
 
 import httpx
@@ -36,6 +36,7 @@ from models.signals.link import LinkSettings
 from service.alarm_schemas import AlarmCloudEvent
 from service.client.alarm_log import follow_alarms
 from service.monitor import MachineMonitor
+from service.store.machine import MachineStore
 from service.store.retention import Retention
 from service.store.store import Store
 from simulator.publisher import PublishSettings, publish
@@ -94,11 +95,14 @@ def lived(machine: Machine, seed: int, hours: float) -> Iterator[SampleBlock]:
 
 
 def offline(file: Path, seed: int, hours: float) -> None:
-    """Print the log of alarms, one line an event."""
+    """Print the log of alarms, one line an event, and the ends of all windows."""
     machine = load_machine(file)
     monitor = MachineMonitor(install(machine, None))
     for block in lived(machine, seed, hours):
-        for event in monitor.step(block).events:
+        report = monitor.step(block)
+        for window in report.windows:
+            print(window.end_ns, flush=True)
+        for event in report.events:
             alarm = event.alarm
             shown = (event.kind, alarm.name, event.time_ns, alarm.occurrence, alarm.severity, alarm.state, alarm.change)
             print(json.dumps(shown), flush=True)
@@ -129,6 +133,7 @@ class Plant:
     file: Path
     endpoint: str
     rng: np.random.Generator
+    kills_wanted: float
     process: subprocess.Popen[bytes] | None = None
     url: str = ""
     reports: int = 0
@@ -210,7 +215,7 @@ def disturbed(plant: Plant, machine: Machine, seed: int, hours: float) -> Iterat
     rng, newest, sent, since = plant.rng, 0.0, 0, 0
     stream = lived(machine, seed, hours)
     recent: list[SampleBlock] = []
-    kills_per_block = 40 / (24 * 3600 / _BLOCK_S)
+    kills_per_block = plant.kills_wanted / (hours * 2 / 3 * 3600 / _BLOCK_S)
     for first in stream:
         pair = [first]
         if rng.random() < 0.01:
@@ -289,6 +294,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--hours", type=float, default=24.0)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--kills", type=float, default=40.0, help="of the monitor, about, in the first two thirds")
+    parser.add_argument("--keep", type=Path, help="empty folder for everything that is written; thrown away without it")
     parser.add_argument("--offline", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--follow", help=argparse.SUPPRESS)
     parser.add_argument("--into", type=Path, help=argparse.SUPPRESS)
@@ -301,22 +308,28 @@ def main() -> None:
     if given.follow is not None:
         follow(given.follow, given.into)
         return
+    if given.keep is not None:
+        given.keep.mkdir(parents=True, exist_ok=True)
+        sys.exit(soak(given.keep.absolute(), given.seed, given.hours, given.kills))
     with tempfile.TemporaryDirectory(prefix="rotorwatch-soak-") as place:
-        sys.exit(soak(Path(place), given.seed, given.hours))
+        sys.exit(soak(Path(place), given.seed, given.hours, given.kills))
 
 
-def soak(folder: Path, seed: int, hours: float) -> int:
+def soak(folder: Path, seed: int, hours: float, kills_wanted: float) -> int:
     """Run both and compare."""
     file, begin_s = machine_file(folder), time.monotonic()
     machine = load_machine(file)
     arguments = ["--offline", str(file), "--hours", str(hours), "--seed", str(seed)]
     with (folder / "offline.jsonl").open("wb") as sink:
         undisturbed = subprocess.Popen([sys.executable, __file__, *arguments], stdout=sink)
-    plant = Plant(folder, file, free_endpoint(), np.random.default_rng([seed, 3]))
+    plant = Plant(folder, file, free_endpoint(), np.random.default_rng([seed, 3]), kills_wanted)
     try:
         live(plant, machine, seed, hours)
         undisturbed.wait()
-        expected = [json.loads(line) for line in (folder / "offline.jsonl").read_text(encoding="utf-8").splitlines()]
+        lines = [json.loads(line) for line in (folder / "offline.jsonl").read_text(encoding="utf-8").splitlines()]
+        expected = [line for line in lines if isinstance(line, list)]
+        windows = [line for line in lines if isinstance(line, int)]
+        _last_window(plant, windows[-1])
         followed = _followed_to_the_end(plant, len(expected))
     finally:
         for process in (plant.follower, plant.process, undisturbed):
@@ -330,10 +343,14 @@ def soak(folder: Path, seed: int, hours: float) -> int:
         texts: list[str] = []
         while page := history.events(after=len(texts) - 1, limit=_PAGE):
             texts += [one.text for one in page]
+        evaluated = _windows(history)
     finally:
         store.close()
     events = [AlarmCloudEvent.model_validate_json(text) for text in texts]
     faults = differences(expected, events)
+    other = next((at for at, pair in enumerate(zip_longest(windows, evaluated)) if pair[0] != pair[1]), None)
+    if other is not None:
+        faults.append(f"window {other} of {len(windows)} ({len(evaluated)} live): another one than offline")
     if followed != texts[: len(followed)] or len(followed) < len(expected):
         faults.append(f"followers wrote {len(followed)} events down, the log has {len(texts)}; they must be the same")
     data_s = hours * 3600
@@ -341,6 +358,7 @@ def soak(folder: Path, seed: int, hours: float) -> int:
     print(f"{hours:g} h of data in {elapsed_s / 60:.1f} min ({data_s / elapsed_s:.0f} times real time), seed {seed}")
     print(f"monitor killed {plant.kills} times, followers {plant.follower_kills} times")
     kinds = {kind: sum(one.data.kind == kind for one in events) for kind in ("raised", "escalated", "cleared")}
+    print(f"windows: {len(windows)} offline, {len(evaluated)} live")
     print(f"events: {len(expected)} offline, {len(events)} in the history ({kinds}), {len(followed)} followed")
     calm = [(at, mb) for at, mb in plant.memory_mb if at > hours * 0.7]
     print(
@@ -351,6 +369,26 @@ def soak(folder: Path, seed: int, hours: float) -> int:
         print(f"slope {slope:+.2f} MB/h of data")
     print("\n".join(faults) if faults else "all logs are the same")
     return 1 if faults else 0
+
+
+def _windows(history: MachineStore) -> list[int]:
+    """Ends of all windows that were evaluated live, in order."""
+    ends: list[int] = []
+    before: int | None = None
+    while page := history.reports(before=before, limit=_PAGE):
+        ends += [report.end_ns for _, report in page]
+        before = page[-1][0]
+    return ends[::-1]
+
+
+def _last_window(plant: Plant, end_ns: int) -> None:
+    """Wait until the monitor has evaluated the last window; what it has not, the comparison shows."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        health = httpx.get(f"{plant.url}/api/v1/machines/{_PLACE}/health", trust_env=False).json()
+        if (health["window_end_ns"] or 0) >= end_ns:
+            return
+        time.sleep(0.1)
 
 
 def _followed_to_the_end(plant: Plant, expected: int) -> list[str]:
