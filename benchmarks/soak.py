@@ -360,6 +360,13 @@ def soak(folder: Path, seed: int, hours: float, kills_wanted: float) -> int:
     kinds = {kind: sum(one.data.kind == kind for one in events) for kind in ("raised", "escalated", "cleared")}
     print(f"windows: {len(windows)} offline, {len(evaluated)} live")
     print(f"events: {len(expected)} offline, {len(events)} in the history ({kinds}), {len(followed)} followed")
+    _tell_memory(plant, hours)
+    print("\n".join(faults) if faults else "all logs are the same")
+    return 1 if faults else 0
+
+
+def _tell_memory(plant: Plant, hours: float) -> None:
+    """Print the monitor's memory over the time in which it was left alone, and its slope."""
     calm = [(at, mb) for at, mb in plant.memory_mb if at > hours * 0.7]
     print(
         "memory of the monitor, MB, over the last third: " + "  ".join(f"{at:.1f} h {mb:.0f}" for at, mb in calm[::4])
@@ -367,8 +374,6 @@ def soak(folder: Path, seed: int, hours: float, kills_wanted: float) -> int:
     if len(calm) > 1:
         slope = float(np.polyfit([at for at, _ in calm], [mb for _, mb in calm], 1)[0])
         print(f"slope {slope:+.2f} MB/h of data")
-    print("\n".join(faults) if faults else "all logs are the same")
-    return 1 if faults else 0
 
 
 def _windows(history: MachineStore) -> list[int]:
