@@ -39,6 +39,7 @@ from service.monitor import MachineMonitor
 from service.store.machine import MachineStore
 from service.store.retention import Retention
 from service.store.store import Store
+from service.transport import LinkError
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
@@ -122,7 +123,11 @@ def follow(endpoint: str, path: Path) -> None:
             file.flush()
             os.fsync(file.fileno())
 
-        follow_alarms(LinkSettings(mode="client", connect=(endpoint,)), [_PLACE], {_PLACE: last}, keep)
+        while True:
+            try:
+                follow_alarms(LinkSettings(mode="client", connect=(endpoint,)), [_PLACE], {_PLACE: last}, keep)
+            except LinkError:  # it joined while the monitor was away
+                continue
 
 
 @dataclass

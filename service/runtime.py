@@ -151,7 +151,7 @@ class Runtime:
             session_open=self._link is not None and self._link.is_open,
             machines=machines,
             history_open=self._history_open,
-            history_trouble=self.store.trouble,
+            history_trouble=self.store.trouble or self.store.unreachable(),
             failing_webhooks=self.webhooks.failing(),
         )
 

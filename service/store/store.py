@@ -7,11 +7,15 @@
                                   Reduction: drops and reduces what is old
 """
 
+import asyncio
 import time
 from collections.abc import Callable
 
+from sqlalchemy import text
+
 from service.store.audit import AuditLog
 from service.store.database import Database
+from service.store.errors import StoreError
 from service.store.machine import MachineStore
 from service.store.records import Dropped
 from service.store.reduction import Reduction
@@ -21,6 +25,8 @@ from service.store.webhooks import WebhookCursors
 from service.store.writer import Writer
 
 __all__ = ["Store"]
+
+_PROBE_S = 3.0
 
 
 class Store:
@@ -90,6 +96,19 @@ class Store:
     def trouble(self) -> str:
         """Why the latest write failed; empty if it did not."""
         return self._writer.trouble
+
+    def unreachable(self) -> str:
+        """Why the database takes no transaction now; empty if it does, also while nothing has to be written."""
+
+        async def ask() -> None:
+            async with asyncio.timeout(_PROBE_S), self._database.writing() as connection:
+                await connection.execute(text("SELECT 1"))
+
+        try:
+            self._database.call(ask)
+        except StoreError as error:
+            return str(error)
+        return ""
 
     def open(self) -> None:
         """Connect, and bring the tables up to date; a store is opened once.

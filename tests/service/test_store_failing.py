@@ -214,6 +214,17 @@ def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServ
         assert len(lab.readings(quantity="misfit", name="z")) == 20
 
 
+def test_that_the_database_is_away_shows_while_nothing_is_written(parts: Parts) -> None:
+    url, fail, mend = parts
+    with opened(url) as store:
+        assert store.unreachable() == ""
+        fail()
+        assert store.unreachable() != ""
+        assert store.trouble == ""
+        mend()
+        until(lambda: store.unreachable() == "", "answer of the database")
+
+
 def test_locks_are_taken_again_after_the_database_was_away(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url) as store:
