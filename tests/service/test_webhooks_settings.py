@@ -107,6 +107,7 @@ def with_secret(folder: Path, text: str, mode: int = 0o600) -> WebhookSettings:
 @pytest.mark.parametrize(
     "text",
     ["", "\n", "whsec_", "whsec_c2hvcnQ=", "whsec_" + 4 * "!" * 12, new_secret().removeprefix("whsec_"), "tooth"],
+    ids=["empty", "a line end", "nothing after the mark", "too short", "no base64", "no mark", "a word"],
 )
 def test_what_is_no_secret(tmp_path: Path, text: str) -> None:
     with pytest.raises(
