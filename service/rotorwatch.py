@@ -93,6 +93,8 @@ def run(
                 if ends:
                     typer.echo(f"Zenoh {what} {', '.join(ends)}")
             typer.echo(f"HTTP API {service.http_url}")
+            if not settings.access.open_on_loopback and not service.store.tokens.all():
+                typer.echo("nobody has a token for it yet: rotorwatch token create NAME --scope read --scope operate")
             sys.stdout.flush()
             stop.wait()
 
