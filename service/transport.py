@@ -35,7 +35,9 @@ __all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap",
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
-_CACHED_BLOCKS = 300
+_HISTORY_BLOCKS = 3000
+"""Most blocks that are asked for of what a publisher keeps. Zenoh begins to hand blocks on when as many are there, answers
+still under way: it must be more than publishers keep (300), or a block that comes after a live one is dropped."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 2.0
 _QUICK_CONNECT_S = 3.0
@@ -448,7 +450,7 @@ def _stream_subscriber(
         session,
         key,
         zenoh.handlers.Callback(callback, indirect=not wait),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_HISTORY_BLOCKS),
         recovery=None if wait else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
         subscriber_detection=True,
     )
