@@ -36,8 +36,9 @@ _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
 _HISTORY_BLOCKS = 3000
-"""Most blocks that are asked for of what a publisher keeps. Zenoh begins to hand blocks on as soon as so many are there,
-answers still under way: it must be more than publishers keep (300), or one that comes after a live block is dropped."""
+"""Most blocks that are asked for of what a publisher keeps. Zenoh begins to hand blocks on as soon as so many are
+there, answers still under way: it must be more than publishers keep (300), or one that comes after a live block is
+dropped."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 2.0
 _QUICK_CONNECT_S = 3.0
