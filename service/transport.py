@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Protocol, TypeVar
 
 import zenoh
@@ -35,15 +36,13 @@ __all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap",
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
-_HISTORY_BLOCKS = 3000
-"""Most blocks that are asked for of what a publisher keeps. Zenoh begins to hand blocks on as soon as so many are
-there, answers still under way: it must be more than publishers keep (300), or one that comes after a live block is
-dropped."""
+_CACHED_BLOCKS = 300
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 2.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
 _STRAGGLERS_S = 2.0
+_NEVER = timedelta(days=365)
 
 _T = TypeVar("_T")
 _log = logger(part="transport")
@@ -168,9 +167,8 @@ class MachineLink:
     callbacks : MachineCallbacks
         Where messages go.
     wait_when_full : bool
-        `on_block` may wait, which slows the publisher down. It then runs on the network's own thread, and lost messages
-        are not fetched again: nothing is lost on a link that waits, and a heartbeat that overtakes waiting blocks would
-        make Zenoh skip them.
+        `on_block` may wait, which slows the publisher down. It then runs on the network's own thread, and heartbeats of
+        the publisher are not listened to: one that overtakes waiting blocks would make Zenoh skip them.
     """
 
     def __init__(self, link: Link, keys: MachineKeys, callbacks: MachineCallbacks, *, wait_when_full: bool) -> None:
@@ -445,14 +443,20 @@ def _stream_subscriber(
 ) -> zenoh.ext.AdvancedSubscriber[None]:
     """Subscribe to sample blocks: those of a publisher's cache first, those lost on the way fetched again.
 
-    With `wait` the callback may hold up the network's own thread, and nothing is fetched again.
+    With `wait` the callback may hold up the network's own thread, and no heartbeat is listened to. But what is missing
+    is fetched there as well: where blocks of the cache and new ones meet, a new one may overtake.
     """
+    # The period is of no use but to have missing blocks fetched at all, without heartbeats.
+    fetched = zenoh.ext.RecoveryConfig(
+        periodic_queries=_NEVER if wait else None,  # type: ignore[arg-type]  # the stub says seconds
+        heartbeat=None if wait else True,
+    )
     return zenoh.ext.declare_advanced_subscriber(
         session,
         key,
         zenoh.handlers.Callback(callback, indirect=not wait),
-        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_HISTORY_BLOCKS),
-        recovery=None if wait else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
+        recovery=fetched,
         subscriber_detection=True,
     )
 
