@@ -67,7 +67,7 @@ def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
         for name in ("c_by", "c_bz", "e"):  # where they are read at all
             assert abs(by_name[name]["z"] or 0.0) < 3.5, name
     (alarm,) = alarms(folder, "changed")
-    assert (alarm["parameter"], alarm["kind"]) == ("k_by", "raised")
+    assert (alarm["name"], alarm["kind"]) == ("k_by", "raised")
     assert alarm["text"] in PAGE
 
 
