@@ -7,7 +7,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from models.alarm_names import of_the_machine
 from service.http.schemas import ReportList
 from service.schemas import Health
 from tests.service.live import Program, endpoint, program, until
@@ -53,14 +52,17 @@ def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, 
             gap = reaches(watched, lambda health: health.quality.gaps == 1, "gap")
             assert "publisher restarted" in gap.quality.last_gap or "clock stepped" in gap.quality.last_gap
             assert gap.stream.publisher_alive
-            until(lambda: newest_full_window(watched) > start_ns(start) + 130e9, "a minute of full windows", 60.0)
-        after = watched.health()
+            # Windows from before a clock was set back are later than those that are waited for.
+            until(
+                lambda: 130e9 < newest_full_window(watched) - start_ns(start) < 3600e9, "a minute of full windows", 60.0
+            )
+            after = watched.health()
         assert after.quality.gaps == 1
         events = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/alarms/events", trust_env=False).json()["events"]
         # What happened to the stream is told; nothing is said of the machine.
         assert {event["data"]["name"] for event in events} <= {"stream-lost", "data-gap", "data-clock"}
         assert {"data-gap", "data-clock"} & {event["data"]["name"] for event in events}
-        assert not any(alarm.raised for alarm in after.alarms if of_the_machine(alarm.name))
+        assert not any(alarm.raised for alarm in after.alarms)
         assert watched.process.poll() is None
 
 
