@@ -6,8 +6,9 @@
     later than expected, or the publisher restarted ........ accept, gap reported
     anything else .......................................... refuse, with a reason and a sentence
 
-Time comes from the blocks alone. A clock that was set (back, or far ahead) is believed after a number of consecutive
-blocks that agree with each other; until then its blocks are refused and counted.
+Time comes from the blocks alone. Blocks of another time (earlier, or far ahead) are believed after a number of
+consecutive ones that agree with each other; until then they are refused and counted. If they are of a new run, the
+publisher was started anew; if not, its clock was set.
 
 A repetition changes nothing but the count of refused blocks, whenever it comes: the gate remembers the courses of the
 stream, also those of earlier runs and from before a clock was set, and those it did not believe.
@@ -65,13 +66,16 @@ class Verdict:
     gap_s : float
         Seconds of data missing before an accepted block (0 = contiguous).
     clock_step_s : float
-        Seconds by which the data's clock was set before this block, either way.
+        Seconds by which the data's time is another one from this block on, either way.
+    new_run : bool
+        Whether that is because the publisher was started anew, and not because its clock was set.
     """
 
     reason: Reason | None = None
     text: str = ""
     gap_s: float = 0.0
     clock_step_s: float = 0.0
+    new_run: bool = False
 
     @property
     def accepted(self) -> bool:
@@ -311,11 +315,14 @@ class Gate:
             return self._refuse(reason, text)
         previous = self._expected
         step_s = 0.0 if previous is None else (block.start_ns - previous.start_ns) / 1e9
+        new_run = candidate.run not in {course.run for course in self.courses}
         self._candidate = None
         self._go_on(candidate)
-        return Verdict(
-            text=f"{self._name}: the stream's clock stepped by {step_s:.6g} s; following it", clock_step_s=step_s
-        )
+        if new_run:
+            text = f"the publisher restarted, {abs(step_s):.6g} s {'earlier' if step_s < 0 else 'later'} in data time"
+        else:
+            text = f"the stream's clock stepped by {step_s:.6g} s; following it"
+        return Verdict(text=f"{self._name}: {text}", clock_step_s=step_s, new_run=new_run)
 
     def _follow(self, block: SampleBlock) -> None:
         expected = self._expected

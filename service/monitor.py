@@ -290,7 +290,7 @@ class MachineMonitor:
             late_s = (block.start_ns - self._end_ns) / 1e9
             if abs(late_s) > ingest.max_jump_s:
                 text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
-                verdict = Verdict(text=text, clock_step_s=late_s)
+                verdict = Verdict(text=text, clock_step_s=late_s, new_run=block.sequence == 0)
             elif late_s > ingest.time_tolerance_s:
                 text = f"{name}: {late_s:.6g} s of data are missing over the restart"
                 verdict = Verdict(text=text, gap_s=late_s)
@@ -324,7 +324,7 @@ class MachineMonitor:
         if verdict.gap_s > 0 and verdict.gap_s >= settings.alarms.gap_s:
             missing = Evidence(before_ns, start_ns)
             alarms.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
-        if verdict.clock_step_s:
+        if verdict.clock_step_s and not verdict.new_run:
             alarms.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
         alarms.suppress(None, start_ns)
 

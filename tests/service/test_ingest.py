@@ -95,15 +95,33 @@ def test_a_restarted_publisher_is_followed_forward_in_time() -> None:
     assert "restarted" in later.text
 
 
+def far(shift_s: int, run: int, count: int = 12) -> list[SampleBlock]:
+    """Blocks that go on elsewhere in time, from sequence 0 in a run of their own, else as if nothing had happened."""
+    return [
+        block(n, sequence=n if run == 1 else n - 1, run=run, shift_ns=shift_s * 10**9) for n in range(1, count + 1)
+    ]
+
+
+@pytest.mark.parametrize("run", [1, 2], ids=["same run", "new run"])
 @pytest.mark.parametrize(("shift_s", "reason"), [(-5000, Reason.PAST), (5000, Reason.FUTURE)])
-def test_a_stepped_clock_is_believed_after_ten_blocks_that_agree(shift_s: int, reason: Reason) -> None:
-    stepped = [block(n, sequence=n - 1, run=2, shift_ns=shift_s * 10**9) for n in range(1, 13)]
-    verdicts = judge(block(0), *stepped)[1:]
+def test_another_time_is_believed_after_ten_blocks_that_agree(shift_s: int, reason: Reason, run: int) -> None:
+    """Within a run the clock was set; a run that begins elsewhere is a publisher that was started anew."""
+    verdicts = judge(block(0), *far(shift_s, run))[1:]
     assert [verdict.reason for verdict in verdicts] == [reason] * 9 + [None] * 3
-    assert "clock stepped" in verdicts[9].text
+    assert ("publisher restarted" in verdicts[9].text) is (run == 2)
+    assert verdicts[9].new_run is (run == 2)
     assert verdicts[9].clock_step_s == pytest.approx(shift_s + 0.9)
-    assert verdicts[9].gap_s == 0.0  # nothing is missing: the clock was set
+    assert verdicts[9].gap_s == 0.0  # nothing is missing: the time is another one
+    assert not verdicts[9].continuous
     assert verdicts[10].continuous
+
+
+def test_a_run_that_was_there_before_is_no_new_one() -> None:
+    """Two publishers that take turns on one key are told by their clocks."""
+    verdicts = judge(block(0), *far(-5000, 2), *(block(n) for n in range(1, 12)))
+    back = [verdict for verdict in verdicts[13:] if verdict.accepted]
+    assert not back[0].new_run
+    assert back[0].clock_step_s > 0
 
 
 def test_one_wild_time_among_good_blocks_costs_one_block() -> None:

@@ -109,6 +109,41 @@ def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
     assert set(states[refilled:]) == {HealthState.HEALTHY}
 
 
+@pytest.mark.parametrize("step_s", [-40, 40_000], ids=["earlier", "far later"])
+@pytest.mark.parametrize(("run", "told"), [(1, ["data-clock"]), (2, [])], ids=["clock set", "publisher started anew"])
+def test_a_publisher_started_anew_is_no_clock_that_was_set(step_s: int, run: int, told: list[str]) -> None:
+    """Whatever its time: a restart is stated as one, and the window fills anew."""
+    everything = stream("healthy", 150.0)
+    target = monitor()
+    feed(target, everything[:650])
+    later = [
+        replace(one, start_ns=one.start_ns + step_s * 10**9, run=run, sequence=number if run == 2 else one.sequence)
+        for number, one in enumerate(everything[650:])
+    ]
+    windows, events = feed(target, later)
+    assert [event.alarm.name for event in events if event.kind == "raised"] == told
+    quality = target.health().quality
+    assert (quality.gaps, quality.missing_s) == (1, 0.0)
+    assert ("publisher restarted" in quality.last_gap) is (run == 2)
+    assert [one.state for one in windows[:5]] == [HealthState.WARMING] * 5
+    assert windows[-1].state is HealthState.HEALTHY
+    ends = [one.end_ns for one in windows]
+    assert ends == sorted(set(ends))
+    assert windows[-1].start_ns >= later[9].start_ns
+
+
+def test_a_publisher_started_anew_while_the_monitor_was_away() -> None:
+    """Its state does not fit, so that it knows no runs: sequence 0 is the beginning of one."""
+    everything = stream("healthy", 20.0)
+    for first, told in ((0, []), (3, ["data-clock"])):
+        target = monitor()
+        before = monitor()
+        feed(before, everything[:5])
+        target.restore_alarms(before.state().alarms, end_ns=everything[0].start_ns + 7200 * 10**9)
+        _, events = feed(target, everything[first:])
+        assert [event.alarm.name for event in events if event.kind == "raised"] == told
+
+
 def test_undecodable_bytes_are_a_refusal_like_any_other() -> None:
     target = monitor()
     (report,) = target.step_payload(b"abc", b"too short", "application/x-rotorwatch-block")

@@ -37,8 +37,12 @@ def reaches(watched: Program, condition: Callable[[Health], bool], what: str) ->
     return found[0]
 
 
-@pytest.mark.parametrize("start", ["2026-01-01T00:02:30Z", "2025-06-01T00:00:00Z"], ids=["later", "clock set back"])
-def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, start: str) -> None:
+@pytest.mark.parametrize(
+    ("start", "told"),
+    [("2026-01-01T00:02:30Z", {"stream-lost", "data-gap"}), ("2025-06-01T00:00:00Z", set())],
+    ids=["later", "earlier"],
+)
+def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, start: str, told: set[str]) -> None:
     """Healthy before, healthy after, a gap between: reported as a gap, no alarm on the machine, windows full again."""
     address = endpoint()
     with program(tmp_path, *monitor(address)) as watched:
@@ -50,9 +54,9 @@ def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, 
         assert before.quality.gaps == 0
         with program(tmp_path, *simulator(address, start, "--run", "2", "--seed", "7700021")):
             gap = reaches(watched, lambda health: health.quality.gaps == 1, "gap")
-            assert "publisher restarted" in gap.quality.last_gap or "clock stepped" in gap.quality.last_gap
+            assert "publisher restarted" in gap.quality.last_gap
             assert gap.stream.publisher_alive
-            # Windows from before a clock was set back are later than those that are waited for.
+            # Windows of a run that was ahead are later than those that are waited for.
             until(
                 lambda: 130e9 < newest_full_window(watched) - start_ns(start) < 3600e9, "a minute of full windows", 60.0
             )
@@ -60,8 +64,8 @@ def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, 
         assert after.quality.gaps == 1
         events = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/alarms/events", trust_env=False).json()["events"]
         # What happened to the stream is told; nothing is said of the machine.
-        assert {event["data"]["name"] for event in events} <= {"stream-lost", "data-gap", "data-clock"}
-        assert {"data-gap", "data-clock"} & {event["data"]["name"] for event in events}
+        # The silence between the runs may have been noticed; a start at another time is no clock that was set.
+        assert told <= {event["data"]["name"] for event in events} <= told | {"stream-lost"}
         assert not any(alarm.raised for alarm in after.alarms)
         assert watched.process.poll() is None
 
