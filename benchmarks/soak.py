@@ -33,13 +33,13 @@ from models.commissioning.installed import install
 from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
-from service.alarm_schemas import AlarmCloudEvent
-from service.client.alarm_log import follow_alarms
+from rotorwatch.client.alarm_log import follow_alarms
+from rotorwatch.records.alarms import AlarmCloudEvent
 from service.monitor import MachineMonitor
 from service.store.machine import MachineStore
 from service.store.retention import Retention
 from service.store.store import Store
-from service.transport import LinkError
+from service.transport import Link, LinkError
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
@@ -125,9 +125,10 @@ def follow(endpoint: str, path: Path) -> None:
 
         while True:
             try:
-                follow_alarms(LinkSettings(mode="client", connect=(endpoint,)), [_PLACE], {_PLACE: last}, keep)
+                link = Link(LinkSettings(mode="client", connect=(endpoint,)))
             except LinkError:  # it joined while the monitor was away
                 continue
+            follow_alarms(link.session, [_PLACE], {_PLACE: last}, keep)
 
 
 @dataclass

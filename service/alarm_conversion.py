@@ -1,21 +1,20 @@
-"""Turns alarms and what happened to them into the JSON models of `service.alarm_schemas`."""
+"""Turns alarms and what happened to them into the records of `rotorwatch`."""
 
 import json
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from importlib.metadata import version
 
 from models.alarm_names import ALARM_TEXT
-from service.alarm_schemas import Alarm as AlarmJson
-from service.alarm_schemas import AlarmCloudEvent, AlarmEventData, AlarmStates
-from service.alarm_schemas import Evidence as EvidenceJson
-from service.alarm_schemas import Shelf as ShelfJson
+from rotorwatch import __version__
+from rotorwatch.records.alarms import Alarm as AlarmJson
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
+from rotorwatch.records.alarms import Evidence as EvidenceJson
+from rotorwatch.records.alarms import Shelf as ShelfJson
 from service.alarms.alarm import Alarm, AlarmEvent, Evidence
 
 __all__ = [
-    "PROGRAM_VERSION",
     "Identity",
     "alarm_cloud_event",
     "alarm_entries",
@@ -25,7 +24,6 @@ __all__ = [
     "rfc3339",
 ]
 
-PROGRAM_VERSION = version("rotorwatch")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -92,7 +90,7 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
         reason=event.reason,
         bundle=identity.bundle,
         machine_hash=identity.machine_hash,
-        program_version=PROGRAM_VERSION,
+        program_version=__version__,
     )
     return AlarmCloudEvent(
         specversion="1.0",

@@ -13,10 +13,11 @@ from pydantic.json_schema import models_json_schema
 
 from models.signals.channels import ChannelDescriptor
 from models.signals.keys import PREFIX, MachineKeys
-from service.alarm_conversion import PROGRAM_VERSION
-from service.alarm_schemas import AlarmCloudEvent, AlarmLogPage, AlarmStates
+from rotorwatch import __version__
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, Report
 from service.log_query import MOST_EVENTS
-from service.schemas import Health, Report, example
 
 __all__ = ["asyncapi"]
 
@@ -78,7 +79,7 @@ def asyncapi(truth: type[BaseModel]) -> dict[str, Any]:
     _, schemas = models_json_schema(sent, ref_template="#/components/schemas/{model}")
     document: dict[str, Any] = {
         "asyncapi": "3.0.0",
-        "info": {"title": "rotorwatch", "version": PROGRAM_VERSION, "description": _DESCRIPTION},
+        "info": {"title": "rotorwatch", "version": __version__, "description": _DESCRIPTION},
         "defaultContentType": _JSON,
         "servers": {
             "monitor": {

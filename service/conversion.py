@@ -1,4 +1,4 @@
-"""Turns the monitor's records into the JSON models of `service.schemas`."""
+"""Turns the monitor's records into the records of `rotorwatch`."""
 
 import hashlib
 import json
@@ -11,27 +11,16 @@ from models.diagnosis.verdict.detectable import DetectableChange, length_to_find
 from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.machine import MachineFile
 from models.physics.parameters import PARAMETER_TEXT
+from rotorwatch.records.health import Health, HealthState, Quality, Report, StreamStatus
+from rotorwatch.records.machines import Channel, DetectableChanges, DetectableParameter, MachineDescription
+from rotorwatch.records.windows import Agreement as AgreementJson
+from rotorwatch.records.windows import Detectable, Finding, SensorFault, Shape, Verdict
+from rotorwatch.records.windows import Equation as EquationJson
+from rotorwatch.records.windows import Opinion as OpinionJson
+from rotorwatch.records.windows import Parameter as ParameterJson
 from service.alarm_conversion import Identity, alarm_entries, finite, rfc3339
-from service.reports import DataQuality, HealthState, MachineHealth, WindowReport
+from service.reports import DataQuality, MachineHealth, WindowReport
 from service.residuals import Opinion
-from service.schemas import Agreement as AgreementJson
-from service.schemas import (
-    Detectable,
-    DetectableChanges,
-    DetectableParameter,
-    Finding,
-    Health,
-    MachineDescription,
-    Quality,
-    Report,
-    SensorFault,
-    Shape,
-    StreamStatus,
-    Verdict,
-)
-from service.schemas import Equation as EquationJson
-from service.schemas import Opinion as OpinionJson
-from service.schemas import Parameter as ParameterJson
 
 __all__ = ["detectable_changes", "health", "machine_description", "machine_hash", "report"]
 
@@ -122,7 +111,7 @@ def machine_description(identity: Identity, machine: MachineFile, state: HealthS
         state=state,
         speed_rpm=None if machine.operation is None else machine.operation.speed_rpm,
         rate_hz=machine.rate_hz,
-        channels=machine.sensors,
+        channels=tuple(Channel.model_validate(channel.model_dump(mode="json")) for channel in machine.sensors),
         window_length_s=machine.window.length_s,
         window_hop_s=machine.window.hop_s,
         keys={name: getattr(keys, name) for name in names},

@@ -28,8 +28,9 @@ from rich.console import Console
 from models.errors import RotorwatchError
 from models.machine import Machine, load_machine
 from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Report
 from service.lines import alarm_event_line, report_line
-from service.schemas import AlarmCloudEvent, AlarmStates, Report
 from service.transport import TopicMessage, follow
 
 __all__ = ["DemoError", "DemoOptions", "Outcome", "run_demo"]

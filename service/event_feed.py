@@ -20,7 +20,7 @@ from typing import Protocol
 from starlette.concurrency import run_in_threadpool
 
 from models.errors import RotorwatchError
-from service.schemas import Health
+from rotorwatch.records.health import Health
 from service.store.errors import StoreError
 from service.store.records import StoredEvent
 

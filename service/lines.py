@@ -2,7 +2,9 @@
 
 from datetime import UTC, datetime
 
-from service.schemas import Alarm, AlarmCloudEvent, AlarmStates, Health, Opinion, Parameter, Report, Verdict
+from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Health, Report
+from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
 __all__ = ["alarm_event_line", "alarm_state_lines", "health_line", "report_line"]
 
@@ -16,7 +18,8 @@ def report_line(report: Report) -> str:
 
     Examples
     --------
-    >>> from service.schemas import Report, example
+    >>> from rotorwatch.records.example import example
+    >>> from rotorwatch.records.health import Report
     >>> report_line(Report.model_validate(example(Report)))
     '00:03:25  demo/lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
     """
@@ -37,7 +40,8 @@ def alarm_event_line(event: AlarmCloudEvent) -> str:
 
     Examples
     --------
-    >>> from service.schemas import AlarmCloudEvent, example
+    >>> from rotorwatch.records.alarms import AlarmCloudEvent
+    >>> from rotorwatch.records.example import example
     >>> alarm_event_line(AlarmCloudEvent.model_validate(example(AlarmCloudEvent)))
     '00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%'
     """
@@ -63,7 +67,8 @@ def health_line(health: Health) -> str:
 
     Examples
     --------
-    >>> from service.schemas import Health, example
+    >>> from rotorwatch.records.example import example
+    >>> from rotorwatch.records.health import Health
     >>> health_line(Health.model_validate(example(Health)))
     '00:03:25  demo/lab  state is alert'
     """

@@ -33,10 +33,12 @@ from models.ingest import Gate, Reason, Verdict
 from models.signals.block import SampleBlock
 from models.signals.channels import with_channel_names
 from models.signals.wire import decode_block
-from service.alarms.alarm import AlarmEvent, Evidence, Severity
+from rotorwatch.records.alarms import Severity
+from rotorwatch.records.health import HealthState
+from service.alarms.alarm import AlarmEvent, Evidence
 from service.alarms.book import AlarmBook
 from service.alarms.operation import Operation
-from service.reports import DataQuality, HealthState, MachineHealth, MonitorReport, MonitorState, WindowReport
+from service.reports import DataQuality, MachineHealth, MonitorReport, MonitorState, WindowReport
 from service.residuals import Evaluation, evaluator_for
 
 __all__ = ["MachineMonitor"]

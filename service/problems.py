@@ -11,8 +11,9 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from rotorwatch.records.example import example
+from rotorwatch.records.monitor import Problem
 from service.logs import logger
-from service.schemas import Problem, example
 from service.store.errors import StoreError
 
 __all__ = ["add_problems", "problem_answer", "problem_responses", "responses"]

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator, Sequence
 
+from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.pulse import STUCK_S
-from service.schemas import MachineReadiness, Readiness
 
 __all__ = ["readiness_of"]
 

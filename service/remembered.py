@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterable, Sequence
 
 from models.errors import CheckpointError
-from service.alarm_conversion import PROGRAM_VERSION, Identity, alarm_cloud_event, finite, rfc3339
+from rotorwatch import __version__
+from service.alarm_conversion import Identity, alarm_cloud_event, finite, rfc3339
 from service.alarms.alarm import AlarmEvent
 from service.alarms.book import NO_ALARMS
 from service.conversion import report as report_json
@@ -65,7 +66,7 @@ def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -
         format=FORMAT,
         bundle=identity.bundle,
         machine_hash=identity.machine_hash,
-        code_version=PROGRAM_VERSION,
+        code_version=__version__,
         end_ns=state.end_ns or 0,
         recorded_ns=recorded_ns,
         alarms=state.alarms,
@@ -120,6 +121,6 @@ def _differences(head: CheckpointHead, identity: Identity) -> Sequence[str]:
         "form of what is remembered": (head.format, FORMAT),
         "machine file": (head.machine_hash, identity.machine_hash),
         "bundle": (head.bundle, identity.bundle),
-        "program version": (head.code_version, PROGRAM_VERSION),
+        "program version": (head.code_version, __version__),
     }
     return [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]

@@ -19,9 +19,9 @@ from models.errors import RotorwatchError
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
+from rotorwatch.records.replays import ReplayProgress
 from service.replay.control import Control
 from service.replay.player import PlayPlan, play
-from service.replay.schemas import ReplayProgress
 from service.replay.source import RecordingSource
 from service.transport import Link
 

@@ -1,7 +1,6 @@
 """What a monitor says: of one window, of one block, of the machine; and what it remembers."""
 
 from dataclasses import dataclass
-from enum import StrEnum
 
 from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.readings import EquationReading, ParameterReading
@@ -9,24 +8,11 @@ from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.detectable import DetectableChange
 from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.ingest import Verdict
+from rotorwatch.records.health import HealthState
 from service.alarms.alarm import Alarm, AlarmEvent
 from service.residuals import Opinion
 
-__all__ = ["DataQuality", "HealthState", "MachineHealth", "MonitorReport", "MonitorState", "WindowReport"]
-
-
-class HealthState(StrEnum):
-    """Health of a machine in one word."""
-
-    WARMING = "warming"
-    HEALTHY = "healthy"
-    ALERT = "alert"
-    DANGER = "danger"
-    OUTSIDE_MODEL = "outside-model"
-    DATA_HEALTH = "data-health"
-    UNCHANGED = "unchanged"
-    NO_DATA = "no-data"
-    NOT_EVALUABLE = "not-evaluable"
+__all__ = ["DataQuality", "MachineHealth", "MonitorReport", "MonitorState", "WindowReport"]
 
 
 @dataclass(frozen=True, slots=True)

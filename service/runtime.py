@@ -33,6 +33,8 @@ from models.commissioning.installed import install
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.keys import MachineKeys
+from rotorwatch.records.health import Health
+from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
 from service.access.tls import server_arguments
 from service.access_settings import AccessSettings
@@ -47,7 +49,6 @@ from service.pulse import Pulse
 from service.readiness import readiness_of
 from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder, RecorderStatus
-from service.schemas import Health, MachineReadiness, Readiness
 from service.store.audit import AuditLog
 from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap

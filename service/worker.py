@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from models.commissioning.installed import Installed
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Health, StreamStatus
+from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from service import conversion
 from service.alarm_conversion import Identity, alarm_log_page, alarm_states
-from service.alarm_schemas import AlarmCloudEvent, AlarmStates
 from service.alarms.alarm import AlarmEvent
 from service.alarms.book import NO_ALARMS
 from service.alarms.operation import NotInTime, Operation
@@ -25,7 +27,6 @@ from service.logs import Limiter, logger
 from service.monitor import MachineMonitor
 from service.remembered import checkpoint_step, restored, stored_event, stored_readings, stored_report
 from service.reports import MachineHealth, MonitorReport, WindowReport
-from service.schemas import DetectableChanges, Health, MachineDescription, StreamStatus
 from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.errors import StoreError
 from service.store.machine import MachineStore

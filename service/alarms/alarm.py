@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from types import MappingProxyType
 
 from models.alarm_names import ALARM_TEXT, CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST
 from models.physics.parameters import PARAMETER_TEXT
-from service.alarms.life_cycle import AlarmState
+from rotorwatch.records.alarms import AlarmState, EventKind, Severity
 
-__all__ = ["Alarm", "AlarmEvent", "EventKind", "Evidence", "Severity", "Shelf"]
+__all__ = ["Alarm", "AlarmEvent", "Evidence", "Shelf"]
 
 _CLEARED: Mapping[str, str] = MappingProxyType(
     {
@@ -27,29 +26,6 @@ _RAISED: Mapping[str, str] = MappingProxyType(
         SHAPE: "a channel's vibration is no longer as on the healthy machine",
     }
 )
-
-
-class Severity(StrEnum):
-    """How serious a raised alarm is."""
-
-    ALERT = "alert"
-    DANGER = "danger"
-
-
-class EventKind(StrEnum):
-    """What happened to an alarm, in the log."""
-
-    RAISED = "raised"
-    ESCALATED = "escalated"
-    CLEARED = "cleared"
-    ACKNOWLEDGED = "acknowledged"
-    RESET = "reset"
-    SHELVED = "shelved"
-    UNSHELVED = "unshelved"
-    SUPPRESSED = "suppressed"
-    UNSUPPRESSED = "unsuppressed"
-    REMOVED_FROM_SERVICE = "removed-from-service"
-    RETURNED_TO_SERVICE = "returned-to-service"
 
 
 @dataclass(frozen=True, slots=True)

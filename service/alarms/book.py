@@ -16,8 +16,9 @@ from pydantic import TypeAdapter
 from models.alarm_names import ALARM_TEXT, of_the_machine
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
-from service.alarms.alarm import Alarm, AlarmEvent, EventKind, Evidence, Severity, Shelf
-from service.alarms.life_cycle import AlarmState, Happening, follow, owed_after
+from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from service.alarms.alarm import Alarm, AlarmEvent, Evidence, Shelf
+from service.alarms.life_cycle import Happening, follow, owed_after
 from service.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
 
 __all__ = ["NO_ALARMS", "AlarmBook"]

@@ -20,26 +20,9 @@ from collections.abc import Mapping
 from enum import StrEnum
 from types import MappingProxyType
 
-__all__ = ["OWED", "REFUSED", "STAYS", "TABLE", "AlarmState", "Cell", "Happening", "follow", "owed_after"]
+from rotorwatch.records.alarms import AlarmState
 
-
-class AlarmState(StrEnum):
-    """Where an alarm is."""
-
-    NORMAL = "normal"
-    UNACKNOWLEDGED = "unacknowledged"
-    ACKNOWLEDGED = "acknowledged"
-    RETURNED = "returned"
-    LATCHED_UNACKNOWLEDGED = "latched-unacknowledged"
-    LATCHED_ACKNOWLEDGED = "latched-acknowledged"
-    SHELVED = "shelved"
-    SUPPRESSED = "suppressed"
-    OUT_OF_SERVICE = "out-of-service"
-
-    @property
-    def annunciated(self) -> bool:
-        """Whether operators are told of what happens to the alarm."""
-        return self not in {AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE}
+__all__ = ["OWED", "REFUSED", "STAYS", "TABLE", "Cell", "Happening", "follow", "owed_after"]
 
 
 class Happening(StrEnum):

@@ -1,10 +1,10 @@
 """What operators do to alarms."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 from models.errors import RotorwatchError
-from service.alarms.alarm import EventKind
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.operations import OperationKind
 from service.alarms.life_cycle import Happening
 
 __all__ = [
@@ -12,12 +12,9 @@ __all__ = [
     "NotInTime",
     "Operation",
     "OperationConflict",
-    "OperationKind",
     "OperationRefused",
     "UnknownAlarm",
 ]
-
-OperationKind = Literal["acknowledge", "reset", "shelve", "unshelve", "remove-from-service", "return-to-service"]
 
 HAPPENINGS: dict[OperationKind, tuple[Happening, EventKind]] = {
     "acknowledge": (Happening.ACKNOWLEDGE, EventKind.ACKNOWLEDGED),

@@ -18,8 +18,8 @@ from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes,
 
 if TYPE_CHECKING:  # these import numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
+    from rotorwatch.records.replays import OfflineSummary
     from service.replay.control import Control
-    from service.replay.schemas import OfflineSummary
     from service.replay.source import RecordingSource
     from service.replay_link import NetworkPlan
     from service.runtime import StopRequest
@@ -185,10 +185,10 @@ class _Offline:
 
 
 def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") -> None:
+    from rotorwatch.records.replays import ReplayLine  # noqa: PLC0415
     from service.replay.choice import choose_machine  # noqa: PLC0415  # keeps --help quick
     from service.replay.console import show  # noqa: PLC0415
     from service.replay.offline import OfflineReplay  # noqa: PLC0415
-    from service.replay.schemas import ReplayLine  # noqa: PLC0415
 
     as_json = request.progress == "json"
     if as_json and request.out is None:

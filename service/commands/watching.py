@@ -14,7 +14,7 @@ from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import ENDPOINT, ConnectOption, LinkOption, exit_codes
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
-    from service.schemas import Health
+    from rotorwatch.records.health import Health
     from service.transport import TopicMessage
 
 __all__ = ["register"]
@@ -145,24 +145,25 @@ class _Lines:
         self._alarms: set[str] = set()
 
     def __call__(self, message: "TopicMessage") -> None:
-        from service import lines, schemas  # noqa: PLC0415  # keeps --help quick
+        from rotorwatch import AlarmCloudEvent, AlarmStates, Health, Report  # noqa: PLC0415  # keeps --help quick
+        from service import lines  # noqa: PLC0415
 
         if message.key.endswith("/alarm/event"):
-            event = schemas.AlarmCloudEvent.model_validate_json(message.text)
+            event = AlarmCloudEvent.model_validate_json(message.text)
             style = _STYLES[event.data.severity] if event.data.kind in {"raised", "escalated"} else "green"
             self._say(lines.alarm_event_line(event), style)
         elif message.key.endswith("/alarm/state"):
             if message.key not in self._alarms:  # later changes arrive as events
                 self._alarms.add(message.key)
-                for line in lines.alarm_state_lines(schemas.AlarmStates.model_validate_json(message.text)):
+                for line in lines.alarm_state_lines(AlarmStates.model_validate_json(message.text)):
                     self._say(line, "bold")
         elif message.key.endswith("/health"):
-            health = schemas.Health.model_validate_json(message.text)
+            health = Health.model_validate_json(message.text)
             if self._states.get(message.key) != health.state:
                 self._states[message.key] = health.state
                 self._say(lines.health_line(health), _STYLES.get(health.state))
         else:
-            report = schemas.Report.model_validate_json(message.text)
+            report = Report.model_validate_json(message.text)
             self._say(lines.report_line(report), _STYLES.get(report.state) if report.state in _BAD_STATES else None)
 
     def _say(self, line: str, style: str | None) -> None:
@@ -184,7 +185,7 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
     import httpx  # noqa: PLC0415  # only here
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from service.schemas import Health  # noqa: PLC0415  # keeps --help quick
+    from rotorwatch.records.health import Health  # noqa: PLC0415  # keeps --help quick
 
     try:
         verify = True if ca is None else ssl.create_default_context(cafile=ca)

@@ -6,7 +6,11 @@ from fastapi import Depends, FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import AfterValidator
 
-from models.machine import MachineFile
+from models.machine import MachineFile, load_machine
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health
+from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
+from rotorwatch.records.monitor import Alive, Readiness
 from service.access.guard import Guard
 from service.http.description import DescribedApp, only_known_arguments
 from service.http.events import add_event_routes
@@ -15,12 +19,10 @@ from service.http.operations import add_operation_routes
 from service.http.page import front_page
 from service.http.recordings import add_recording_routes
 from service.http.replays import add_replay_routes
-from service.http.schemas import Alive, MachineConfiguration, MachineList, configuration_example
 from service.http.service import add_service_routes
 from service.http.snapshots import add_snapshot_routes
 from service.http.views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
 from service.problems import add_problems, problem_answer, responses
-from service.schemas import DetectableChanges, Health, MachineDescription, Readiness
 
 __all__ = ["MachineView", "ServiceView", "create_app"]
 
@@ -87,6 +89,11 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     return app
 
 
+def _configuration_example() -> dict[str, object]:
+    """A configuration of the shipped machine ``lab``."""
+    return {**example(MachineConfiguration), "file": load_machine("lab").model_dump(mode="json")}
+
+
 def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     common: dict[str, Any] = {"tags": ["machines"], "dependencies": [guard.read]}
 
@@ -102,7 +109,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 
     @app.get(
         f"{PLACE}/configuration",
-        responses=responses(MachineConfiguration, 404, 422, shown=configuration_example()),
+        responses=responses(MachineConfiguration, 404, 422, shown=_configuration_example()),
         **common,
     )
     def configuration(site: SiteName, machine: MachineName) -> MachineConfiguration:
@@ -111,7 +118,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         return MachineConfiguration(
             site=view.identity.site,
             machine=view.identity.machine,
-            file=MachineFile.model_validate(view.machine.model_dump()),
+            file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json"),
             bundle=view.identity.bundle,
             machine_hash=view.identity.machine_hash,
         )

@@ -8,13 +8,13 @@ from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from models.errors import RotorwatchError
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
 from service.access.guard import Guard
 from service.access.scopes import Caller
-from service.alarm_schemas import AlarmCloudEvent
 from service.event_feed import AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
 from service.http.views import ServiceView
 from service.problems import problem_responses
-from service.schemas import example
 
 __all__ = ["add_event_routes", "stream_example"]
 

@@ -6,9 +6,17 @@ from typing import Annotated, Any, Literal
 from fastapi import FastAPI, HTTPException, Query
 from fastapi.responses import Response
 
+from rotorwatch.records.alarms import EventKind, Severity
+from rotorwatch.records.history import (
+    AlarmEventList,
+    AuditList,
+    AuditRecord,
+    Reading,
+    ReadingBucket,
+    ReadingList,
+    ReportList,
+)
 from service.access.guard import Guard
-from service.alarms.alarm import EventKind, Severity
-from service.http.schemas import AlarmEventList, AuditList, AuditRecord, Reading, ReadingBucket, ReadingList, ReportList
 from service.http.views import (
     PLACE,
     AlarmName,

@@ -7,25 +7,17 @@ from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, 
 
 from models.alarm_names import ALARM_TEXT
 from models.errors import RotorwatchError
+from rotorwatch.records.alarms import Alarm, AlarmState, AlarmStates
+from rotorwatch.records.example import example
+from rotorwatch.records.operations import OperationDone, OperationKind, OperationOrder, ReasonedOrder, ShelveOrder
 from service.access.audit import AuditNote
 from service.access.guard import Guard
 from service.access.scopes import Caller
 from service.alarm_conversion import alarm_entries
-from service.alarm_schemas import Alarm, AlarmStates
 from service.alarms.alarm import Alarm as AlarmRecord
-from service.alarms.life_cycle import AlarmState
-from service.alarms.operation import (
-    NotInTime,
-    Operation,
-    OperationConflict,
-    OperationKind,
-    OperationRefused,
-    UnknownAlarm,
-)
-from service.http.schemas import OperationDone, OperationOrder, ReasonedOrder, ShelveOrder
+from service.alarms.operation import NotInTime, Operation, OperationConflict, OperationRefused, UnknownAlarm
 from service.http.views import PLACE, AlarmName, MachineName, MachineView, ServiceView, SiteName, found_machine
 from service.problems import responses
-from service.schemas import example
 
 __all__ = ["add_operation_routes"]
 

@@ -3,9 +3,9 @@
 import html
 from datetime import UTC, datetime
 
-from service.alarm_schemas import Alarm
-from service.alarms.alarm import Severity
-from service.schemas import Health, Opinion, Parameter, Verdict
+from rotorwatch.records.alarms import Alarm, Severity
+from rotorwatch.records.health import Health
+from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
 __all__ = ["front_page"]
 

@@ -5,24 +5,20 @@ from typing import Annotated, Protocol
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import FileResponse
-from pydantic import BaseModel, ConfigDict, Field
 from starlette.types import Message, Receive, Scope, Send
 
 from models.signals.recording import summarize_recording
+from rotorwatch.records.recordings import RecordingDetail, RecordingEntry, RecordingList
 from service.access.guard import Guard
 from service.problems import problem_answer, problem_responses, responses
 from service.recording.catalogue import Recording
 
 __all__ = [
-    "RecordingDetail",
-    "RecordingEntry",
     "RecordingIndex",
-    "RecordingList",
     "add_recording_routes",
     "found_recording",
 ]
 
-_JSON = ConfigDict(extra="forbid", frozen=True)
 _NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
 _NONE = "no recordings: the settings name no directory for them ([recording] directory)"
 
@@ -39,41 +35,6 @@ class RecordingIndex(Protocol):
 
     def find(self, recording_id: str) -> Recording | None:
         """One recording, or None; reaches no file outside the directory."""
-
-
-class RecordingEntry(BaseModel):
-    """One recording."""
-
-    model_config = _JSON
-
-    id: str = Field(description="site, machine and file name", examples=["demo/lab/20260101T000000Z.mcap"])
-    site: str = Field(description="site of the machine", examples=["demo"])
-    machine: str = Field(description="name of the machine", examples=["lab"])
-    start_ns: int = Field(description="time of the first message", examples=[1767225600000000000])
-    end_ns: int = Field(description="time of the last message", examples=[1767225900000000000])
-    messages: int | None = Field(description="number of messages; null if incomplete or damaged", examples=[3001])
-    size_bytes: int = Field(description="size of the file", examples=[19231007])
-    complete: bool = Field(
-        description="false for a file that is being written, or was left by a crash", examples=[True]
-    )
-    kept_because: str = Field(description="which alarm keeps it beyond its time; empty if none", examples=[""])
-    problem: str = Field(description="why it cannot be read; empty if it can", examples=[""])
-
-
-class RecordingDetail(RecordingEntry):
-    """One recording with what is in it."""
-
-    keys: dict[str, int] = Field(
-        description="messages by key; empty if incomplete or damaged", examples=[{"rotorwatch/demo/lab/stream": 3000}]
-    )
-
-
-class RecordingList(BaseModel):
-    """Recordings by site, machine and time."""
-
-    model_config = _JSON
-
-    recordings: tuple[RecordingEntry, ...] = Field(description="by site, machine and time")
 
 
 _Site = Annotated[str | None, Query(description="only of this site")]

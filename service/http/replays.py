@@ -8,9 +8,21 @@ from typing import Annotated, Any
 
 from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel
 
 from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
+from rotorwatch.records.fields import JSON
+from rotorwatch.records.health import Report
+from rotorwatch.records.replays import (
+    ReplayAlarmList,
+    ReplayJob,
+    ReplayList,
+    ReplayReportList,
+    ReplayRequest,
+    ReplaySeek,
+)
 from service.access.guard import Guard
 from service.access_settings import is_loopback
 from service.config import MachineEntry, ServiceSettings
@@ -18,51 +30,19 @@ from service.http.recordings import RecordingIndex, found_recording
 from service.problems import problem_responses, responses
 from service.replay.choice import is_shipped_bundle, is_shipped_machine
 from service.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
-from service.replay.schemas import ReplayJob, ReplayRequest, ReplaySeek
-from service.schemas import AlarmCloudEvent, Report, example
 
-__all__ = ["ReplayAlarmList", "ReplayDesk", "ReplayList", "ReplayReportList", "add_replay_routes"]
+__all__ = ["ReplayDesk", "add_replay_routes"]
 
-_JSON = ConfigDict(extra="forbid", frozen=True)
 _PLACE = "/api/v1/replays"
 _LOOK_S = 0.25
 _QUIET_S = 15.0
 _UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # what to connect to, nothing listens there
 
 
-class ReplayList(BaseModel):
-    """Replays since the service started, the latest first."""
-
-    model_config = _JSON
-
-    replays: tuple[ReplayJob, ...] = Field(description="the latest first")
-
-
-_NEXT = "pass it as offset to go on; null if there is no more yet"
-
-
 class NoOrder(BaseModel):
     """An empty object: that a request is sent as JSON shows that no page from elsewhere has sent it."""
 
-    model_config = _JSON
-
-
-class ReplayReportList(BaseModel):
-    """Window reports of a replay, in the order of the data."""
-
-    model_config = _JSON
-
-    reports: tuple[Report, ...] = Field(description="oldest first")
-    next_offset: int | None = Field(description=_NEXT, examples=[100])
-
-
-class ReplayAlarmList(BaseModel):
-    """Alarm events of a replay, in the order of the data."""
-
-    model_config = _JSON
-
-    events: tuple[AlarmCloudEvent, ...] = Field(description="oldest first")
-    next_offset: int | None = Field(description=_NEXT, examples=[100])
+    model_config = JSON
 
 
 class ReplayDesk:

@@ -6,10 +6,10 @@ from fastapi import FastAPI, Response
 from fastapi.responses import PlainTextResponse
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from rotorwatch.records.monitor import WebhookList
 from service.access.guard import Guard
 from service.problems import problem_responses, responses
 from service.webhooks.desk import WebhookDesk
-from service.webhooks.schemas import WebhookList
 
 __all__ = ["MeasuredView", "MetricsText", "add_service_routes"]
 

@@ -4,12 +4,12 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query
 
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.access.guard import Guard
 from service.http.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 from service.problems import responses
-from service.snapshots.choice import SnapshotError, Units
+from service.snapshots.choice import SnapshotError
 from service.snapshots.path import MOST_REVOLUTIONS
-from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 
 __all__ = ["add_snapshot_routes"]
 

@@ -8,14 +8,16 @@ from pydantic import AfterValidator
 
 from models.alarm_names import ALARM_TEXT
 from models.machine import MachineFile
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Health
+from rotorwatch.records.machines import DetectableChanges, MachineDescription
+from rotorwatch.records.monitor import Readiness
 from service.alarm_conversion import Identity
-from service.alarm_schemas import AlarmCloudEvent, AlarmStates
 from service.alarms.operation import Operation
 from service.event_feed import EventFeed
 from service.http.recordings import RecordingIndex
 from service.http.replays import ReplayDesk
 from service.http.service import MeasuredView
-from service.schemas import DetectableChanges, Health, MachineDescription, Readiness
 from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.audit import AuditLog
 from service.store.machine import MachineStore

@@ -19,7 +19,8 @@ from models.signals.channels import ChannelDescriptor, Quantity
 from models.signals.keys import PREFIX
 from models.signals.recording import RecordedMessage, read_recording, summarize_recording
 from models.signals.wire import decode_block
-from service.schemas import AlarmCloudEvent, Report
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.health import Report
 
 __all__ = ["Selection", "Table", "alarm_table", "report_table", "stream_table"]
 

@@ -14,13 +14,12 @@ from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_l
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.process_collector import ProcessCollector
 
-from service.alarm_conversion import PROGRAM_VERSION
+from rotorwatch import __version__
+from rotorwatch.records.monitor import Readiness, WebhookList
 from service.metrics.machine import Observed, machine_families
 from service.metrics.requests import RequestCounts
 from service.recording.recorder import RecorderStatus
-from service.schemas import Readiness
 from service.store.errors import StoreError
-from service.webhooks.schemas import WebhookList
 from service.worker import MachineWorker
 
 __all__ = ["CONTENT_TYPE", "MeasuredService", "Metrics"]
@@ -141,7 +140,7 @@ class Metrics:
 
 def _service_families(readiness: Readiness) -> Iterator[Metric]:
     build = InfoMetricFamily("rotorwatch_build", "Version of the monitor")
-    build.add_metric((), {"version": PROGRAM_VERSION, "python": platform.python_version()})
+    build.add_metric((), {"version": __version__, "python": platform.python_version()})
     yield build
     yield GaugeMetricFamily("rotorwatch_ready", "1 if /readyz says so", value=readiness.ready)
     yield GaugeMetricFamily("rotorwatch_session_open", "1 if the Zenoh session is open", value=readiness.session_open)

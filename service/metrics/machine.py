@@ -12,11 +12,9 @@ from prometheus_client.core import (
     SummaryMetricFamily,
 )
 
-from service.alarms.alarm import EventKind, Severity
-from service.alarms.life_cycle import AlarmState
+from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from rotorwatch.records.health import Health, HealthState
 from service.recording.recorder import RecorderStatus
-from service.reports import HealthState
-from service.schemas import Health
 from service.worker import MachineWorker
 
 __all__ = ["Observed", "machine_families"]

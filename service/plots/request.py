@@ -8,6 +8,7 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from models.errors import MachineFileError, RecordingError
+from rotorwatch.records.alarms import AlarmEventData
 from service.plots.correlation import correlations_of, latest_window
 from service.plots.correlation_figure import paint_correlations
 from service.plots.orbit import read_orbits
@@ -20,7 +21,6 @@ from service.plots.trend import read_trend, recorded_alarms, trend_machine
 from service.plots.trend_figure import paint_trend
 from service.replay.choice import choose_machine
 from service.replay.source import RecordingSource, parse_moment
-from service.schemas import AlarmEventData
 
 __all__ = ["Kind", "PlotRequest", "draw_plot"]
 

@@ -6,6 +6,7 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from models.signals.channels import Channel
+from rotorwatch.records.alarms import AlarmEventData
 from service.plots.spectrum import Spectrum, Waterfall
 from service.plots.style import (
     COLOURS,
@@ -20,7 +21,6 @@ from service.plots.style import (
     stretch_text,
     time_axis,
 )
-from service.schemas import AlarmEventData
 
 __all__ = ["paint_cascade", "paint_map", "paint_spectrum"]
 

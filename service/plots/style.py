@@ -14,8 +14,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from models.errors import RotorwatchError
 from models.signals.block import FloatArray
+from rotorwatch.records.alarms import AlarmEventData
 from service.replay.source import clock
-from service.schemas import AlarmEventData
 
 __all__ = [
     "COLOURS",

@@ -14,13 +14,12 @@ from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import FloatArray
 from models.signals.keys import PREFIX, MachineKeys
-from service.alarms.alarm import EventKind
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
+from rotorwatch.records.health import HealthState, Report
 from service.conversion import machine_hash
 from service.replay.choice import choose_machine
 from service.replay.offline import OfflineReplay
 from service.replay.source import RecordingSource
-from service.reports import HealthState
-from service.schemas import AlarmCloudEvent, AlarmEventData, Report
 
 __all__ = ["SHOWN", "ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of"]
 

@@ -10,6 +10,7 @@ from matplotlib.patches import Patch
 from models.alarm_names import MODEL
 from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
+from rotorwatch.records.alarms import AlarmEventData
 from service.plots.style import (
     COLOURS,
     GREY,
@@ -26,7 +27,6 @@ from service.plots.style import (
     time_axis,
 )
 from service.plots.trend import ParameterTrend, Trend
-from service.schemas import AlarmEventData
 
 __all__ = ["paint_trend"]
 

@@ -12,8 +12,8 @@ from typing import Literal
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
+from rotorwatch.records.replays import ReplayLine, ReplayProgress
 from service.replay.control import Control
-from service.replay.schemas import ReplayLine, ReplayProgress
 from service.replay.source import clock
 
 __all__ = ["Show", "obey", "orders", "show"]

@@ -19,8 +19,8 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from models.errors import RotorwatchError
+from rotorwatch.records.replays import ReplayJob, ReplayLine
 from service.logs import logger
-from service.replay.schemas import ReplayJob, ReplayLine
 
 __all__ = ["REPLAYS", "JobPlan", "ReplayJobError", "ReplayJobs", "TooManyReplaysError"]
 

@@ -11,12 +11,12 @@ from collections.abc import Callable
 from models.commissioning.installed import Installed
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
+from rotorwatch.records.replays import OfflineSummary, ReplayProgress
 from service import conversion
 from service.alarm_conversion import Identity, alarm_cloud_event
 from service.descriptor import descriptor_mismatch
 from service.monitor import MachineMonitor
 from service.replay.control import Control
-from service.replay.schemas import OfflineSummary, ReplayProgress
 from service.replay.source import RecordingSource
 from service.reports import MonitorReport
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from models.signals.recording import RecordedMessage
+from rotorwatch.records.replays import ReplayProgress
 from service.replay.control import Control
-from service.replay.schemas import ReplayProgress
 from service.replay.source import RecordingSource
 
 __all__ = ["PlayPlan", "Sink", "play"]

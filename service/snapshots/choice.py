@@ -1,7 +1,6 @@
 """Which channels a snapshot is of: those asked for by name, or a sensible few."""
 
 from collections.abc import Iterable, Sequence
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -9,11 +8,11 @@ import numpy.typing as npt
 from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.channels import Channel, Quantity, state_name
+from rotorwatch.records.snapshots import Units
 
 __all__ = [
     "MOST_PAIRS",
     "SnapshotError",
-    "Units",
     "chosen_channels",
     "chosen_pairs",
     "figures",
@@ -21,8 +20,6 @@ __all__ = [
     "product_unit",
     "si_unit",
 ]
-
-Units = Literal["channel", "SI"]
 
 MOST_PAIRS = 8
 """Pairs in a snapshot that no pair was asked for."""

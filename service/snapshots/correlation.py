@@ -8,10 +8,10 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
-from service.snapshots.choice import Units, chosen_pairs, figures, product_unit
+from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
+from service.snapshots.choice import chosen_pairs, figures, product_unit
 from service.snapshots.measured import MeasuredCorrelations, measured_correlations
 from service.snapshots.prediction import Prediction
-from service.snapshots.schemas import CorrelationPair, CorrelationSnapshot
 from service.snapshots.statement import Speaker, heading, no_window, theory
 
 __all__ = ["correlation_snapshot"]

@@ -9,11 +9,10 @@ from models.diagnosis.readings import ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import SampleBlock
-from service.snapshots.choice import Units
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.snapshots.correlation import correlation_snapshot
 from service.snapshots.orbit import orbit_snapshot
 from service.snapshots.prediction import NO_PARAMETERS, Prediction, predict
-from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.snapshots.spectrum import spectrum_snapshot
 from service.snapshots.statement import Speaker
 

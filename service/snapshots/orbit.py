@@ -15,11 +15,11 @@ from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import RotorParameters, changed
 from models.signals.block import SampleBlock
 from models.signals.channels import Channel, state_name
-from service.snapshots.choice import Units, figures, orbit_pairs
+from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
+from service.snapshots.choice import figures, orbit_pairs
 from service.snapshots.ellipse import Ellipse, phase_lag_deg
 from service.snapshots.path import NewestPath, newest_path
 from service.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
-from service.snapshots.schemas import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector
 from service.snapshots.statement import Speaker, heading, no_window, theory
 
 __all__ = ["orbit_snapshot"]

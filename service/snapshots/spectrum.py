@@ -12,10 +12,10 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
-from service.snapshots.choice import SnapshotError, Units, chosen_channels, chosen_pairs, figures, product_unit
+from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, SpectrumSnapshot, Units
+from service.snapshots.choice import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
 from service.snapshots.excitation import LEFT_OUT_BINS
 from service.snapshots.prediction import Prediction
-from service.snapshots.schemas import ChannelDensity, CrossSpectrum, SpectrumSnapshot
 from service.snapshots.statement import Speaker, heading, no_window, theory
 
 __all__ = ["MOST_LINES", "spectrum_snapshot"]

@@ -7,7 +7,7 @@ import numpy as np
 
 from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
-from service.snapshots.schemas import PredictedChange, Theory
+from rotorwatch.records.snapshots import PredictedChange, Theory
 
 __all__ = ["Heading", "Speaker", "heading", "no_window", "theory"]
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 
 from models.errors import RotorwatchError
+from rotorwatch.records.monitor import WebhookList
 from service.alarm_conversion import rfc3339
 from service.event_feed import AlarmLog
 from service.webhook_settings import WebhookSettings
 from service.webhooks.answer import Meaning
 from service.webhooks.dispatcher import Cursors, Dispatcher
 from service.webhooks.receiver import Receiver
-from service.webhooks.schemas import WebhookList
 
 __all__ = ["NotDeliveredError", "WebhookDesk", "send_test"]
 

@@ -21,14 +21,14 @@ from typing import Protocol
 
 from pydantic import ValidationError
 
-from service.alarm_schemas import AlarmCloudEvent
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.monitor import WebhookStatus
 from service.event_feed import AlarmLog
 from service.logs import Limiter, logger
 from service.store.errors import StoreError
 from service.store.records import StoredEvent
 from service.webhook_settings import WebhookSettings
 from service.webhooks.answer import Answer, Meaning, pause_s
-from service.webhooks.schemas import WebhookStatus
 
 __all__ = ["Cursors", "Dispatcher", "Post"]
 

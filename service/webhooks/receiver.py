@@ -9,7 +9,7 @@ from contextlib import suppress
 import httpx
 
 from models.errors import MachineFileError
-from service.alarm_conversion import PROGRAM_VERSION
+from rotorwatch import __version__
 from service.webhook_settings import WebhookSettings
 from service.webhooks.answer import Answer, answer_of, no_answer
 from service.webhooks.signature import signature, signing_keys
@@ -134,7 +134,7 @@ class Receiver:
         timestamp_s = int(self._now_s())
         return {
             "content-type": CONTENT_TYPE,
-            "user-agent": f"rotorwatch/{PROGRAM_VERSION}",
+            "user-agent": f"rotorwatch/{__version__}",
             "webhook-id": identifier,
             "webhook-timestamp": str(timestamp_s),
             "webhook-signature": signature(self._keys, identifier, timestamp_s, body),

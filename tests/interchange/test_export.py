@@ -15,9 +15,11 @@ from models.machine import Machine, load_machine
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter
 from models.signals.wire import encode_arrow, encode_block
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Report
 from service.interchange.exported import Selection
 from service.interchange.exporting import ExportFormat, export
-from service.schemas import AlarmCloudEvent, Report, example
 from tests.interchange.material import START_NS, imported, stretches
 
 LAB = load_machine("lab")

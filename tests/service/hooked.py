@@ -12,9 +12,8 @@ from typing import Any
 
 from standardwebhooks import Webhook
 
-from service.alarm_schemas import AlarmCloudEvent
-from service.alarms.alarm import EventKind, Severity
-from service.schemas import example
+from rotorwatch.records.alarms import AlarmCloudEvent, EventKind, Severity
+from rotorwatch.records.example import example
 from service.store.records import StoredEvent
 from service.webhook_settings import WebhookSettings
 from service.webhooks.signature import new_secret

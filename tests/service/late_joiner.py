@@ -12,8 +12,9 @@ import threading
 from pathlib import Path
 
 from models.signals.link import LinkSettings
-from service.alarm_schemas import AlarmCloudEvent
-from service.client.alarm_log import follow_alarms
+from rotorwatch.client.alarm_log import follow_alarms
+from rotorwatch.records.alarms import AlarmCloudEvent
+from service.transport import Link
 
 PLACE = "demo/lab"
 ALARM = "data-gap"
@@ -58,12 +59,13 @@ def follow(connect: str, path: Path) -> None:
         os.write(file, line[100:])
         os.fsync(file)
 
-    follow_alarms(LinkSettings(connect=(connect,)), [PLACE], {PLACE: last}, keep, ask_every_s=0.5)
+    follow_alarms(Link(LinkSettings(connect=(connect,))).session, [PLACE], {PLACE: last}, keep, ask_every_s=0.5)
 
 
 def monitor(listen: str, history: str) -> None:
     """Run the service; its alarm is taken out of service and put back again and again."""
-    from service.alarms.operation import Operation, OperationKind  # noqa: PLC0415  # followers need none of this
+    from rotorwatch.records.operations import OperationKind  # noqa: PLC0415  # followers need none of this
+    from service.alarms.operation import Operation  # noqa: PLC0415  # followers need none of this
     from service.config import HistorySettings, HttpSettings, LogSettings, MachineEntry, ServiceSettings  # noqa: PLC0415
     from service.logs import configure_logging  # noqa: PLC0415
     from service.runtime import running  # noqa: PLC0415

@@ -12,8 +12,8 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
+from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot
 from service.snapshots.desk import LatestData, SnapshotDesk
-from service.snapshots.schemas import CorrelationPair, CorrelationSnapshot
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, stream
 

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.machine import AlarmSettings
-from service.alarms.alarm import Alarm, AlarmEvent, EventKind
+from rotorwatch.records.alarms import AlarmState, EventKind
+from service.alarms.alarm import Alarm, AlarmEvent
 from service.alarms.book import AlarmBook
-from service.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, AlarmState, Cell, Happening, follow
+from service.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, Happening, follow
 from service.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
 
 ROOT = Path(__file__).parents[2]

@@ -16,17 +16,18 @@ from models.ingest import Reason
 from models.machine import AlarmSettings, IngestSettings, Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
+from rotorwatch.records.alarms import AlarmState
+from rotorwatch.records.health import HealthState
 from service.alarm_conversion import Identity
 from service.alarms.alarm import Alarm, AlarmEvent
 from service.alarms.book import AlarmBook
-from service.alarms.life_cycle import AlarmState
 from service.alarms.operation import Operation
 from service.config import QueueSettings
 from service.conversion import machine_hash
 from service.inbox import RawBlock
 from service.monitor import MachineMonitor
 from service.remembered import checkpoint_step, restored, stored_readings
-from service.reports import HealthState, WindowReport
+from service.reports import WindowReport
 from service.store.errors import StoreError
 from service.store.machine import MachineStore
 from service.store.records import Checkpoint, Step

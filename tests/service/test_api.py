@@ -9,19 +9,13 @@ import pytest
 from models.alarm_names import ALARM_TEXT
 from models.machine import Machine, load_machine
 from models.physics.parameters import PARAMETERS
-from service.alarm_schemas import Alarm
-from service.http.schemas import (
-    AlarmEventList,
-    Alive,
-    AuditList,
-    MachineConfiguration,
-    MachineList,
-    ReadingList,
-    ReportList,
-)
+from rotorwatch.records.alarms import Alarm, AlarmStates
+from rotorwatch.records.health import Health
+from rotorwatch.records.history import AlarmEventList, AuditList, ReadingList, ReportList
+from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
+from rotorwatch.records.monitor import Alive, Readiness
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.runtime import Runtime
-from service.schemas import AlarmStates, DetectableChanges, Health, MachineDescription, Readiness
-from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.worker import MachineWorker
 from tests.service.live import START_NS
 from tests.service.monitored import PLACE, answered, client, faulty, problem
@@ -52,10 +46,9 @@ def test_machines_are_listed(http: httpx.Client, seen: tuple[Runtime, MachineWor
 
 def test_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
     found = answered(http.get(f"{PLACE}/configuration"), MachineConfiguration)
-    assert Machine.model_validate(found.file.model_dump()) == seen[1].machine
-    assert found.file.alarms.on_delay_s == 10.0
-    assert found.file.rotor is not None
-    assert found.file.rotor.k_by_N_per_m == load_machine("lab").rotor.k_by_N_per_m
+    assert (file := Machine.model_validate(found.file)) == seen[1].machine
+    assert file.alarms.on_delay_s == 10.0
+    assert file.rotor.k_by_N_per_m == load_machine("lab").rotor.k_by_N_per_m
     assert found.machine_hash == seen[1].identity.machine_hash
 
 

@@ -14,11 +14,12 @@ from typing import Any
 
 import pytest
 
+from rotorwatch.records.example import example
+from rotorwatch.records.monitor import Problem
 from service.access.guard import Guard
 from service.config import ServiceSettings
 from service.http.app import create_app
 from service.runtime import Runtime
-from service.schemas import Problem, example
 from tests.service.live import ROOT, settings, until
 from tests.service.monitored import GUARDED, PLACE, client, fed, token
 

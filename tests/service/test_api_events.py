@@ -14,15 +14,15 @@ import httpx_sse
 import numpy as np
 import pytest
 
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.health import Health
 from service import event_feed
 from service.access.scopes import Scope
 from service.access_settings import AccessSettings, LimitSettings
-from service.alarm_schemas import AlarmCloudEvent
 from service.alarms.operation import Operation
 from service.config import MachineEntry
 from service.event_feed import CursorError, cursor_text, parsed_cursor
 from service.runtime import Runtime, running
-from service.schemas import Health
 from service.store.errors import StoreError
 from service.worker import MachineWorker
 from tests.service.live import endpoint, settings, until

@@ -7,14 +7,16 @@ import httpx
 import pytest
 
 from models.diagnosis.readings import EquationReading, ParameterReading
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmState, AlarmStates, EventKind
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, HealthState, Report, StreamStatus
+from rotorwatch.records.history import AlarmEventList, AuditList
+from rotorwatch.records.machines import MachineDescription
 from service import conversion
 from service.alarm_conversion import Identity, alarm_cloud_event
-from service.alarms.alarm import Alarm, AlarmEvent, EventKind
-from service.alarms.life_cycle import AlarmState
-from service.http.schemas import AlarmEventList, AuditList
-from service.reports import DataQuality, HealthState, MachineHealth, WindowReport
+from service.alarms.alarm import Alarm, AlarmEvent
+from service.reports import DataQuality, MachineHealth, WindowReport
 from service.runtime import Runtime
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, MachineDescription, Report, StreamStatus, example
 from tests.service.live import LAB
 from tests.service.monitored import PLACE, answered, client, fed
 

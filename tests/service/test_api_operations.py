@@ -9,9 +9,10 @@ from typing import Any
 import httpx
 import pytest
 
+from rotorwatch.records.alarms import Alarm, AlarmStates
+from rotorwatch.records.history import AlarmEventList, AuditList
+from rotorwatch.records.operations import OperationDone
 from service.access.scopes import Scope
-from service.alarm_schemas import Alarm, AlarmStates
-from service.http.schemas import AlarmEventList, AuditList, OperationDone
 from service.runtime import Runtime
 from tests.service.live import Feed, until
 from tests.service.monitored import GUARDED, PLACE, answered, client, fed, problem, token

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.runtime import Runtime
-from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from tests.service.live import START_NS, Feed, until
 from tests.service.monitored import PLACE, answered, client, fed
 

@@ -13,20 +13,20 @@ from typing import Any
 import pytest
 import trustme
 
-import service.client
-from service.access.scopes import Scope
-from service.access_settings import AccessSettings, TlsSettings
-from service.client import (
+from rotorwatch import (
     AccessRefused,
+    Client,
     ClientError,
     Conflict,
     LogReplaced,
     NoAnswer,
     NotFound,
     RequestRefused,
-    Rotorwatch,
     ServiceEvent,
 )
+from rotorwatch.client import errors
+from service.access.scopes import Scope
+from service.access_settings import AccessSettings, TlsSettings
 from service.config import HistorySettings, HttpSettings, ServiceSettings
 from service.runtime import Runtime, running
 from service.worker import MachineWorker
@@ -44,8 +44,8 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, Ma
 
 
 @pytest.fixture
-def plant(seen: tuple[Runtime, MachineWorker]) -> Iterator[Rotorwatch]:
-    with Rotorwatch(seen[0].http_url, _token(seen[0])) as client:
+def plant(seen: tuple[Runtime, MachineWorker]) -> Iterator[Client]:
+    with Client(seen[0].http_url, _token(seen[0])) as client:
         yield client
 
 
@@ -59,7 +59,7 @@ def _token(runtime: Runtime) -> str:
     return _TOKENS[id(runtime)]
 
 
-def test_what_there_is(plant: Rotorwatch, seen: tuple[Runtime, MachineWorker]) -> None:
+def test_what_there_is(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
     _, worker = seen
     (machine,) = plant.machines()
     assert machine == plant.machine(PLACE) == worker.description()
@@ -68,7 +68,7 @@ def test_what_there_is(plant: Rotorwatch, seen: tuple[Runtime, MachineWorker]) -
     assert plant.detectable(PLACE, -0.05) == worker.detectable(-0.05)
 
 
-def test_alarms_and_their_log(plant: Rotorwatch, seen: tuple[Runtime, MachineWorker]) -> None:
+def test_alarms_and_their_log(plant: Client, seen: tuple[Runtime, MachineWorker]) -> None:
     _, worker = seen
     assert plant.alarms(PLACE) == worker.alarms()
     everything = plant.alarms(PLACE, everything=True)
@@ -85,22 +85,22 @@ def test_alarms_and_their_log(plant: Rotorwatch, seen: tuple[Runtime, MachineWor
 
 
 def test_pages_are_put_together(
-    plant: Rotorwatch, seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch
+    plant: Client, seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reports, forwards = list(plant.reports(PLACE)), list(plant.alarm_events(PLACE, after=-1))
     assert len(reports) == seen[1].tally.windows > 10
-    monkeypatch.setattr("service.client.rotorwatch._PAGE", 3)
+    monkeypatch.setattr("rotorwatch.client.client._PAGE", 3)
     assert list(plant.reports(PLACE)) == reports
     end_ns = [report.end_ns for report in reports]
     assert [r.end_ns for r in plant.reports(PLACE, since_ns=end_ns[8], until_ns=end_ns[1])] == end_ns[2:9]
-    monkeypatch.setattr("service.client.rotorwatch._PAGE", 1)
+    monkeypatch.setattr("rotorwatch.client.client._PAGE", 1)
     assert list(plant.alarm_events(PLACE, after=-1)) == forwards
     assert list(plant.alarm_events(PLACE)) == forwards[::-1]
     entries = list(plant.audit())
     assert [entry.number for entry in entries] == sorted((entry.number for entry in entries), reverse=True)
 
 
-def test_readings_over_time(plant: Rotorwatch) -> None:
+def test_readings_over_time(plant: Client) -> None:
     readings = list(plant.readings(PLACE, "parameter", "k_by"))
     shown = [r.parameters[0].relative_change for r in plant.reports(PLACE) if r.parameters]
     assert [reading.value for reading in readings] == shown[::-1]
@@ -111,7 +111,7 @@ def test_readings_over_time(plant: Rotorwatch) -> None:
     assert len(list(plant.readings(PLACE, "speed"))) == len(readings)
 
 
-def test_snapshots(plant: Rotorwatch) -> None:
+def test_snapshots(plant: Client) -> None:
     (pair,) = plant.correlations(PLACE, [("y1", "z1")]).pairs
     assert (pair.first, pair.second) == ("y1", "z1")
     spectra = plant.spectra(PLACE, ["y1", "y2"], from_hz=10.0, to_hz=50.0)
@@ -135,7 +135,7 @@ def test_snapshots(plant: Rotorwatch) -> None:
     ],
 )
 def test_refusals_are_exceptions_with_the_services_words(
-    plant: Rotorwatch, ask: Any, kind: type[Exception], told: str
+    plant: Client, ask: Any, kind: type[Exception], told: str
 ) -> None:
     with pytest.raises(ClientError) as caught:
         ask(plant)
@@ -146,20 +146,20 @@ def test_refusals_are_exceptions_with_the_services_words(
 def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyPatch) -> None:
     runtime, _ = seen
     monkeypatch.delenv("ROTORWATCH_TOKEN", raising=False)
-    with Rotorwatch(runtime.http_url) as stranger:
+    with Client(runtime.http_url) as stranger:
         with pytest.raises(AccessRefused) as caught:
             stranger.machines()
         assert caught.value.status == 401
         with pytest.raises(AccessRefused, match="a valid access token is needed"):
             next(stranger.events())
     monkeypatch.setenv("ROTORWATCH_TOKEN", _token(runtime) + "\n")
-    with Rotorwatch(runtime.http_url) as known:
+    with Client(runtime.http_url) as known:
         assert len(known.machines()) == 1
         alarm = known.alarm(PLACE, "k_by")
     with pytest.raises(ClientError, match="on one line") as refused:
-        Rotorwatch(runtime.http_url, "rw_1\nrw_2")
+        Client(runtime.http_url, "rw_1\nrw_2")
     assert "rw_1" not in str(refused.value)
-    with Rotorwatch(runtime.http_url, token(runtime, Scope.READ, name="screen")) as screen:
+    with Client(runtime.http_url, token(runtime, Scope.READ, name="screen")) as screen:
         with pytest.raises(AccessRefused) as caught:
             screen.acknowledge(PLACE, alarm)
         assert caught.value.status == 403
@@ -168,7 +168,7 @@ def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyP
 
 def test_nobody_there() -> None:
     url = endpoint().replace("tcp/", "http://")
-    with Rotorwatch(url, "rw_x") as plant:
+    with Client(url, "rw_x") as plant:
         with pytest.raises(NoAnswer, match=url):
             plant.machines()
         with pytest.raises(NoAnswer, match=url):
@@ -201,7 +201,7 @@ def plan(folder: Path, **changes: object) -> ServiceSettings:
 
 
 def test_operators_work(tmp_path: Path) -> None:
-    with gapped(plan(tmp_path)) as runtime, Rotorwatch(runtime.http_url, "") as plant:
+    with gapped(plan(tmp_path)) as runtime, Client(runtime.http_url, "") as plant:
         first = plant.alarm(PLACE, "data-gap")
         done = plant.acknowledge(PLACE, first, "cable was moved")
         assert (done.alarm.state, done.events[0].data.reason) == ("acknowledged", "cable was moved")
@@ -227,7 +227,7 @@ def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
     heard: list[ServiceEvent] = []
     errors: list[Exception] = []
 
-    def listen(plant: Rotorwatch) -> None:
+    def listen(plant: Client) -> None:
         try:
             for event in plant.events(PLACE, from_beginning=True):
                 if event.alarm is not None:
@@ -235,13 +235,13 @@ def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
         except ClientError as error:
             errors.append(error)
 
-    def work(plant: Rotorwatch) -> None:
+    def work(plant: Client) -> None:
         alarm = plant.alarm(PLACE, "data-gap")
         for _ in range(3):
             alarm = plant.remove_from_service(PLACE, alarm, "away").alarm
             alarm = plant.return_to_service(PLACE, alarm, "back").alarm
 
-    with Rotorwatch(f"http://127.0.0.1:{port}", "") as plant, Rotorwatch(f"http://127.0.0.1:{port}", "") as other:
+    with Client(f"http://127.0.0.1:{port}", "") as plant, Client(f"http://127.0.0.1:{port}", "") as other:
         listener = threading.Thread(target=listen, args=(plant,), daemon=True)
         with gapped(kept):
             listener.start()
@@ -260,7 +260,7 @@ def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
     assert [type(error) for error in errors] == [LogReplaced]
 
 
-def plant_events_after(plant: Rotorwatch, cursor: str, count: int) -> list[ServiceEvent]:
+def plant_events_after(plant: Client, cursor: str, count: int) -> list[ServiceEvent]:
     stream = (event for event in plant.events(PLACE, after=cursor) if event.alarm is not None)
     return [next(stream) for _ in range(count)]
 
@@ -276,12 +276,12 @@ def test_encrypted(tmp_path: Path) -> None:
     tls = TlsSettings(certificate=certificate, key=key)
     with running(plan(tmp_path, access=AccessSettings(tls=tls))) as runtime:
         text = token(runtime)
-        with Rotorwatch(runtime.http_url, text, ca=ca) as plant:
+        with Client(runtime.http_url, text, ca=ca) as plant:
             assert plant.health(PLACE).state == "warming"
-        with Rotorwatch(runtime.http_url, text) as plant, pytest.raises(NoAnswer, match="certificate"):
+        with Client(runtime.http_url, text) as plant, pytest.raises(NoAnswer, match="certificate"):
             plant.health(PLACE)
     with pytest.raises(ClientError, match=r"nowhere\.pem"):
-        Rotorwatch("https://127.0.0.1", ca=tmp_path / "nowhere.pem")
+        Client("https://127.0.0.1", ca=tmp_path / "nowhere.pem")
 
 
 # The page
@@ -320,8 +320,8 @@ def test_examples_in_the_page_run(
 
 
 def test_the_page_names_every_method_and_error() -> None:
-    methods = [name for name in vars(Rotorwatch) if not name.startswith("_")]
+    methods = [name for name in vars(Client) if not name.startswith("_")]
     for name in methods:
         assert name == "close" or f"`{name}(" in PAGE or f"`{name}`" in PAGE, f"docs/client.md does not mention {name}"
-    for name in service.client.__all__:
-        assert name in {"Rotorwatch", "ServiceEvent"} or f"| `{name}` |" in PAGE
+    for name in errors.__all__:
+        assert f"| `{name}` |" in PAGE

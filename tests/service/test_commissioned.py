@@ -11,11 +11,12 @@ from models.commissioning.installed import Installed
 from models.errors import BundleError
 from models.machine import AlarmSettings, MachineFile
 from models.signals.block import SampleBlock
+from rotorwatch.records.health import HealthState
 from service.alarm_conversion import Identity
 from service.alarms.alarm import AlarmEvent
 from service.conversion import report
 from service.monitor import MachineMonitor
-from service.reports import HealthState, WindowReport
+from service.reports import WindowReport
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
     LAB,

@@ -14,6 +14,8 @@ from models.machine import Machine
 from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.health import Report
 from service.plots.correlation import correlations_of, latest_window
 from service.plots.orbit import read_orbits
 from service.plots.spectrum import read_spectrum, read_waterfall
@@ -21,7 +23,6 @@ from service.plots.stretches import RecordedStream
 from service.plots.trend import read_trend, trend_machine
 from service.replay.offline import OfflineReplay
 from service.replay.source import RecordingSource
-from service.schemas import AlarmCloudEvent, Report
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from tests.service.live import LAB, START_NS, scenario_blocks

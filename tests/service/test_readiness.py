@@ -7,12 +7,12 @@ from pathlib import Path
 import httpx
 import pytest
 
+from rotorwatch.records.health import HealthState
+from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.config import HistorySettings, ServiceSettings
 from service.pulse import Pulse
 from service.readiness import readiness_of
-from service.reports import HealthState
 from service.runtime import Runtime, running
-from service.schemas import MachineReadiness, Readiness
 from service.store.retention import Retention
 from service.store.store import Store
 from tests.service.hooked import hook, settings_for

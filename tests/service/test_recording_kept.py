@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
 from service.config import RecordingSettings
 from service.recording.catalogue import Catalogue, Recording, kept_reasons, name_of
 from service.recording.recorder import MachineRecorder
 from service.recording.retention import AlarmMark, alarm_mark, alarm_marks, decide
-from service.schemas import AlarmCloudEvent, example
 from tests.service.live import LAB
 
 NS = 1_000_000_000

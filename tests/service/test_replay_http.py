@@ -14,6 +14,9 @@ import pytest
 from pydantic import BaseModel
 
 from models.signals.link import LinkSettings
+from rotorwatch.records.monitor import Problem
+from rotorwatch.records.recordings import RecordingDetail, RecordingList
+from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
 from service.config import (
     HistorySettings,
     HttpSettings,
@@ -22,11 +25,8 @@ from service.config import (
     ReplaySettings,
     ServiceSettings,
 )
-from service.http.recordings import RecordingDetail, RecordingList
-from service.http.replays import ReplayAlarmList, ReplayDesk, ReplayList, ReplayReportList
-from service.replay.schemas import ReplayJob
+from service.http.replays import ReplayDesk
 from service.runtime import Runtime, running
-from service.schemas import Problem
 from simulator.scenario import parse_fault
 from tests.service.live import START_NS, endpoint, scenario_blocks, until
 from tests.service.monitored import OPEN

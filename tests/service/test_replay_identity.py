@@ -13,10 +13,10 @@ from models.commissioning.installed import install
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import read_recording
+from rotorwatch.records.replays import OfflineSummary
 from service.monitor import MachineMonitor
 from service.replay.control import Control
 from service.replay.offline import OfflineReplay
-from service.replay.schemas import OfflineSummary
 from service.replay.source import RecordingSource
 from service.replay_link import NetworkPlan, replay_to_network
 from service.runtime import running

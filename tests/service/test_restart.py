@@ -7,8 +7,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.http.schemas import ReportList
-from service.schemas import Health
+from rotorwatch.records.health import Health
+from rotorwatch.records.history import ReportList
 from tests.service.live import Program, endpoint, program, until
 
 PACE = "8"

@@ -10,8 +10,10 @@ from pathlib import Path
 import httpx
 import pytest
 
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, Report
 from service.lines import alarm_event_line, alarm_state_lines, health_line, report_line
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report, example
 from simulator.scenario import parse_fault
 from tests.service.live import (
     ROOT,

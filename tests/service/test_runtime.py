@@ -15,6 +15,8 @@ from models.commissioning.installed import install
 from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Health, Report
 from service import conversion
 from service.alarm_conversion import alarm_cloud_event
 from service.config import HttpSettings, MachineEntry, ServiceSettings
@@ -23,7 +25,6 @@ from service.monitor import MachineMonitor
 from service.remembered import stored_event, stored_report
 from service.reports import MonitorReport
 from service.runtime import HttpError, Runtime, running
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report
 from service.transport import LinkError, TopicMessage, follow
 from simulator.scenario import parse_fault
 from tests.service.live import (

@@ -15,14 +15,14 @@ from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import changed
 from models.signals.block import SampleBlock
 from models.signals.channels import state_name
-from service.schemas import example
+from rotorwatch.records.example import example
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.snapshots import desk as desk_module
 from service.snapshots.choice import SnapshotError
 from service.snapshots.desk import LatestData
 from service.snapshots.path import MOST_REVOLUTIONS
 from service.snapshots.prediction import Prediction, predict
 from service.snapshots.revolutions import NewestBlocks
-from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (

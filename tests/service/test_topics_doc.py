@@ -15,11 +15,10 @@ from pydantic import BaseModel
 
 from models.signals.channels import ChannelDescriptor
 from models.signals.keys import MachineKeys
-from service.alarm_schemas import AlarmLogPage
-from service.alarms.alarm import EventKind
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates, EventKind
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, HealthState, Report
 from service.config import ServiceSettings, load_settings
-from service.reports import HealthState
-from service.schemas import AlarmCloudEvent, AlarmStates, Health, Report, example
 from simulator.truth import TruthRecord
 from tests.service.live import LAB, ROOT, Feed, endpoint, open_session, service, until
 

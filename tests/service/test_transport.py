@@ -11,9 +11,9 @@ import zenoh
 import zenoh.ext
 
 from models.signals.link import LinkSettings
-from service.alarm_schemas import AlarmLogPage
+from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
+from rotorwatch.records.health import Health
 from service.inbox import Inbox, RawBlock
-from service.schemas import AlarmStates, Health
 from service.store.errors import StoreError
 from service.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
 from tests.service.live import (

@@ -8,7 +8,7 @@ import typer
 from typer.testing import CliRunner
 
 from models.errors import MachineFileError
-from service.alarms.alarm import EventKind, Severity
+from rotorwatch.records.alarms import EventKind, Severity
 from service.commands import webhook as webhook_commands
 from service.config import load_settings
 from service.runtime import Runtime

@@ -11,30 +11,25 @@ from typing import Self, TypeVar
 import httpx
 from pydantic import BaseModel
 
-from service.alarm_schemas import Alarm, AlarmCloudEvent, AlarmStates
-from service.alarms.alarm import EventKind, Severity
-from service.alarms.life_cycle import AlarmState
-from service.alarms.operation import OperationKind
-from service.client.answers import refusal, understood
-from service.client.errors import ClientError, NoAnswer
-from service.client.event_stream import ServiceEvent, service_events
-from service.http.schemas import (
+from rotorwatch.client.answers import refusal, understood
+from rotorwatch.client.errors import ClientError, NoAnswer
+from rotorwatch.client.event_stream import ServiceEvent, service_events
+from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmState, AlarmStates, EventKind, Severity
+from rotorwatch.records.health import Health, Report
+from rotorwatch.records.history import (
     AlarmEventList,
     AuditList,
     AuditRecord,
-    MachineConfiguration,
-    MachineList,
-    OperationDone,
     Reading,
     ReadingBucket,
     ReadingList,
     ReportList,
 )
-from service.schemas import DetectableChanges, Health, MachineDescription, Report
-from service.snapshots.choice import Units
-from service.snapshots.schemas import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
+from rotorwatch.records.operations import OperationDone, OperationKind
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 
-__all__ = ["TOKEN_VARIABLE", "Rotorwatch"]
+__all__ = ["TOKEN_VARIABLE", "Client"]
 
 TOKEN_VARIABLE = "ROTORWATCH_TOKEN"  # noqa: S105  # the name of a variable
 _PAGE = 500
@@ -47,7 +42,7 @@ M = TypeVar("M", bound=BaseModel)
 _Parameter = str | int | float | bool | None | Sequence[str]
 
 
-class Rotorwatch:
+class Client:
     """A connection to a monitor.
 
     Machines are named as ``<site>/<machine>``. What changes an alarm takes the `Alarm` as it was seen: it is done only
@@ -74,7 +69,7 @@ class Rotorwatch:
 
     Examples
     --------
-    >>> with Rotorwatch("http://127.0.0.1:8080") as plant:
+    >>> with Client("http://127.0.0.1:8080") as plant:
     ...     print(plant.health("demo/lab").state)  # doctest: +SKIP
     """
 

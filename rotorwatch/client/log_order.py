@@ -8,8 +8,8 @@ publisher's cache (only the latest), and from the log itself by query (always co
     alarm/state --------> announce(latest) ┘                  └ incomplete: ask the log after `ask_after`
 """
 
-from service.alarm_schemas import AlarmCloudEvent, AlarmLogPage
-from service.client.errors import LogReplaced
+from rotorwatch.client.errors import LogReplaced
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage
 
 __all__ = ["LogOrder"]
 

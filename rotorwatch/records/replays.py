@@ -1,18 +1,30 @@
-"""JSON about replays: how far one is, what it found, and how one is asked for."""
+"""Replays: how one is asked for, how far one is, what it found."""
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
-__all__ = ["OfflineSummary", "ReplayJob", "ReplayLine", "ReplayProgress", "ReplayRequest", "ReplaySeek"]
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.fields import JSON
+from rotorwatch.records.health import Report
 
-_JSON = ConfigDict(extra="forbid", frozen=True)
+__all__ = [
+    "OfflineSummary",
+    "ReplayAlarmList",
+    "ReplayJob",
+    "ReplayLine",
+    "ReplayList",
+    "ReplayProgress",
+    "ReplayReportList",
+    "ReplayRequest",
+    "ReplaySeek",
+]
 
 
 class ReplayProgress(BaseModel):
     """How far a replay is."""
 
-    model_config = _JSON
+    model_config = JSON
 
     fraction: float = Field(ge=0, le=1, description="of the recorded time to be replayed", examples=[0.5])
     position_ns: int = Field(
@@ -28,7 +40,7 @@ class ReplayProgress(BaseModel):
 class OfflineSummary(BaseModel):
     """What an offline replay found."""
 
-    model_config = _JSON
+    model_config = JSON
 
     site: str = Field(description="site of the machine whose file was used", examples=["demo"])
     machine: str = Field(description="its name", examples=["lab"])
@@ -57,7 +69,7 @@ class OfflineSummary(BaseModel):
 class ReplayLine(BaseModel):
     """One line of a program that replays: progress, or the summary at the end."""
 
-    model_config = _JSON
+    model_config = JSON
 
     kind: Literal["progress", "summary"]
     progress: ReplayProgress | None = None
@@ -67,7 +79,7 @@ class ReplayLine(BaseModel):
 class ReplayRequest(BaseModel):
     """A replay to be started."""
 
-    model_config = _JSON
+    model_config = JSON
 
     recordings: tuple[str, ...] = Field(
         min_length=1,
@@ -104,7 +116,7 @@ class ReplayRequest(BaseModel):
 class ReplayJob(BaseModel):
     """A replay that was started over HTTP."""
 
-    model_config = _JSON
+    model_config = JSON
 
     id: str = Field(description="names the replay until the service stops", examples=["5f2b9c0d1a7e"])
     state: Literal["running", "paused", "finished", "stopped", "failed"] = Field(
@@ -136,7 +148,7 @@ class ReplayJob(BaseModel):
 class ReplaySeek(BaseModel):
     """Where a replay is to go on: a time, or a distance from where it is."""
 
-    model_config = _JSON
+    model_config = JSON
 
     to_ns: int | None = Field(default=None, ge=0, description="time of recording", examples=[1767225700000000000])
     by_s: float | None = Field(
@@ -152,3 +164,32 @@ class ReplaySeek(BaseModel):
         if (self.to_ns is None) == (self.by_s is None):
             raise ValueError("give either to_ns or by_s")
         return self
+
+
+class ReplayList(BaseModel):
+    """Replays since the service started, the latest first."""
+
+    model_config = JSON
+
+    replays: tuple[ReplayJob, ...] = Field(description="the latest first")
+
+
+_NEXT = "pass it as offset to go on; null if there is no more yet"
+
+
+class ReplayReportList(BaseModel):
+    """Window reports of a replay, in the order of the data."""
+
+    model_config = JSON
+
+    reports: tuple[Report, ...] = Field(description="oldest first")
+    next_offset: int | None = Field(description=_NEXT, examples=[100])
+
+
+class ReplayAlarmList(BaseModel):
+    """Alarm events of a replay, in the order of the data."""
+
+    model_config = JSON
+
+    events: tuple[AlarmCloudEvent, ...] = Field(description="oldest first")
+    next_offset: int | None = Field(description=_NEXT, examples=[100])

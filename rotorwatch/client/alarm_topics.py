@@ -9,18 +9,16 @@ from typing import Literal
 import zenoh
 import zenoh.ext
 
-from models.errors import RotorwatchError
-from models.signals.keys import PREFIX
-from models.signals.link import LinkSettings
-from service.transport import Link
+from rotorwatch.client.errors import ClientError
 
 __all__ = ["AlarmMessage", "AlarmTopics", "LogUnavailable"]
 
+_PREFIX = "rotorwatch"
 _ANSWER_S = 5.0
 _CACHED_EVENTS = 200
 
 
-class LogUnavailable(RotorwatchError):  # noqa: N818  # said to whoever follows, by its name
+class LogUnavailable(ClientError):  # noqa: N818  # said to whoever follows, by its name
     """A monitor could not answer from its alarm log; the message is the monitor's."""
 
 
@@ -34,13 +32,13 @@ class AlarmMessage:
         ``<site>/<machine>``.
     kind : {"event", "state", "monitor"}
         An alarm event, the alarms as they are now, or a monitor that has come.
-    text : str
+    text : bytes
         JSON; empty for a monitor.
     """
 
     place: str
     kind: Literal["event", "state", "monitor"]
-    text: str
+    text: bytes
 
 
 class AlarmTopics:
@@ -50,27 +48,21 @@ class AlarmTopics:
 
     Parameters
     ----------
-    settings : LinkSettings
-        Where to connect.
+    session : zenoh.Session
+        Open, and open for as long as this is.
     machines : sequence of str
         ``<site>/<machine>``, where ``*`` stands for any.
     hear : callable
         Takes each message, on a thread of Zenoh's: be short. Latest states and events that monitors still have come at
         once, possibly out of order and more than once.
-
-    Raises
-    ------
-    LinkError
-        If an endpoint is malformed, or a client finds nobody there. A peer waits in the background.
     """
 
-    def __init__(self, settings: LinkSettings, machines: Sequence[str], hear: Callable[[AlarmMessage], None]) -> None:
+    def __init__(self, session: zenoh.Session, machines: Sequence[str], hear: Callable[[AlarmMessage], None]) -> None:
+        self._session = session
         self._hear = hear
         with ExitStack() as undo:
-            self._link = Link(settings)
-            undo.callback(self._link.close)
             for place in machines:
-                self._subscribe(f"{PREFIX}/{place}", undo)
+                self._subscribe(f"{_PREFIX}/{place}", undo)
             self._undo = undo.pop_all()
 
     def __enter__(self) -> "AlarmTopics":
@@ -80,7 +72,7 @@ class AlarmTopics:
         self.close()
 
     def close(self) -> None:
-        """Close the session."""
+        """End the subscriptions."""
         self._undo.close()
 
     def ask(self, place: str, after: int, limit: int) -> str | None:
@@ -106,8 +98,8 @@ class AlarmTopics:
             If the monitor cannot read its history now.
         """
         refusal = ""
-        selector = f"{PREFIX}/{place}/alarm/event?after={after};limit={limit}"
-        for reply in self._link.session.get(selector, timeout=_ANSWER_S):
+        selector = f"{_PREFIX}/{place}/alarm/event?after={after};limit={limit}"
+        for reply in self._session.get(selector, timeout=_ANSWER_S):
             if reply.ok is not None:
                 return reply.ok.payload.to_string()
             if reply.err is not None:
@@ -117,17 +109,17 @@ class AlarmTopics:
         return None
 
     def _subscribe(self, root: str, undo: ExitStack) -> None:
-        session, guarded = self._link.session, self._link.guarded
         for suffix, kept in (("alarm/event", _CACHED_EVENTS), ("alarm/state", 1)):
             subscriber = zenoh.ext.declare_advanced_subscriber(
-                session,
+                self._session,
                 f"{root}/{suffix}",
-                guarded(self._take),
+                self._take,
                 history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=kept),
                 recovery=zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
             )
             undo.callback(subscriber.undeclare)
-        alive = session.liveliness().declare_subscriber(f"{root}/alive/monitor", guarded(self._take), history=True)
+        liveliness = self._session.liveliness()
+        alive = liveliness.declare_subscriber(f"{root}/alive/monitor", self._take, history=True)
         undo.callback(alive.undeclare)
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -136,9 +128,9 @@ class AlarmTopics:
         _, site, machine, topic, what = str(sample.key_expr).split("/")
         place = f"{site}/{machine}"
         if topic == "alive":
-            self._hear(AlarmMessage(place, "monitor", ""))
+            self._hear(AlarmMessage(place, "monitor", b""))
         else:
-            self._hear(AlarmMessage(place, "event" if what == "event" else "state", sample.payload.to_string()))
+            self._hear(AlarmMessage(place, "event" if what == "event" else "state", sample.payload.to_bytes()))
 
 
 def _refusal(payload: bytes) -> str:

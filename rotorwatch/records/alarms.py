@@ -1,46 +1,74 @@
-"""JSON of alarms that leaves the monitor: what they are now, and what happened to them."""
+"""Alarms: what they are now, and what happened to them."""
 
+from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
-from service.alarms.alarm import EventKind, Severity
-from service.alarms.life_cycle import AlarmState
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Site
 
 __all__ = [
-    "EXAMPLE_NS",
-    "JSON",
     "Alarm",
     "AlarmCloudEvent",
     "AlarmEventData",
     "AlarmLogPage",
+    "AlarmState",
     "AlarmStates",
-    "BundleIdentity",
+    "EventKind",
     "Evidence",
-    "MachineHash",
-    "Name",
+    "Severity",
     "Shelf",
-    "Site",
 ]
 
-JSON = ConfigDict(extra="forbid", frozen=True)
-EXAMPLE_NS = 1767225805000000000
 
-Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
-Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
-BundleIdentity = Annotated[
-    str | None,
-    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
-]
-MachineHash = Annotated[
-    str,
-    Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
-]
+class Severity(StrEnum):
+    """How serious a raised alarm is."""
+
+    ALERT = "alert"
+    DANGER = "danger"
+
+
+class EventKind(StrEnum):
+    """What happened to an alarm, in the log."""
+
+    RAISED = "raised"
+    ESCALATED = "escalated"
+    CLEARED = "cleared"
+    ACKNOWLEDGED = "acknowledged"
+    RESET = "reset"
+    SHELVED = "shelved"
+    UNSHELVED = "unshelved"
+    SUPPRESSED = "suppressed"
+    UNSUPPRESSED = "unsuppressed"
+    REMOVED_FROM_SERVICE = "removed-from-service"
+    RETURNED_TO_SERVICE = "returned-to-service"
+
+
+class AlarmState(StrEnum):
+    """Where an alarm is."""
+
+    NORMAL = "normal"
+    UNACKNOWLEDGED = "unacknowledged"
+    ACKNOWLEDGED = "acknowledged"
+    RETURNED = "returned"
+    LATCHED_UNACKNOWLEDGED = "latched-unacknowledged"
+    LATCHED_ACKNOWLEDGED = "latched-acknowledged"
+    SHELVED = "shelved"
+    SUPPRESSED = "suppressed"
+    OUT_OF_SERVICE = "out-of-service"
+
+    @property
+    def annunciated(self) -> bool:
+        """Whether operators are told of what happens to the alarm."""
+        return self not in {AlarmState.SHELVED, AlarmState.SUPPRESSED, AlarmState.OUT_OF_SERVICE}
+
 
 _STATE_TEXT = (
     "normal, unacknowledged, acknowledged, returned (cleared, not acknowledged), latched-unacknowledged or "
     "latched-acknowledged (cleared, to be reset), shelved, suppressed (by a rule), out-of-service"
 )
+
+
 _AlarmName = Annotated[
     str,
     Field(
@@ -49,17 +77,27 @@ _AlarmName = Annotated[
         examples=["k_by"],
     ),
 ]
+
+
 _AlarmChange = Annotated[
     float | None, Field(description="relative change that decided; null for what is no parameter", examples=[-0.247])
 ]
+
+
 _AlarmError = Annotated[float | None, Field(description="its standard error", examples=[0.0071])]
+
+
 _AlarmInterval = Annotated[
     tuple[float, float] | None, Field(description="its 95 % interval", examples=[(-0.261, -0.233)])
 ]
+
+
 _LowConfidence = Annotated[
     bool,
     Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
 ]
+
+
 _Note = Annotated[str, Field(description="what is known of it, in a sentence; empty for a parameter", examples=[""])]
 
 

@@ -1,15 +1,14 @@
-"""JSON of the snapshots of a live machine.
+"""Snapshots of a live machine.
 
-Conventions as in `service.schemas`, but for one thing: what has the unit of a channel, or of two channels' product,
-says in `unit` which that is. Arrays that belong together have one length, which their descriptions name. Numbers have
-six significant digits; null stands for what is not known.
+What has the unit of a channel, or of two channels' product, says in `unit` which that is. Arrays that belong together
+have one length, which their descriptions name. Numbers have six significant digits; null stands for what is not known.
 """
 
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from service.window_schemas import JSON
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Site
 
 __all__ = [
     "ChannelDensity",
@@ -24,33 +23,38 @@ __all__ = [
     "RunningSpeedVector",
     "SpectrumSnapshot",
     "Theory",
+    "Units",
 ]
 
-_NS = 1767225805000000000
+Units = Literal["channel", "SI"]
+
 _Series = tuple[float | None, ...]
 
-_Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]
-_Name = Annotated[str, Field(description="name of the machine", examples=["lab"])]
-_Bundle = Annotated[
-    str | None,
-    Field(description="identity of what was trained and commissioned; null without", examples=["lab-3f9c1e0b7a52"]),
-]
-_MachineHash = Annotated[
-    str,
-    Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
-]
+
 _StartNs = Annotated[
-    int | None, Field(description="oldest data in the window; null without one", examples=[_NS - 60_000_000_000])
+    int | None, Field(description="oldest data in the window; null without one", examples=[EXAMPLE_NS - 60_000_000_000])
 ]
-_EndNs = Annotated[int | None, Field(description="end of the newest data in the window", examples=[_NS])]
+
+
+_EndNs = Annotated[int | None, Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])]
+
+
 _Filled = Annotated[float, Field(description="fraction of a full window that is there now", examples=[1.0])]
+
+
 _Speed = Annotated[
     float | None, Field(description="mean speed in the window; null if it is not known", examples=[138.23])
 ]
+
+
 _Reason = Annotated[str, Field(description="why there is nothing to show; empty if there is", examples=[""])]
+
+
 _SumUnit = Annotated[
     str, Field(description="unit of the values: a product of the two channels' units", examples=["um^2"])
 ]
+
+
 _DensityUnit = Annotated[
     str, Field(description="unit of the values: a product of two channels' units, per Hz", examples=["um^2/Hz"])
 ]
@@ -122,8 +126,8 @@ class CorrelationSnapshot(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
+    site: Site
+    machine: Name
     start_ns: _StartNs
     end_ns: _EndNs
     filled: _Filled
@@ -141,8 +145,8 @@ class CorrelationSnapshot(BaseModel):
     pairs: tuple[CorrelationPair, ...] = Field(description="pair by pair")
     theory: Theory = Field(description="what the predictions are of")
     reason: _Reason
-    bundle: _Bundle
-    machine_hash: _MachineHash
+    bundle: BundleIdentity
+    machine_hash: MachineHash
 
 
 class ChannelDensity(BaseModel):
@@ -199,8 +203,8 @@ class SpectrumSnapshot(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
+    site: Site
+    machine: Name
     start_ns: _StartNs
     end_ns: _EndNs
     filled: _Filled
@@ -233,8 +237,8 @@ class SpectrumSnapshot(BaseModel):
     cross: tuple[CrossSpectrum, ...] = Field(description="pair by pair, those asked for")
     theory: Theory = Field(description="what the predictions are of")
     reason: _Reason
-    bundle: _Bundle
-    machine_hash: _MachineHash
+    bundle: BundleIdentity
+    machine_hash: MachineHash
 
 
 class RunningSpeedVector(BaseModel):
@@ -310,8 +314,8 @@ class OrbitSnapshot(BaseModel):
 
     model_config = JSON
 
-    site: _Site
-    machine: _Name
+    site: Site
+    machine: Name
     start_ns: _StartNs
     end_ns: _EndNs
     filled: _Filled
@@ -322,7 +326,7 @@ class OrbitSnapshot(BaseModel):
     orbits: tuple[PlaceOrbit, ...] = Field(description="place by place")
     revolutions: int = Field(description="whole revolutions in `path`, 0 without", examples=[8])
     path_start_ns: int | None = Field(
-        description="time of the first sample in `path`; null without", examples=[_NS - 400_000_000]
+        description="time of the first sample in `path`; null without", examples=[EXAMPLE_NS - 400_000_000]
     )
     pulses_s: tuple[float, ...] = Field(
         description="when the shaft angle was 0, after `path_start_ns`: revolutions + 1 values",
@@ -331,5 +335,5 @@ class OrbitSnapshot(BaseModel):
     theory: Theory = Field(description="what the predictions are of")
     reason: str = Field(description="why there is no ellipse; empty if there is", examples=[""])
     path_reason: str = Field(description="why there is no path, or a shorter one; empty otherwise", examples=[""])
-    bundle: _Bundle
-    machine_hash: _MachineHash
+    bundle: BundleIdentity
+    machine_hash: MachineHash

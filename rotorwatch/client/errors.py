@@ -2,18 +2,15 @@
 
 ::
 
-    RotorwatchError
-    └── ClientError
-        ├── LogReplaced           the alarm log is another one than that which was followed
-        ├── NoAnswer              nobody answered, or not in time
-        └── RequestRefused        the service said no: `status` and the problem's text
-            ├── AccessRefused         401, 403: no token, or one without the scope
-            ├── NotFound              404: no such machine, alarm, ...
-            ├── Conflict              409, 412: the alarm is no longer as it was seen, or its state does not allow it
-            └── Unavailable           429, 503: try again later
+    ClientError
+    ├── LogReplaced           the alarm log is another one than that which was followed
+    ├── NoAnswer              nobody answered, or not in time
+    └── RequestRefused        the service said no: `status` and the problem's text
+        ├── AccessRefused         401, 403: no token, or one without the scope
+        ├── NotFound              404: no such machine, alarm, ...
+        ├── Conflict              409, 412: the alarm is no longer as it was seen, or its state does not allow it
+        └── Unavailable           429, 503: try again later
 """
-
-from models.errors import RotorwatchError
 
 __all__ = [
     "AccessRefused",
@@ -27,7 +24,7 @@ __all__ = [
 ]
 
 
-class ClientError(RotorwatchError):
+class ClientError(Exception):
     """Everything a client raises."""
 
 

@@ -5,8 +5,8 @@ from typing import TypeVar
 import httpx
 from pydantic import BaseModel, ValidationError
 
-from service.client.errors import AccessRefused, ClientError, Conflict, NotFound, RequestRefused, Unavailable
-from service.schemas import Problem
+from rotorwatch.client.errors import AccessRefused, ClientError, Conflict, NotFound, RequestRefused, Unavailable
+from rotorwatch.records.monitor import Problem
 
 __all__ = ["refusal", "understood"]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import httpx
 from httpx_sse import SSEError, connect_sse
 
-from service.alarm_schemas import AlarmCloudEvent
-from service.client.answers import refusal, understood
-from service.client.errors import Conflict, LogReplaced, NoAnswer, Unavailable
-from service.schemas import Health
+from rotorwatch.client.answers import refusal, understood
+from rotorwatch.client.errors import Conflict, LogReplaced, NoAnswer, Unavailable
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.health import Health
 
 __all__ = ["ServiceEvent", "service_events"]
 

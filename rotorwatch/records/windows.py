@@ -1,35 +1,14 @@
-"""JSON of what is said of a window: parameters, equations, opinions, verdict, sensors.
+"""What is said of a window: parameters, equations, opinions, verdict, sensors."""
 
-Conventions as in `service.schemas`.
-"""
+from typing import Literal
 
-from typing import Annotated
+from pydantic import BaseModel, Field
 
-from pydantic import BaseModel, ConfigDict, Field
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, Reason
 
-from models.diagnosis.verdict.agreement import Verdict as AgreementVerdict
-
-__all__ = [
-    "JSON",
-    "Agreement",
-    "Detectable",
-    "Equation",
-    "Finding",
-    "Opinion",
-    "Parameter",
-    "Reason",
-    "SensorFault",
-    "Shape",
-    "Verdict",
-]
-
-JSON = ConfigDict(extra="forbid", frozen=True)
-"""Of every model."""
-
-_NS = 1767225805000000000
+__all__ = ["Agreement", "Detectable", "Equation", "Finding", "Opinion", "Parameter", "SensorFault", "Shape", "Verdict"]
 
 Interval = tuple[float, float]
-Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]
 
 
 class Parameter(BaseModel):
@@ -75,7 +54,7 @@ class Agreement(BaseModel):
 
     name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
     between: tuple[str, str] = Field(description="who is compared", examples=[("likelihood", "relation")])
-    verdict: AgreementVerdict = Field(
+    verdict: Literal["agree", "disagree", "only-one"] = Field(
         description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
     )
     difference_z: float | None = Field(
@@ -103,9 +82,9 @@ class Finding(BaseModel):
     text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
     since_ns: int = Field(
         description="start of the stretch of data that found it first: the date of the change, as far as it is known",
-        examples=[_NS - 20_000_000_000],
+        examples=[EXAMPLE_NS - 20_000_000_000],
     )
-    found_ns: int = Field(description="end of that stretch", examples=[_NS - 10_000_000_000])
+    found_ns: int = Field(description="end of that stretch", examples=[EXAMPLE_NS - 10_000_000_000])
     stretch_s: float = Field(description="length of that stretch", examples=[10.0])
 
 

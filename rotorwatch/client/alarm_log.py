@@ -6,13 +6,13 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 
+import zenoh
 from pydantic import ValidationError
 
-from models.signals.link import LinkSettings
-from service.alarm_schemas import AlarmCloudEvent, AlarmLogPage, AlarmStates
-from service.alarm_topics import AlarmMessage, AlarmTopics, LogUnavailable
-from service.client.errors import ClientError
-from service.client.log_order import LogOrder
+from rotorwatch.client.alarm_topics import AlarmMessage, AlarmTopics, LogUnavailable
+from rotorwatch.client.errors import ClientError
+from rotorwatch.client.log_order import LogOrder
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 
 __all__ = ["follow_alarms"]
 
@@ -25,7 +25,7 @@ _log = logging.getLogger("rotorwatch.client")
 
 
 def follow_alarms(
-    link: LinkSettings,
+    session: zenoh.Session,
     machines: Sequence[str],
     after: Mapping[str, int],
     on_event: Callable[[AlarmCloudEvent], None],
@@ -41,8 +41,8 @@ def follow_alarms(
 
     Parameters
     ----------
-    link : LinkSettings
-        Where to connect.
+    session : zenoh.Session
+        An open session with the network of the monitors. It stays open; a connection that is lost comes back by itself.
     machines : sequence of str
         ``<site>/<machine>``, where ``*`` stands for any.
     after : mapping of str to int
@@ -58,14 +58,12 @@ def follow_alarms(
 
     Raises
     ------
-    LinkError
-        If an endpoint is malformed, or (as a client) nobody answers there at the start.
     LogReplaced
         If a log is not the one that was followed: it ends before `after`, or its last event has changed.
     ClientError
         If a monitor sends something that this version does not understand.
     """
-    _Follower(machines, after, on_event, stop or threading.Event(), ask_every_s).run(link)
+    _Follower(machines, after, on_event, stop or threading.Event(), ask_every_s).run(session)
 
 
 class _Follower:
@@ -90,8 +88,8 @@ class _Follower:
             if "*" not in place:
                 self._order(place)
 
-    def run(self, link: LinkSettings) -> None:
-        with AlarmTopics(link, self._machines, self._hear) as topics:
+    def run(self, session: zenoh.Session) -> None:
+        with AlarmTopics(session, self._machines, self._hear) as topics:
             while not self._stop.is_set():
                 now_s = time.monotonic()
                 due = [place for place, due_s in self._due_s.items() if due_s <= now_s]

@@ -1,66 +1,12 @@
-"""JSON of the HTTP API beyond what is also published: lists with cursors, orders of operators, the audit log.
-
-Conventions as in `service.schemas`.
-"""
-
-from typing import Annotated
+"""What has been: lists with cursors, readings over time, the audit log."""
 
 from pydantic import BaseModel, Field
 
-from models.machine import MachineFile, load_machine
-from service.alarm_schemas import EXAMPLE_NS, Alarm, AlarmCloudEvent, BundleIdentity, MachineHash, Name, Site
-from service.alarms.life_cycle import AlarmState
-from service.schemas import MachineDescription, Report, example
-from service.window_schemas import JSON
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.fields import EXAMPLE_NS, JSON
+from rotorwatch.records.health import Report
 
-__all__ = [
-    "AlarmEventList",
-    "Alive",
-    "AuditList",
-    "AuditRecord",
-    "MachineConfiguration",
-    "MachineList",
-    "OperationDone",
-    "OperationOrder",
-    "Reading",
-    "ReadingBucket",
-    "ReadingList",
-    "ReasonedOrder",
-    "ReportList",
-    "ShelveOrder",
-    "configuration_example",
-]
-
-_LONGEST_REASON = 500
-_PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
-
-
-class Alive(BaseModel):
-    """The process answers."""
-
-    model_config = JSON
-
-    alive: bool = Field(description="always true", examples=[True])
-
-
-class MachineList(BaseModel):
-    """Every monitored machine."""
-
-    model_config = JSON
-
-    machines: tuple[MachineDescription, ...] = Field(description="in the order of the settings")
-
-
-class MachineConfiguration(BaseModel):
-    """What a machine is monitored with."""
-
-    model_config = JSON
-
-    site: Site
-    machine: Name
-    file: MachineFile = Field(description="the machine file, what it leaves out filled in")
-    bundle: BundleIdentity
-    machine_hash: MachineHash
+__all__ = ["AlarmEventList", "AuditList", "AuditRecord", "Reading", "ReadingBucket", "ReadingList", "ReportList"]
 
 
 class ReportList(BaseModel):
@@ -136,68 +82,6 @@ class ReadingList(BaseModel):
     )
 
 
-_Reason = Annotated[
-    str,
-    Field(
-        max_length=_LONGEST_REASON,
-        pattern=_PRINTABLE,
-        description="why; it goes into the log of alarms and the audit log",
-        examples=["sensor cable is being replaced"],
-    ),
-]
-_GivenReason = Annotated[_Reason, Field(pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")]
-_ExpectedState = Annotated[
-    AlarmState | None,
-    Field(description="state in which you saw the alarm; needed without If-Match", examples=["unacknowledged"]),
-]
-
-
-class OperationOrder(BaseModel):
-    """What an operator says when acknowledging, unshelving, resetting, or returning to service."""
-
-    model_config = JSON
-
-    reason: _Reason = ""
-    expected_state: _ExpectedState = None
-
-
-class ReasonedOrder(BaseModel):
-    """What is said when taking an alarm out of service."""
-
-    model_config = JSON
-
-    reason: _GivenReason
-    expected_state: _ExpectedState = None
-
-
-class ShelveOrder(BaseModel):
-    """What an operator says when shelving."""
-
-    model_config = JSON
-
-    reason: _GivenReason
-    duration_s: float | None = Field(
-        default=None,
-        gt=0,
-        allow_inf_nan=False,
-        description="for how long, data time; left out: as long as the machine file allows (`longest_shelf_s`)",
-        examples=[3600.0],
-    )
-    one_shot: bool = Field(
-        default=False, description="end it when the condition clears, if that is earlier", examples=[False]
-    )
-    expected_state: _ExpectedState = None
-
-
-class OperationDone(BaseModel):
-    """What came of an operation."""
-
-    model_config = JSON
-
-    alarm: Alarm = Field(description="as it is afterwards; its version is the new ETag")
-    events: tuple[AlarmCloudEvent, ...] = Field(description="what happened")
-
-
 class AuditRecord(BaseModel):
     """One entry of the audit log."""
 
@@ -228,10 +112,3 @@ class AuditList(BaseModel):
     next_before: int | None = Field(
         description="pass it as `before` to get what is older; null if there is nothing older", examples=[291]
     )
-
-
-def configuration_example() -> dict[str, object]:
-    """A configuration of the shipped machine ``lab``."""
-    plain = load_machine("lab").model_dump(mode="json")
-    heading = {name: example(MachineDescription)[name] for name in ("site", "machine", "bundle", "machine_hash")}
-    return {**heading, "file": plain}

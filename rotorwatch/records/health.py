@@ -1,0 +1,170 @@
+"""How a machine is: window by window, and where it stands now."""
+
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, Field
+
+from rotorwatch.records.alarms import Alarm
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Reason, Site
+from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
+
+__all__ = ["Health", "HealthState", "Quality", "Report", "State", "StreamStatus"]
+
+
+class HealthState(StrEnum):
+    """Health of a machine in one word."""
+
+    WARMING = "warming"
+    HEALTHY = "healthy"
+    ALERT = "alert"
+    DANGER = "danger"
+    OUTSIDE_MODEL = "outside-model"
+    DATA_HEALTH = "data-health"
+    UNCHANGED = "unchanged"
+    NO_DATA = "no-data"
+    NOT_EVALUABLE = "not-evaluable"
+
+
+State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
+
+
+_MisfitZ = Annotated[
+    float | None,
+    Field(
+        description="distance of the window from what the model can explain, standard deviations; null without a test",
+        examples=[0.4],
+    ),
+]
+
+
+_Suspect = Annotated[
+    str, Field(description="what explains data outside the model best, if one thing does; else empty", examples=[""])
+]
+
+
+_Opinions = Annotated[tuple[Opinion, ...], Field(description="what the other diagnosticians read in the window")]
+
+
+_Verdict = Annotated[Verdict | None, Field(description="what has changed; null if the window was not evaluated")]
+
+
+_Detectable = Annotated[tuple[Detectable, ...], Field(description="what would have been found in this window")]
+
+
+_Sensors = Annotated[
+    tuple[SensorFault, ...],
+    Field(
+        description="faults of sensors in the window; with any of them nothing is said of the machine", examples=[()]
+    ),
+]
+
+
+_Shapes = Annotated[
+    tuple[Shape, ...],
+    Field(description="where no equation can be evaluated: whether each channel is as it was", examples=[()]),
+]
+
+
+class Report(BaseModel):
+    """One evaluation of the sliding window."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    start_ns: int = Field(description="oldest data in the window", examples=[EXAMPLE_NS - 60_000_000_000])
+    end_ns: int = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
+    state: State
+    filled: float = Field(description="fraction of a full window", examples=[1.0])
+    speed_rad_s: float | None = Field(description="mean speed in the window", examples=[138.23])
+    misfit_z: _MisfitZ
+    suspect: _Suspect
+    verdict: _Verdict
+    parameters: tuple[Parameter, ...] = Field(
+        description="readings of the whole window by the diagnostician that decides"
+    )
+    opinions: _Opinions
+    equations: tuple[Equation, ...] = Field(description="the networks' residuals, equation by equation")
+    detectable: _Detectable
+    sensors: _Sensors
+    shapes: _Shapes
+    reason: Reason
+    bundle: BundleIdentity
+    machine_hash: MachineHash
+
+
+class Quality(BaseModel):
+    """What came in since the monitor started."""
+
+    model_config = JSON
+
+    accepted_blocks: int = Field(description="blocks accepted", examples=[2051])
+    refused_blocks: dict[str, int] = Field(description="blocks refused, by reason", examples=[{"not-finite": 3}])
+    gaps: int = Field(description="interruptions before accepted blocks", examples=[1])
+    missing_s: float = Field(description="data time the gaps cost", examples=[0.3])
+    queue_dropped_blocks: int = Field(description="blocks dropped because the monitor could not keep up", examples=[0])
+    link_missed_blocks: int = Field(description="blocks lost on the way, as far as the link knows", examples=[0])
+    last_refusal: str = Field(
+        description="latest reason for refusing a block",
+        examples=["demo/lab: block 740, channel y1: sample 12 is nan, expected a finite number"],
+    )
+    last_gap: str = Field(description="latest gap", examples=["demo/lab: 0.3 s of data are missing (3 blocks)"])
+
+
+class StreamStatus(BaseModel):
+    """What is known about whoever publishes the stream."""
+
+    model_config = JSON
+
+    publisher_alive: bool = Field(
+        description="a publisher's liveliness token is there; publishers need not have one", examples=[True]
+    )
+    data_age_s: float | None = Field(
+        description="time since the last accepted block was processed; null before the first", examples=[0.04]
+    )
+    descriptor_mismatch: tuple[str, ...] = Field(
+        description="fields of the announced channel descriptor that differ from the machine file", examples=[()]
+    )
+
+
+class Health(BaseModel):
+    """Where a machine stands: state, latest window, alarms, quality of the data."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    state: HealthState = Field(
+        description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
+        "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence; outranks everything, see "
+        "`alarms`) or not-evaluable",
+        examples=["alert"],
+    )
+    reason: str = Field(description="why the state is no-data or not-evaluable; empty otherwise", examples=[""])
+    filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
+    window_start_ns: int | None = Field(
+        description="oldest data of the latest window", examples=[EXAMPLE_NS - 60_000_000_000]
+    )
+    window_end_ns: int | None = Field(description="end of the latest window", examples=[EXAMPLE_NS])
+    speed_rad_s: float | None = Field(description="mean speed in the latest window", examples=[138.23])
+    misfit_z: _MisfitZ
+    suspect: _Suspect
+    verdict: _Verdict
+    parameters: tuple[Parameter, ...] = Field(description="parameters in the latest window")
+    opinions: _Opinions
+    equations: tuple[Equation, ...] = Field(description="equations in the latest window")
+    detectable: _Detectable
+    sensors: _Sensors
+    shapes: _Shapes
+    alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
+    quality: Quality = Field(description="what came in")
+    stream: StreamStatus = Field(description="what is known about the publisher")
+    restart: str = Field(
+        description="what became of the state from before the latest start of the monitor; empty if there was none",
+        examples=["went on where it stood at 2026-01-01T00:02:55Z"],
+    )
+    worker_errors: int = Field(description="blocks lost to an error inside the monitor", examples=[0])
+    last_worker_error: str = Field(description="the latest of them; empty if none", examples=[""])
+    bundle: BundleIdentity
+    machine_hash: MachineHash

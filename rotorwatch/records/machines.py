@@ -1,0 +1,109 @@
+"""Machines: what they are, what they are monitored with, what would be found on them."""
+
+from pydantic import BaseModel, Field, JsonValue
+
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Site
+from rotorwatch.records.health import State
+
+__all__ = [
+    "Channel",
+    "DetectableChanges",
+    "DetectableParameter",
+    "MachineConfiguration",
+    "MachineDescription",
+    "MachineList",
+]
+
+
+class Channel(BaseModel):
+    """One column of a machine's stream."""
+
+    model_config = JSON
+
+    name: str = Field(description="name of the channel, unique in the stream", examples=["y1"])
+    quantity: str = Field(
+        description="displacement, velocity, acceleration, tilt, tilt_rate or shaft_angle", examples=["displacement"]
+    )
+    location: str = Field(description="bearing, disc or shaft", examples=["bearing"])
+    direction: str = Field(description="y, z or rotation", examples=["y"])
+    unit: str = Field(description="unit of the samples", examples=["um"])
+
+
+class MachineDescription(BaseModel):
+    """A monitored machine: what it is, what its stream looks like, where to find what is said about it."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    description: str = Field(description="from the machine file", examples=["Rotor kit with an overhung disc"])
+    state: State
+    speed_rpm: float | None = Field(
+        description="nominal speed, null where the machine file gives none", examples=[1320.0]
+    )
+    rate_hz: float = Field(description="samples per second and channel", examples=[2000.0])
+    channels: tuple[Channel, ...] = Field(
+        description="columns of the stream",
+        examples=[({"name": "y1", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"},)],
+    )
+    window_length_s: float = Field(description="length of the sliding window", examples=[60.0])
+    window_hop_s: float = Field(description="data time between reports", examples=[5.0])
+    keys: dict[str, str] = Field(
+        description="Zenoh keys by name",
+        examples=[{"stream": "rotorwatch/demo/lab/stream", "health": "rotorwatch/demo/lab/health"}],
+    )
+    bundle: BundleIdentity
+    machine_hash: MachineHash
+
+
+class MachineList(BaseModel):
+    """Every monitored machine."""
+
+    model_config = JSON
+
+    machines: tuple[MachineDescription, ...] = Field(description="in the order of the settings")
+
+
+class MachineConfiguration(BaseModel):
+    """What a machine is monitored with."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    file: dict[str, JsonValue] = Field(
+        description="the machine file, what it leaves out filled in", examples=[{"site": "demo", "name": "lab"}]
+    )
+    bundle: BundleIdentity
+    machine_hash: MachineHash
+
+
+class DetectableParameter(BaseModel):
+    """What it takes to find a change of one parameter."""
+
+    model_config = JSON
+
+    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    loss: float = Field(description="smallest relative change downwards found in one window", examples=[-0.025])
+    gain: float = Field(description="smallest relative change upwards found in one window", examples=[0.026])
+    length_s: float | None = Field(
+        description="data it takes to find the wished `change`; null without a wish", examples=[16.0]
+    )
+
+
+class DetectableChanges(BaseModel):
+    """What would be found on this machine as it runs now, with 95 % probability."""
+
+    model_config = JSON
+
+    site: Site
+    machine: Name
+    window_end_ns: int | None = Field(description="end of the window this is computed from", examples=[EXAMPLE_NS])
+    window_length_s: float = Field(description="length of the window", examples=[60.0])
+    false_alarms_per_month: float = Field(description="declared in the machine file", examples=[1.0])
+    change: float | None = Field(description="relative change asked for; null without", examples=[-0.05])
+    parameters: tuple[DetectableParameter, ...] = Field(description="one entry per parameter that can be read")
+    reason: str = Field(description="why there is no entry; empty otherwise", examples=[""])
+    bundle: BundleIdentity
+    machine_hash: MachineHash

@@ -1,0 +1,42 @@
+"""Recordings that a monitor keeps."""
+
+from pydantic import BaseModel, Field
+
+from rotorwatch.records.fields import JSON
+
+__all__ = ["RecordingDetail", "RecordingEntry", "RecordingList"]
+
+
+class RecordingEntry(BaseModel):
+    """One recording."""
+
+    model_config = JSON
+
+    id: str = Field(description="site, machine and file name", examples=["demo/lab/20260101T000000Z.mcap"])
+    site: str = Field(description="site of the machine", examples=["demo"])
+    machine: str = Field(description="name of the machine", examples=["lab"])
+    start_ns: int = Field(description="time of the first message", examples=[1767225600000000000])
+    end_ns: int = Field(description="time of the last message", examples=[1767225900000000000])
+    messages: int | None = Field(description="number of messages; null if incomplete or damaged", examples=[3001])
+    size_bytes: int = Field(description="size of the file", examples=[19231007])
+    complete: bool = Field(
+        description="false for a file that is being written, or was left by a crash", examples=[True]
+    )
+    kept_because: str = Field(description="which alarm keeps it beyond its time; empty if none", examples=[""])
+    problem: str = Field(description="why it cannot be read; empty if it can", examples=[""])
+
+
+class RecordingDetail(RecordingEntry):
+    """One recording with what is in it."""
+
+    keys: dict[str, int] = Field(
+        description="messages by key; empty if incomplete or damaged", examples=[{"rotorwatch/demo/lab/stream": 3000}]
+    )
+
+
+class RecordingList(BaseModel):
+    """Recordings by site, machine and time."""
+
+    model_config = JSON
+
+    recordings: tuple[RecordingEntry, ...] = Field(description="by site, machine and time")
