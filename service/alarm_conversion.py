@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from models.alarm_names import ALARM_TEXT
+from models.diagnosis.readings import Z95
 from rotorwatch import __version__
 from rotorwatch.records.alarms import Alarm as AlarmJson
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
@@ -137,7 +138,7 @@ def _alarm(alarm: Alarm) -> AlarmJson:
 
 def _interval(alarm: Alarm) -> tuple[float, float] | None:
     change, error = finite(alarm.change), finite(alarm.standard_error)
-    return None if change is None or error is None else (change - 1.96 * error, change + 1.96 * error)
+    return None if change is None or error is None else (change - Z95 * error, change + Z95 * error)
 
 
 def _evidence(evidence: Evidence | None) -> EvidenceJson | None:

@@ -2,13 +2,12 @@
 
 from datetime import UTC, datetime
 
+from models.diagnosis.readings import Z95
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
 __all__ = ["alarm_event_line", "alarm_state_lines", "health_line", "report_line"]
-
-_Z95 = 1.959964
 
 
 def report_line(report: Report) -> str:
@@ -110,4 +109,4 @@ def _change(name: str, change: float | None, standard_error: float | None) -> st
     if change is None or standard_error is None:
         return f"{name} n/a"
     # A true minus sign is as wide as the plus sign, so that columns stay put.
-    return f"{name} {100 * change:+5.1f}±{100 * _Z95 * standard_error:.1f} %".replace("-", "−")
+    return f"{name} {100 * change:+5.1f}±{100 * Z95 * standard_error:.1f} %".replace("-", "−")

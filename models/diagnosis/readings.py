@@ -8,9 +8,10 @@ import numpy as np
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-__all__ = ["Diagnosis", "Diagnostician", "EquationReading", "ParameterReading"]
+__all__ = ["Z95", "Diagnosis", "Diagnostician", "EquationReading", "ParameterReading"]
 
-_Z95 = 1.959964
+Z95 = 1.959964
+"""Standard errors on either side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +41,7 @@ class ParameterReading:
         """95 % interval of the change."""
         if self.change is None or self.standard_error is None:
             return None
-        return self.change - _Z95 * self.standard_error, self.change + _Z95 * self.standard_error
+        return self.change - Z95 * self.standard_error, self.change + Z95 * self.standard_error
 
     @property
     def z(self) -> float | None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 from models.alarm_names import ALARM_TEXT, CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST
+from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
 
@@ -192,7 +193,7 @@ class AlarmEvent:
             said = alarm.note or _RAISED.get(alarm.name, "")
             return f"{alarm.severity.upper()}: {words}" + (f": {said}" if said else "")
         what = f"{words} ({alarm.name})"
-        half = 1.96 * (alarm.standard_error or 0.0)
+        half = Z95 * (alarm.standard_error or 0.0)
         size = f"{alarm.change or 0.0:+.1%} ± {half:.1%}"
         reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
         match self.kind:

@@ -3,6 +3,7 @@
 import html
 from datetime import UTC, datetime
 
+from models.diagnosis.readings import Z95
 from rotorwatch.records.alarms import Alarm, Severity
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
@@ -145,5 +146,5 @@ def _other(opinion: Opinion, name: str) -> str:
     if said is None or said.relative_change is None or said.standard_error is None:
         return '<td class="number">–'
     apart = any(one.name == name and one.verdict == "disagree" for one in opinion.agreement)
-    text = f"{said.relative_change:+.1%} ± {1.96 * said.standard_error:.1%}"
+    text = f"{said.relative_change:+.1%} ± {Z95 * said.standard_error:.1%}"
     return f'<td class="number disagree">{text} disagrees' if apart else f'<td class="number">{text}'

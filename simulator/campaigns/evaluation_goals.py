@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
+from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.calibration import window_thresholds
 from models.diagnosis.verdict.stretch import to_scale
 from models.physics.parameters import PARAMETERS
@@ -50,7 +51,6 @@ _ANOMALY_TEXT = {
     Anomaly.ADDED_MASS: "deposit on the disc",
     Anomaly.GAIN_DRIFT: "gain of a sensor",
 }
-_Z95 = 1.959964
 _READ = ("k_by", "c_by", "k_bz", "c_bz", "e")
 _COVERED = (0.93, 0.97)
 _DETECTED = {
@@ -302,11 +302,11 @@ def length_exponent(summary: Summary, layout: Layout, name: str) -> Interval | N
         return None
     x = np.log([length_s for length_s, _ in points])
     y = np.log([ratio.value for _, ratio in points])
-    weight = np.array([(2 * _Z95 / np.log(ratio.high / ratio.low)) ** 2 for _, ratio in points])
+    weight = np.array([(2 * Z95 / np.log(ratio.high / ratio.low)) ** 2 for _, ratio in points])
     x = x - np.average(x, weights=weight)
     precision = float(np.sum(weight * x**2))
     slope = float(np.sum(weight * x * y)) / precision - 0.5
-    half = _Z95 / precision**0.5
+    half = Z95 / precision**0.5
     return Interval(value=slope, low=slope - half, high=slope + half)
 
 

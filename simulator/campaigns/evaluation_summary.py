@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 from simulator.campaigns.draws import Anomaly, Excitation, Layout
@@ -33,7 +34,6 @@ __all__ = [
 ]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
-_Z95 = 1.959964
 _RESAMPLINGS = 400
 _RESAMPLING_SEED = 20261
 _SHAFT = "EI"
@@ -379,7 +379,7 @@ def _parameter(name: str, asked: Sequence[tuple[WindowRecord, Opinion]]) -> Para
         bound=float(np.median(bound)) if bounded else None,
         bound_quantiles=tuple(np.quantile(bound, _STEPS).tolist()) if bounded else (),
         spread_in_bounds=_spread(deviation[bounded] / bound) if bounded else None,
-        covered=Rate.of_counts(int(np.sum(np.abs(deviation) <= _Z95 * error)), len(read)),
+        covered=Rate.of_counts(int(np.sum(np.abs(deviation) <= Z95 * error)), len(read)),
         found=_named_rates(name, altered),
         mistaken=_named_rates(name, unaltered),
     )
@@ -407,5 +407,5 @@ def _spread(values: FloatArray) -> Interval | None:
 def _mean(values: FloatArray) -> Interval:
     middle = float(np.mean(values))
     # One window has no scatter: there its own standard error is all that is known.
-    half = _Z95 * (float(np.std(values, ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 1.0)
+    half = Z95 * (float(np.std(values, ddof=1)) / len(values) ** 0.5 if len(values) > 1 else 1.0)
     return Interval(value=middle, low=middle - half, high=middle + half)

@@ -6,6 +6,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from models.commissioning.knowledge import KnowledgeLevel
+from models.diagnosis.readings import Z95
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.unknown_study import CELLS, UnknownPlan, UnknownRecord
@@ -13,7 +14,6 @@ from simulator.campaigns.unknown_study import CELLS, UnknownPlan, UnknownRecord
 __all__ = ["CellSummary", "Reading", "UnknownSummary", "pooled", "summarize_unknown"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
-_Z95 = 1.959964
 
 
 class Reading(BaseModel):
@@ -192,6 +192,6 @@ def _reading(name: str, truth: float, own: list[UnknownRecord]) -> Reading:
         windows=len(read),
         median=float(np.median(change)),
         median_error=float(np.median(error)),
-        covered=Rate.of_counts(int(np.sum(np.abs(z) <= _Z95)), len(read)),
+        covered=Rate.of_counts(int(np.sum(np.abs(z) <= Z95)), len(read)),
         z_rms=float(np.sqrt(np.mean(z**2))),
     )

@@ -9,13 +9,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from models.commissioning.report import CommissioningReport, HealthyReading, ParameterSummary
+from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.stretch import to_scale
 from simulator.commission.svg import COLOURS, GREY, INK, WIDTH_IN
 from simulator.commission.units import percent
 
 __all__ = ["draw_budget", "draw_readings"]
 
-_Z95 = 1.959964
 _ROW_IN, _PANEL_IN = 0.42, 1.75
 _ROOM = 0.35
 _MOST_LABELS = 24
@@ -59,7 +59,7 @@ def _readings(axes: Axes, parameter: ParameterSummary, recordings: Sequence[str]
             axes.axvline(start - 0.5, color=GREY, linewidth=0.7, linestyle=":")
         x = start + np.arange(len(own))
         change = 100 * np.array([one.relative_change for one in own])
-        reach = 100 * _Z95 * np.array([one.standard_error for one in own])
+        reach = 100 * Z95 * np.array([one.standard_error for one in own])
         axes.errorbar(
             x, change, yerr=reach, color=COLOURS[number % len(COLOURS)], marker="o", markersize=4, linestyle="",
             linewidth=1.1, capsize=2.5,

@@ -1,5 +1,7 @@
 """The likelihood: derivatives, readings of independent windows against the truth, the bound, and what is outside."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -167,6 +169,16 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
     assert from_first.steps <= 15
     for one, other in zip(from_first.parameters, cold.parameters, strict=True):
         assert abs((one.change or 0) - (other.change or 0)) < 0.4 * (other.standard_error or 0)
+
+
+def test_windows_of_the_same_size_at_other_frequencies_have_groups_of_their_own() -> None:
+    machine = load_machine("lab")
+    window = simulate_window(Draw(machine, SEED, Purpose.EVALUATION, 20, layout=Layout.INDEPENDENT), 0)
+    stretched = replace(window, frequencies_hz=1.1 * window.frequencies_hz, speed_rad_s=1.1 * window.speed_rad_s)
+    used = LikelihoodFit(machine)
+    used.diagnose(window)
+    used.reset()
+    assert used.diagnose(stretched).parameters == LikelihoodFit(machine).diagnose(stretched).parameters
 
 
 def test_a_dead_channel_is_named() -> None:

@@ -332,8 +332,8 @@ class LikelihoodFit:
         )
 
     def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
-        """Groups for a set of excluded bins, remembered while the speed stays in the same bin."""
-        key = excluded.tobytes() + bytes([int(coarser)])
+        """Groups for frequencies and excluded bins, remembered while the speed stays in the same bin."""
+        key = frequencies_hz.tobytes() + excluded.tobytes() + bytes([int(coarser)])
         if key not in self._groups:
             if len(self._groups) >= 8:
                 self._groups.clear()

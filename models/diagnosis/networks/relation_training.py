@@ -11,6 +11,7 @@ import torch
 
 from models.diagnosis.networks.equations import Equation, SynchronousEquation
 from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy, Network, read_equation, window_view
+from models.diagnosis.readings import Z95
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
@@ -22,7 +23,7 @@ _ROUNDS = 40
 _STEPS_PER_ROUND = 25
 
 _LEVELS = [0.9, 0.95]
-_NORMAL = np.array([[1.644854], [1.959964]])
+_NORMAL = np.array([[1.644854], [Z95]])
 """Quantiles of |z| that calibrate the standard errors, and the normal distribution's: two scatter less than one."""
 _MAD = 1.4826
 """Median absolute deviation to standard deviation."""
