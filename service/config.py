@@ -106,7 +106,12 @@ class HistorySettings(BaseModel):
         if self.url is not None:
             return self.url
         folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "rotorwatch"
-        return f"sqlite:///{folder / 'history.sqlite'}"
+        return f"sqlite:///{folder.absolute() / 'history.sqlite'}"
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether no other program finds what is kept."""
+        return self.database.endswith(":memory:")
 
 
 class RecordingSettings(BaseModel):

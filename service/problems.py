@@ -1,12 +1,14 @@
 """Errors of the HTTP API as problem details (RFC 9457), and how OpenAPI tells of them."""
 
 from collections.abc import Awaitable, Callable
+from difflib import SequenceMatcher
 from http import HTTPStatus
 from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from fastapi.routing import iter_route_contexts
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException as StarletteHTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -21,13 +23,16 @@ __all__ = ["add_problems", "problem_answer", "problem_responses", "responses"]
 _PROBLEM = "application/problem+json"
 _ANYWHERE = (422, 429, 500)
 _GUARDED = (401, 403, 503)
+_BEGINNING = ["api", "v1"]
+_LIKENESS = 0.6
+_LONGEST_PATH = 128
 _HEADERS: dict[int, dict[str, Any]] = {
     401: {"WWW-Authenticate": {"description": "how to show who you are", "schema": {"type": "string"}}},
     429: {"Retry-After": {"description": "seconds to wait", "schema": {"type": "integer"}}},
 }
 _DETAILS = {
     400: "There was an error parsing the body",
-    401: "a valid access token is needed, as header Authorization: Bearer rw_…",
+    401: "an access token is needed, as header Authorization: Bearer rw_…",
     403: "this needs the scope operate; screen has read",
     409: "k_by is acknowledged (version 18), not as it was seen (version 17): look again",
     413: "the request body is too large, expected at most 1000000 bytes",
@@ -101,8 +106,18 @@ def add_problems(app: FastAPI) -> None:
     async def on_http(request: Request, error: Exception) -> JSONResponse:
         if not isinstance(error, StarletteHTTPException):
             raise error
-        response = problem_answer(request, error.status_code, str(error.detail))
-        response.headers.update(error.headers or {})
+        detail, headers = str(error.detail), dict(error.headers or {})
+        if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+            headers["Allow"] = ", ".join(_methods(request))
+            detail = (
+                f"{request.url.path[:_LONGEST_PATH]} takes {headers['Allow']}, not {request.method[:_LONGEST_PATH]}"
+            )
+        elif error.status_code == HTTPStatus.NOT_FOUND and "endpoint" not in request.scope:
+            near = _nearest(request)
+            detail = f"nothing is at {request.url.path[:_LONGEST_PATH]}"
+            detail += f"; did you mean {near}?" if near else "; everything there is stands in /docs and /openapi.json"
+        response = problem_answer(request, error.status_code, detail)
+        response.headers.update(headers)
         return response
 
     async def on_invalid(request: Request, error: Exception) -> JSONResponse:
@@ -123,6 +138,30 @@ def add_problems(app: FastAPI) -> None:
     for kind, handler in handlers.items():
         app.add_exception_handler(kind, handler)
     app.add_middleware(_LastResort)
+
+
+def _methods(request: Request) -> list[str]:
+    """Methods of all routes at the path of a request that no route takes."""
+    contexts = list(iter_route_contexts(request.app.routes))
+    path = next(one.path_format for one in contexts if one.endpoint == request.scope["endpoint"])
+    return sorted({method for one in contexts if one.path_format == path for method in one.methods or ()})
+
+
+def _nearest(request: Request) -> str | None:
+    """Path that was perhaps meant: as many parts, each like its own, the beginning ``/api/v1`` left out or not."""
+    asked = request.url.path.strip("/").split("/")
+    best, found = _LIKENESS, None
+    for context in iter_route_contexts(request.app.routes):
+        whole = (context.path_format or "").strip("/").split("/")
+        for beginning in {0, len(_BEGINNING)} if whole[: len(_BEGINNING)] == _BEGINNING else {0}:
+            if len(whole) - beginning != len(asked) or max(map(len, asked)) > _LONGEST_PATH:
+                continue
+            pairs = list(zip(whole[beginning:], asked, strict=True))
+            like = min(1.0 if one[:1] == "{" else SequenceMatcher(None, one, other).ratio() for one, other in pairs)
+            if like > best:
+                parts = [other if one[:1] == "{" else one for one, other in pairs]
+                best, found = like, "/" + "/".join(whole[:beginning] + parts)
+    return found
 
 
 def _field(place: tuple[str | int, ...]) -> str:

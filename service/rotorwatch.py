@@ -94,7 +94,7 @@ def run(
                     typer.echo(f"Zenoh {what} {', '.join(ends)}")
             typer.echo(f"HTTP API {service.http_url}")
             if not settings.access.open_on_loopback and not service.store.tokens.all():
-                typer.echo("nobody has a token for it yet: rotorwatch token create NAME --scope read --scope operate")
+                typer.echo(access_commands.creation_hint(config, settings.history))
             sys.stdout.flush()
             stop.wait()
 

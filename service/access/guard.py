@@ -29,9 +29,9 @@ from models.errors import RotorwatchError
 from service.access.audit import AuditLog, AuditTrail, Visit
 from service.access.middleware import VISIT, AccessMiddleware
 from service.access.origin import SAFE_METHODS, check_origin
-from service.access.presented import address_of, challenge, key_of, network_of, presented_text
+from service.access.presented import address_of, key_of, network_of, presented_text, unauthenticated
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
-from service.access.requirement import NEEDED, Requirement, requires
+from service.access.requirement import Requirement, requires
 from service.access.routes import PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, TokenStore, parse_token, token_is_valid
@@ -163,7 +163,7 @@ class Guard:
         if wait_s:
             raise _too_many(f"more than {self.access.limits.requests_per_minute} requests in a minute", wait_s)
         if caller is None:
-            raise HTTPException(401, NEEDED, {"WWW-Authenticate": challenge(request)})
+            raise HTTPException(401, unauthenticated(request))
         hosts = self.access.hosts
         check_origin(request.headers, request.method, listens_on=self._host, hosts=hosts, open_to_all=in_the_open)
         return caller

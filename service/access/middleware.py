@@ -14,7 +14,7 @@ from starlette.types import Scope as AsgiScope
 
 from service.access.audit import AuditNote, AuditTrail, Visit
 from service.access.origin import SAFE_METHODS
-from service.access.presented import address_of, network_of
+from service.access.presented import address_of, challenges, network_of
 from service.access.requirement import CALLER
 from service.access.scopes import Caller
 from service.logs import Limiter, logger
@@ -25,6 +25,7 @@ __all__ = ["VISIT", "AccessMiddleware"]
 VISIT = "access_visit"
 """Where the request on its way is kept, in ``request.state``."""
 
+_UNAUTHENTICATED = 401
 _TOO_LARGE = 413
 _LONGEST_NUMBER = 18
 _REFUSED = (401, 403, 429)
@@ -104,6 +105,9 @@ class AccessMiddleware:
             request.state.audit = AuditNote(reason=refusal.detail)
             answer = problem_answer(request, refusal.status_code, refusal.detail)
             answer.headers.update(refusal.headers or {})
+            if refusal.status_code == _UNAUTHENTICATED:
+                for challenge in challenges(request):
+                    answer.headers.append("WWW-Authenticate", challenge)
             await answer(scope, receive, watched)
 
         try:

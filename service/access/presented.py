@@ -10,8 +10,11 @@ from starlette.datastructures import Headers
 from service.access.origin import SAFE_METHODS
 from service.access.scopes import Caller
 
-__all__ = ["address_of", "challenge", "key_of", "network_of", "presented_text"]
+__all__ = ["BEARER", "NEEDED", "address_of", "challenges", "key_of", "network_of", "presented_text", "unauthenticated"]
 
+NEEDED = "an access token is needed, as header Authorization: Bearer rw_…"
+BEARER = 'Bearer realm="rotorwatch"'
+_BASIC = 'Basic realm="rotorwatch", charset="UTF-8"'
 _V6_NETWORK = 64
 
 
@@ -52,7 +55,20 @@ def presented_text(headers: Headers, method: str) -> str | None:
     return None
 
 
-def challenge(request: Request) -> str:
-    """Value of ``WWW-Authenticate``; a browser that shows a page is also told how to ask for a password."""
+def challenges(request: Request) -> tuple[str, ...]:
+    """Values of ``WWW-Authenticate``, one header each: Chromium reads only the first challenge of a header.
+
+    A browser that shows a page is also told how to ask for a password.
+    """
+    invalid = ', error="invalid_token"' if "authorization" in request.headers else ""
     shows_page = request.method in SAFE_METHODS and "text/html" in request.headers.get("accept", "")
-    return 'Bearer, Basic realm="rotorwatch", charset="UTF-8"' if shows_page else "Bearer"
+    return (BEARER + invalid, *((_BASIC,) if shows_page else ()))
+
+
+def unauthenticated(request: Request) -> str:
+    """Why a request has no caller; a token that is not valid is not told whether it ever was."""
+    if "authorization" not in request.headers:
+        return NEEDED
+    if presented_text(request.headers, request.method) is None:
+        return f"the header Authorization holds no access token, expected: Bearer rw_… ({request.method})"
+    return "the access token is not valid: no such token was created here, or it has expired or was revoked"

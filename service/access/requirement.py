@@ -8,14 +8,13 @@ from fastapi.security.base import SecurityBase
 from starlette.exceptions import HTTPException
 
 from service.access.audit import AuditNote
+from service.access.presented import BEARER, NEEDED
 from service.access.scopes import Caller, Scope
 
-__all__ = ["CALLER", "NEEDED", "Requirement", "caller_of", "requires"]
+__all__ = ["CALLER", "Requirement", "caller_of", "requires"]
 
 CALLER = "access_caller"
 """Where the middleware leaves the caller, in ``request.state``."""
-
-NEEDED = "a valid access token is needed, as header Authorization: Bearer rw_…"
 
 
 class Requirement:
@@ -102,5 +101,5 @@ def caller_of(request: Request) -> Caller:
     """
     caller = getattr(request.state, CALLER, None)
     if not isinstance(caller, Caller):
-        raise HTTPException(401, NEEDED, {"WWW-Authenticate": "Bearer"})
+        raise HTTPException(401, NEEDED, {"WWW-Authenticate": BEARER})
     return caller

@@ -2,12 +2,16 @@
 
 import getpass
 import os
+import shlex
+import shutil
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
+from urllib.parse import urlsplit
 
 import typer
 
@@ -15,10 +19,11 @@ from models.errors import MachineFileError
 from service.commands.running import exit_codes
 
 if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
+    from service.config import HistorySettings
     from service.store.records import AuditEntry, TokenRecord
     from service.store.store import Store
 
-__all__ = ["register"]
+__all__ = ["creation_hint", "register"]
 
 _PAGE = 500
 
@@ -75,6 +80,31 @@ def create(
         typer.echo(f"token {record.token_id} of {name} ({', '.join(record.scopes)}), valid {until}", err=True)
         typer.echo("it is shown this once; send it as header Authorization: Bearer TOKEN", err=True)
         typer.echo(text)
+
+
+def creation_hint(config: Path | None, history: "HistorySettings") -> str:
+    """Say how a first token is created for a monitor, from any folder and without its environment.
+
+    Parameters
+    ----------
+    config : Path, optional
+        Settings file of the monitor.
+    history : HistorySettings
+        As they are in use.
+    """
+    if history.in_memory:
+        return "nobody can have a token for it: the history is in memory, where no other program finds tokens"
+    command = ["rotorwatch" if shutil.which("rotorwatch") else sys.argv[0], "token", "create", "operator"]
+    command += ["--scope", "read", "--scope", "operate"]
+    if config is not None:
+        command += ["--config", str(config.absolute())]
+    said, prefix = "nobody has a token for it yet", ""
+    overridden = bool({"ROTORWATCH_HISTORY", "ROTORWATCH_HISTORY__URL"} & {name.upper() for name in os.environ})
+    if overridden and urlsplit(history.database).password is not None:
+        said += " (create one with ROTORWATCH_HISTORY__URL as it is here)"
+    elif overridden or (history.url is None and os.environ.get("XDG_STATE_HOME")):
+        prefix = f"ROTORWATCH_HISTORY__URL={shlex.quote(history.database)} "
+    return f"{said}: {prefix}{shlex.join(command)}"
 
 
 def list_(config: _ConfigOption = None) -> None:
@@ -202,7 +232,7 @@ def _opened(config: Path | None) -> "Iterator[Store]":
     from service.store.store import Store  # noqa: PLC0415
 
     history = load_settings(config).history
-    if history.database.endswith(":memory:"):
+    if history.in_memory:
         raise MachineFileError(
             f"{config}: history.url is {history.database!r}: tokens would be in memory, where no other program "
             "finds them; expected a file or a PostgreSQL server"

@@ -185,7 +185,8 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
     import httpx  # noqa: PLC0415  # only here
     from pydantic import ValidationError  # noqa: PLC0415
 
-    from rotorwatch.records.health import Health  # noqa: PLC0415  # keeps --help quick
+    from rotorwatch.client.answers import refusal  # noqa: PLC0415  # keeps --help quick
+    from rotorwatch.records.health import Health  # noqa: PLC0415
 
     try:
         verify = True if ca is None else ssl.create_default_context(cafile=ca)
@@ -200,7 +201,8 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
     except httpx.HTTPStatusError as error:
         if error.response.status_code in {httpx.codes.UNAUTHORIZED, httpx.codes.FORBIDDEN}:
             raise RotorwatchError(
-                f"{url}: the API asks for a token with the scope read: set ROTORWATCH_TOKEN (rotorwatch token create)"
+                f"{url}: {refusal(error.response)}; set ROTORWATCH_TOKEN to a token with the scope read "
+                "(rotorwatch token create)"
             ) from error
         raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:

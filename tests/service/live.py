@@ -248,18 +248,23 @@ class Program:
 
 
 @contextmanager
-def program(folder: Path, *arguments: str, **environment: str) -> Iterator[Program]:
-    """Run ``python -m ARGUMENTS`` from the checkout; it is gone when the block is left."""
+def program(
+    folder: Path, *arguments: str, cwd: Path = ROOT, alone: dict[str, str] | None = None, **environment: str
+) -> Iterator[Program]:
+    """Run ``python -m ARGUMENTS`` from the checkout, or elsewhere in an environment of its own, `alone`.
+
+    It is gone when the block is left.
+    """
     number = len(list(folder.glob("*.out")))
     out, err = folder / f"{number}.out", folder / f"{number}.err"
     with out.open("wb") as out_file, err.open("wb") as err_file:
         process = subprocess.Popen(
             [sys.executable, "-m", *arguments],
-            cwd=ROOT,
+            cwd=cwd,
             stdin=subprocess.DEVNULL,
             stdout=out_file,
             stderr=err_file,
-            env={**os.environ, "COLUMNS": "200", **_ALONE, **environment},
+            env={**({**os.environ, **_ALONE} if alone is None else alone), "COLUMNS": "200", **environment},
         )
     try:
         yield Program(process, out, err)

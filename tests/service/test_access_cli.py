@@ -1,14 +1,20 @@
 """``rotorwatch token`` and ``rotorwatch audit`` beside a running service, on the same database."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
+import httpx
 import pytest
 import typer
 from typer.testing import CliRunner, Result
 
 from service.access.scopes import Scope
 from service.commands import access as access_commands
+from service.config import HistorySettings
 from tests.service.guarded import Guarded, guarded
+from tests.service.live import ROOT, endpoint, program
 
 
 @pytest.fixture
@@ -135,3 +141,64 @@ def test_the_audit_log_shows_each_action_once(tmp_path: Path, commands: typer.Ty
         assert "DELETE" not in chosen
         assert "DELETE" not in run(commands, "audit", "--limit", "2", "--config", config).stdout
         assert "GET /health" not in run(commands, "audit", "--actor", "control room", "--config", config).stdout
+
+
+@pytest.mark.parametrize(
+    ("lines", "environment"),
+    [
+        ('[history]\nurl = "sqlite:///own history.sqlite"\n', {}),
+        ('[history]\nurl = "sqlite:///other.sqlite"\n', {"ROTORWATCH_HISTORY__URL": "sqlite:///environment.sqlite"}),
+    ],
+    ids=["file", "environment over file"],
+)
+def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(
+    tmp_path: Path, lines: str, environment: dict[str, str]
+) -> None:
+    folder = tmp_path / "a plant"
+    folder.mkdir()
+    (folder / "plant.toml").write_text(lines, encoding="utf-8")
+    arguments = ["--listen", endpoint(), "--http-port", "0", "--config", "plant.toml"]
+    plain = {name: value for name, value in os.environ.items() if not name.startswith(("ROTORWATCH_", "XDG_"))}
+    plain |= {"PYTHONPATH": str(ROOT), "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"}
+    plain |= {"HOME": str(tmp_path)}
+    alone = plain | environment
+    with program(tmp_path, "service.rotorwatch", "run", *arguments, cwd=folder, alone=alone) as monitor:
+        url = monitor.url()
+        monitor.wait_for("token create")
+        hint = next(line for line in monitor.output().splitlines() if "token create" in line)
+        command = hint.split(": ", 1)[1]
+        # In another terminal: another folder, and nothing of the monitor's environment.
+        created = subprocess.run(
+            ["sh", "-c", command], cwd=tmp_path, env=plain, capture_output=True, text=True, check=True
+        )
+        headers = {"authorization": f"Bearer {created.stdout.strip()}"}
+        assert httpx.get(f"{url}/api/v1/machines", headers=headers, trust_env=False).status_code == 200
+
+
+def test_the_hint_knows_where_the_history_is_and_shows_no_password(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    assert f"ROTORWATCH_HISTORY__URL=sqlite:///{tmp_path}/" in access_commands.creation_hint(None, HistorySettings())
+    url = "postgresql://watch:secret@db/plant"
+    monkeypatch.setenv("ROTORWATCH_HISTORY__URL", url)
+    told = access_commands.creation_hint(None, HistorySettings(url=url))
+    assert "secret" not in told
+    assert "ROTORWATCH_HISTORY__URL" in told
+    in_memory = access_commands.creation_hint(None, HistorySettings(url="sqlite:///:memory:"))
+    assert "token create" not in in_memory
+
+
+def test_status_says_why_a_token_is_refused(tmp_path: Path) -> None:
+    with guarded(tmp_path) as monitor, monitor.client() as client:
+        wanted = client.get("/").json()["detail"]
+        asked = [sys.executable, "-m", "service.rotorwatch", "status", "--url", monitor.url]
+        wrong = "rw_000000000000_" + 43 * "0"
+        plain = {name: value for name, value in os.environ.items() if name != "ROTORWATCH_TOKEN"}
+        without = subprocess.run(asked, cwd=ROOT, env=plain, capture_output=True, text=True, check=False)
+        mistaken = subprocess.run(
+            asked, cwd=ROOT, env=plain | {"ROTORWATCH_TOKEN": wrong}, capture_output=True, text=True, check=False
+        )
+    assert (without.returncode, mistaken.returncode) == (1, 1)
+    assert wanted in without.stderr
+    assert "not valid" in mistaken.stderr

@@ -29,6 +29,8 @@ ROUTES = {
     ("DELETE", "/machine"): {CONFIGURE},
 }
 
+ASKED = 'Bearer realm="rotorwatch"'
+
 
 @pytest.fixture
 def monitor(tmp_path: Path) -> Iterator[Guarded]:
@@ -42,7 +44,7 @@ def test_every_route_but_healthz_refuses_whoever_has_no_token(monitor: Guarded) 
         for method, path in [*ROUTES, ("GET", "/forgotten"), ("GET", "/nowhere"), ("PATCH", "/health")]:
             answer = send(client, method, path)
             problem(answer, 401)
-            assert answer.headers["www-authenticate"] == "Bearer"
+            assert answer.headers.get_list("www-authenticate") == [ASKED]
         problem(client.post("/healthz", json={}), 401)
     assert not monitor.done
 
@@ -76,8 +78,14 @@ def test_a_wrong_expired_or_revoked_token_gets_the_same_answer(monitor: Guarded)
             answers.append(client.get("/health", headers={b"authorization": f"Bearer {token}".encode()}))
     texts = {answer.text for answer in answers}
     assert {answer.status_code for answer in answers} == {401}
-    assert {answer.headers["www-authenticate"] for answer in answers} == {"Bearer"}
+    assert {answer.headers["www-authenticate"] for answer in answers} == {f'{ASKED}, error="invalid_token"'}
     assert len(texts) == 1
+    with monitor.client() as client:
+        without = client.get("/health")
+        in_no_form = client.get("/health", headers={"authorization": f"Token {good}"})
+    details = {problem(answer, 401) for answer in (refused, without, in_no_form)}
+    assert len(details) == 3  # nothing given, nothing that could be a token, and a token that is none of ours
+    assert "error" not in without.headers["www-authenticate"]
     with monitor.client(good) as client:
         assert client.get("/health").json()["name"] == "ops"
 
@@ -102,9 +110,12 @@ def test_a_token_counts_only_in_its_header(monitor: Guarded) -> None:
 def test_browsers_give_the_token_as_password(monitor: Guarded) -> None:
     token = monitor.token(READ)
     with monitor.client() as client:
-        asked = client.get("/", headers={"accept": "text/html,*/*"})
-        assert asked.status_code == 401
-        assert asked.headers["www-authenticate"].startswith("Bearer, Basic realm=")
+        for given in ({}, basic("rw_000000000000_" + 43 * "0")):
+            asked = client.get("/", headers={"accept": "text/html,*/*"} | given)
+            assert asked.status_code == 401
+            bearer, in_browsers = asked.headers.get_list("www-authenticate")  # Chromium reads one challenge a line
+            assert bearer == ASKED + (', error="invalid_token"' if given else "")
+            assert in_browsers == 'Basic realm="rotorwatch", charset="UTF-8"'
         assert client.get("/", headers=basic(token)).status_code == 200
         assert client.get("/", headers=basic(token, "")).status_code == 200
         for wrong in ("Basic", "Basic ===", "Basic eA==", f"Basic {base64.b64encode(b'x:' + bytes([255])).decode()}"):

@@ -294,11 +294,34 @@ def test_unknown_machine_is_a_problem_that_names_the_known_ones(http: httpx.Clie
     assert found.detail == "no machine demo/pump; there are: demo/lab"
 
 
-def test_unknown_path_and_wrong_method_are_problems(http: httpx.Client) -> None:
-    problem(http.get("/api/v2/machines"), 404)
-    answer = http.delete("/api/v1/machines")
-    problem(answer, 405)
-    assert answer.headers["allow"] == "GET"
+@pytest.mark.parametrize(
+    ("path", "near"),
+    [
+        (f"{PLACE}/heath", f"{PLACE}/health"),
+        ("/api/v1/machine/demo/lab", PLACE),
+        ("/api/v1/alarms", None),
+        ("/machines", "/api/v1/machines"),
+        ("/heathz", "/healthz"),
+        ("/favicon.ico", None),
+        ("/" + 5000 * "x", None),
+    ],
+)
+def test_an_unknown_path_is_named_with_the_nearest_there_is(http: httpx.Client, path: str, near: str | None) -> None:
+    found = problem(http.get(path), 404)
+    assert path[:64] in found.detail
+    assert len(found.detail) < 400
+    if near is None:
+        assert "did you mean" not in found.detail
+    else:
+        assert found.detail.endswith(f"did you mean {near}?")
+
+
+def test_a_wrong_method_is_named_with_those_there_are(http: httpx.Client) -> None:
+    answer = http.delete("/api/v1/replays")
+    found = problem(answer, 405)
+    assert answer.headers["allow"] == "GET, POST"
+    assert "DELETE" in found.detail
+    assert "GET, POST" in found.detail
 
 
 @pytest.mark.parametrize(

@@ -150,8 +150,12 @@ def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyP
         with pytest.raises(AccessRefused) as caught:
             stranger.machines()
         assert caught.value.status == 401
-        with pytest.raises(AccessRefused, match="a valid access token is needed"):
+        with pytest.raises(AccessRefused, match="an access token is needed"):
             next(stranger.events())
+    with Rotorwatch(runtime.http_url, "rw_000000000000_" + 43 * "0") as mistaken:
+        with pytest.raises(AccessRefused, match="not valid") as caught:
+            mistaken.machines()
+        assert caught.value.status == 401
     monkeypatch.setenv("ROTORWATCH_TOKEN", _token(runtime) + "\n")
     with Client(runtime.http_url) as known:
         assert len(known.machines()) == 1
