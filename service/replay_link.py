@@ -54,11 +54,11 @@ class NetworkPlan:
     prefix : str
         What goes before every key; with several passes, the number of the pass comes after it.
     pace : float or None
-        Recorded seconds per second; None is as fast as subscribers take it.
+        Seconds of data per second; None is as fast as subscribers take it.
     passes : int or None
         Repetitions; None is without end.
     from_ns, to_ns : int
-        Times of recording.
+        Times of the data.
     wait_for_subscriber_s : float
         Hold the first message of a pass back at most this long.
     linger_s : float
@@ -318,8 +318,8 @@ def replay_to_network(
             link.begin_pass(target)
             if plan.wait_for_subscriber_s:
                 link.wait_for_subscribers(plan.wait_for_subscriber_s, lambda: control.stopped)
-            for _, found in described:
-                if found is not None and found.log_time_ns < plan.from_ns:  # else it comes in its place
+            for keys, found in described:
+                if found is not None and source.span(keys).start_ns < plan.from_ns:  # else it comes in its place
                     link.put(found)
             wanted = None if plan.everything else _sent_by(plan.machines)
             stretch = PlayPlan(wanted, plan.pace, plan.from_ns, plan.to_ns, number)

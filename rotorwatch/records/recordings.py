@@ -15,8 +15,8 @@ class RecordingEntry(BaseModel):
     id: str = Field(description="site, machine and file name", examples=["demo/lab/20260101T000000Z.mcap"])
     site: str = Field(description="site of the machine", examples=["demo"])
     machine: str = Field(description="name of the machine", examples=["lab"])
-    start_ns: int = Field(description="time of the first message", examples=[1767225600000000000])
-    end_ns: int = Field(description="time of the last message", examples=[1767225900000000000])
+    start_ns: int = Field(description="when the first message was recorded", examples=[1767225600000000000])
+    end_ns: int = Field(description="when the last message was recorded", examples=[1767225900000000000])
     messages: int | None = Field(description="number of messages; null if incomplete or damaged", examples=[3001])
     size_bytes: int = Field(description="size of the file", examples=[19231007])
     complete: bool = Field(
@@ -27,11 +27,16 @@ class RecordingEntry(BaseModel):
 
 
 class RecordingDetail(RecordingEntry):
-    """One recording with what is in it."""
+    """One recording with what is in it: which data, of whatever time they were recorded."""
 
     keys: dict[str, int] = Field(
         description="messages by key; empty if incomplete or damaged", examples=[{"rotorwatch/demo/lab/stream": 3000}]
     )
+    data_start_ns: int | None = Field(
+        description="time of the earliest data, which a replay may begin from; null if incomplete or damaged",
+        examples=[1767225600000000000],
+    )
+    data_end_ns: int | None = Field(description="end of the latest data", examples=[1767225900000000000])
 
 
 class RecordingList(BaseModel):

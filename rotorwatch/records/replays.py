@@ -26,10 +26,8 @@ class ReplayProgress(BaseModel):
 
     model_config = JSON
 
-    fraction: float = Field(ge=0, le=1, description="of the recorded time to be replayed", examples=[0.5])
-    position_ns: int = Field(
-        description="time at which the latest message was recorded", examples=[1767225805000000000]
-    )
+    fraction: float = Field(ge=0, le=1, description="of the stretch to be replayed; 1 at its end", examples=[0.5])
+    position_ns: int = Field(description="time that the data have reached", examples=[1767225805000000000])
     messages: int = Field(description="messages read so far", examples=[3000])
     windows: int = Field(description="windows evaluated so far; 0 if the replay only publishes", examples=[60])
     alarms: int = Field(description="alarm events so far; 0 if the replay only publishes", examples=[1])
@@ -103,13 +101,13 @@ class ReplayRequest(BaseModel):
         examples=["lab"],
     )
     from_ns: int | None = Field(
-        default=None, ge=0, description="only what was recorded from this time on", examples=[1767225600000000000]
+        default=None, ge=0, description="only data from this time on", examples=[1767225600000000000]
     )
     to_ns: int | None = Field(
-        default=None, ge=0, description="only what was recorded before this time", examples=[1767225900000000000]
+        default=None, ge=0, description="only data before this time", examples=[1767225900000000000]
     )
     pace: float = Field(
-        default=1.0, ge=0.1, le=1000.0, description="paced: recorded seconds per second", examples=[10.0]
+        default=1.0, ge=0.1, le=1000.0, description="paced: seconds of data per second", examples=[10.0]
     )
 
 
@@ -133,7 +131,7 @@ class ReplayJob(BaseModel):
     from_ns: int | None = Field(description="as requested", examples=[1767225600000000000])
     to_ns: int | None = Field(description="as requested", examples=[1767225900000000000])
     pace: float | None = Field(
-        default=None, description="recorded seconds per second; null: as fast as possible", examples=[None]
+        default=None, description="seconds of data per second; null: as fast as possible", examples=[None]
     )
     prefix: str = Field(
         description="paced: what goes before every key, and the namespace of a monitor for it; empty offline",
@@ -150,7 +148,7 @@ class ReplaySeek(BaseModel):
 
     model_config = JSON
 
-    to_ns: int | None = Field(default=None, ge=0, description="time of recording", examples=[1767225700000000000])
+    to_ns: int | None = Field(default=None, ge=0, description="time of the data", examples=[1767225700000000000])
     by_s: float | None = Field(
         default=None,
         ge=-1e9,

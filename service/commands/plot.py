@@ -100,7 +100,7 @@ def plot(
 ) -> None:
     """Draw what is in recordings: PNG or SVG by the end of the name. Needs matplotlib: the extra "plots".
 
-    Times are UTC. --from, --to and --at are times of recording, as for replay. The same input gives the same file.
+    Times are UTC, and those of the data, however fast they were recorded. The same input gives the same file.
 
     [bold]Examples[/bold]
 

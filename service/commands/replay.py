@@ -87,7 +87,7 @@ def replay(
         ),
     ] = None,
     pace: Annotated[
-        str, typer.Option("--pace", help="Recorded seconds per second, 0.1 to 1000, or max: as fast as it is taken.")
+        str, typer.Option("--pace", help="Seconds of data per second, 0.1 to 1000, or max: as fast as it is taken.")
     ] = "1",
     loop: Annotated[
         str, typer.Option("--loop", metavar="N", help="Passes, or forever; each has a prefix of its own: PREFIX/1, ...")
@@ -116,7 +116,8 @@ def replay(
     """Replay recordings: offline through the monitor, or onto the network byte for byte.
 
     On the network a replay stays apart from what is live: its keys begin with a prefix, and a monitor hears them
-    only as its namespace. In a terminal the space bar pauses and the arrow keys go 10 s back and forth.
+    only as its namespace. In a terminal the space bar pauses and the arrow keys go 10 s back and forth. All times are
+    those of the data, however fast they were recorded.
 
     [bold]Examples[/bold]
 
@@ -136,16 +137,14 @@ def replay(
         one_blas_thread()
         from service.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
         from service.replay.control import Control  # noqa: PLC0415
-        from service.replay.source import RecordingSource, parse_moment  # noqa: PLC0415
+        from service.replay.source import RecordingSource  # noqa: PLC0415
 
         try:
             source = RecordingSource(files)
         except RecordingError as error:
             raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
-        from_ns = source.start_ns if from_ is None else parse_moment(from_, source.start_ns, "--from")
-        to_ns = source.end_ns + 1 if to is None else parse_moment(to, source.start_ns, "--to")
-        if from_ns >= to_ns or from_ns > source.end_ns or to_ns <= source.start_ns:
-            raise MachineFileError(f"--from {from_ or 0} --to {to or 'the end'}: nothing was recorded in between")
+        machines = source.machines if key is None else (source.machine(key),)
+        from_ns, to_ns = source.between(from_, to, *machines)
         _check_options(offline, {"--machine": machine, "--out": out, "--overwrite": overwrite},
                        {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything})  # fmt: skip
         wishes = Control()
@@ -158,7 +157,7 @@ def replay(
 
             plan = NetworkPlan(
                 link=_link(connect, listen),
-                machines=source.machines if key is None else (source.machine(key),),
+                machines=machines,
                 everything=everything,
                 prefix=_prefix(prefix, files[0]),
                 pace=_pace(pace),

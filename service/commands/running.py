@@ -40,9 +40,13 @@ LinkOption = Annotated[
 
 FromOption = Annotated[
     str | None,
-    typer.Option("--from", metavar="TIME", help="Seconds after the start, or a time such as 2026-01-01T00:02:30Z."),
+    typer.Option(
+        "--from",
+        metavar="TIME",
+        help="Data from then on: seconds after their start, or a time of the data such as 2026-01-01T00:02:30Z (UTC).",
+    ),
 ]
-ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="The same, without what comes then.")]
+ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="Data before then; the same.")]
 
 
 def one_blas_thread() -> None:

@@ -12,6 +12,7 @@ from rotorwatch.records.recordings import RecordingDetail, RecordingEntry, Recor
 from service.access.guard import Guard
 from service.problems import problem_answer, problem_responses, responses
 from service.recording.catalogue import Recording
+from service.replay.source import RecordingSource
 
 __all__ = [
     "RecordingIndex",
@@ -75,7 +76,15 @@ def add_recording_routes(app: FastAPI, index: RecordingIndex | None, guard: Guar
         found = found_recording(index, f"{site}/{machine}/{name}")
         readable = found.complete and not found.problem
         keys = summarize_recording(found.path).messages if readable else {}
-        return RecordingDetail.model_validate({**_fields(found), "keys": keys})
+        data = RecordingSource([found.path]).span() if keys else None
+        return RecordingDetail.model_validate(
+            {
+                **_fields(found),
+                "keys": keys,
+                "data_start_ns": None if data is None else data.start_ns,
+                "data_end_ns": None if data is None else data.end_ns,
+            }
+        )
 
     @app.get(
         "/api/v1/recordings/{site}/{machine}/{name}/download",

@@ -8,6 +8,7 @@ from typing import Literal
 from matplotlib.figure import Figure
 
 from models.errors import MachineFileError, RecordingError
+from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmEventData
 from service.plots.correlation import correlations_of, latest_window
 from service.plots.correlation_figure import paint_correlations
@@ -43,7 +44,7 @@ class PlotRequest:
     key : str or None
         ``SITE/MACHINE``, where the recordings hold several.
     from_, to, at : str or None
-        Times of recording, as `parse_moment` takes them; `at` is where the latest data end.
+        Times of the data, as `parse_moment` takes them; `at` is where the latest data end.
     machine : str or None
         ``FILE`` or ``FILE@BUNDLE`` for trends and correlations.
     channels : tuple of str
@@ -95,13 +96,12 @@ def draw_plot(request: PlotRequest) -> None:
         source = RecordingSource(request.files)
     except RecordingError as error:
         raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
-    from_ns, to_ns = _limits(request, source)
+    keys = (trend_machine if request.kind == "trend" else RecordingSource.machine)(source, request.key)
+    from_ns, to_ns = _limits(request, source, keys)
     if request.kind == "trend":
-        keys = trend_machine(source, request.key)
         trend = read_trend(source, keys, request.machine, from_ns, to_ns)
         draw(request.out, request.look, lambda look: paint_trend(trend, look))
         return
-    keys = source.machine(request.key)
     name = f"{keys.site}/{keys.machine}"
     if request.kind == "correlation":
         installed = choose_machine(keys, request.machine)
@@ -148,17 +148,11 @@ def _spectra(
     )
 
 
-def _limits(request: PlotRequest, source: RecordingSource) -> tuple[int, int]:
-    start_ns, end_ns = source.start_ns, source.end_ns + 1
-    from_ns = start_ns if request.from_ is None else parse_moment(request.from_, start_ns, "--from")
-    to_ns = end_ns if request.to is None else parse_moment(request.to, start_ns, "--to")
-    if from_ns >= to_ns or from_ns >= end_ns or to_ns <= start_ns:
-        raise MachineFileError(
-            f"--from {request.from_ or 0} --to {request.to or 'the end'}: nothing was recorded in between"
-        )
-    if request.at is not None:
-        at_ns = parse_moment(request.at, start_ns, "--at")
-        if not from_ns < at_ns:
-            raise MachineFileError(f"--at {request.at}: nothing was recorded before that, from {request.from_ or 0} on")
-        to_ns = min(to_ns, at_ns + 1)  # a block is recorded when it ends
-    return max(from_ns, start_ns), min(to_ns, end_ns)
+def _limits(request: PlotRequest, source: RecordingSource, keys: MachineKeys) -> tuple[int, int]:
+    from_ns, to_ns = source.between(request.from_, request.to, keys)
+    if request.at is None:
+        return from_ns, to_ns
+    at_ns = parse_moment(request.at, source.span(keys).start_ns, "--at")
+    if not from_ns < at_ns:
+        raise MachineFileError(f"--at {request.at}: nothing was recorded before that, from {request.from_ or 0} on")
+    return from_ns, min(to_ns, at_ns)

@@ -10,7 +10,7 @@ from scipy.signal import welch
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from service.plots.stretches import RecordedStream, Stretch
+from service.plots.stretches import RecordedStream, Stretch, begins_again
 
 __all__ = ["Spectrum", "Waterfall", "read_spectrum", "read_waterfall", "summed_power"]
 
@@ -165,29 +165,28 @@ def read_waterfall(
     """
     segment = _segment(stream, window_s, resolution_hz)
     each_s = max(window_s, (stream.to_ns - stream.from_ns) / 1e9 / _MOST_SPECTRA)
-    starts, ends, speeds, values = [], [], [], []
+    rows: list[tuple[int, int, float, FloatArray]] = []
     for stretch in stream.stretches((channel,), each_s):
         if stretch.samples.shape[0] < segment:
             continue
+        while rows and begins_again(rows[-1][1], stretch.start_ns):
+            rows.pop()  # of several runs at the same time the one that was recorded last is shown
         power, count = summed_power(stretch, segment, scaling)
-        starts.append(stretch.start_ns)
-        ends.append(stretch.end_ns)
-        speeds.append(stretch.speed_rad_s)
-        values.append(_values(power[0] / count, scaling))
-    if len(values) < 2:
+        rows.append((stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power[0] / count, scaling)))
+    if len(rows) < 2:
         raise RotorwatchError(
-            f"{stream.place}: {len(values)} spectra of {stream.name} over {window_s:g} s without a gap, expected at "
+            f"{stream.place}: {len(rows)} spectra of {stream.name} over {window_s:g} s without a gap, expected at "
             "least 2 for a waterfall; a shorter --window may do"
         )
+    starts, ends, speeds, values = zip(*rows, strict=True)
     rate_hz = stream.descriptor.rate_hz
-    order = np.argsort(starts, kind="stable")
     return Waterfall(
         channel=channel,
         frequencies_hz=_lines(segment, rate_hz),
-        start_ns=np.array(starts, dtype=np.int64)[order],
-        end_ns=np.array(ends, dtype=np.int64)[order],
-        speed_rad_s=np.array(speeds)[order],
-        values=np.stack(values)[order],
+        start_ns=np.array(starts, dtype=np.int64),
+        end_ns=np.array(ends, dtype=np.int64),
+        speed_rad_s=np.array(speeds),
+        values=np.stack(values),
         scaling=scaling,
         resolution_hz=rate_hz / segment,
     )

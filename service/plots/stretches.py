@@ -13,7 +13,7 @@ from models.signals.keys import MachineKeys
 from models.signals.wire import decode_block
 from service.replay.source import RecordingSource
 
-__all__ = ["RecordedStream", "Stretch"]
+__all__ = ["RecordedStream", "Stretch", "begins_again"]
 
 _TOLERANCE_S = 2e-4
 _RATE_TOLERANCE = 1e-4
@@ -57,6 +57,11 @@ class Stretch:
         return float((whole[-1] - whole[0]) / (whole.size - 1) * self.rate_hz)
 
 
+def begins_again(end_ns: int, start_ns: int) -> bool:
+    """Whether data that follow others in a recording are earlier than these: of a new run, or after a clock was set."""
+    return start_ns < end_ns - _TOLERANCE_S * 1e9
+
+
 class RecordedStream:
     """The sample blocks of one machine.
 
@@ -65,7 +70,7 @@ class RecordedStream:
     source : RecordingSource
     keys : MachineKeys
     from_ns, to_ns : int
-        Only what was recorded from `from_ns` up to, and without, `to_ns`.
+        Only data from `from_ns` up to, and without, `to_ns`.
 
     Raises
     ------
@@ -129,7 +134,7 @@ class RecordedStream:
         longest_s : float, optional
             Length of a stretch, s; without it only gaps cut.
         from_ns : int, optional
-            Only what was recorded from this time on.
+            Only data from this time on.
         """
         names = [channel.name for channel in self.descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]
@@ -155,9 +160,15 @@ class RecordedStream:
             yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
 
     def latest(self, channels: Sequence[Channel], length_s: float) -> list[Stretch]:
-        """What was recorded in the last `length_s` before `to_ns`, in pieces if there are gaps."""
-        from_ns = max(self.from_ns, self.to_ns - round(length_s * 1e9))
-        return list(self.stretches(channels, from_ns=from_ns))
+        """The newest `length_s` of data before `to_ns`, in pieces if there are gaps."""
+        span = self._source.span(self._keys)
+        end_ns = self.to_ns if self.to_ns <= span.end_ns else span.newest_ns
+        found: list[Stretch] = []
+        for stretch in self.stretches(channels, from_ns=max(self.from_ns, end_ns - round(length_s * 1e9))):
+            if found and begins_again(found[-1].end_ns, stretch.start_ns):
+                found.clear()
+            found.append(stretch)
+        return found
 
     def _stretch(self, start_ns: int, rows: FloatArray, with_angle: bool) -> Stretch:
         rate_hz = self.descriptor.rate_hz

@@ -112,7 +112,7 @@ def read_trend(source: RecordingSource, keys: MachineKeys, machine: str | None, 
     machine : str or None
         ``FILE`` or ``FILE@BUNDLE``, to be evaluated anew with it.
     from_ns, to_ns : int
-        Only what was recorded from `from_ns` up to, and without, `to_ns`.
+        Only data from `from_ns` up to, and without, `to_ns`.
 
     Raises
     ------

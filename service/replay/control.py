@@ -67,7 +67,7 @@ class Control:
             self._changed.notify_all()
 
     def seek(self, to_ns: int) -> None:
-        """Go on with what was recorded from this time on; a paused replay stays paused there."""
+        """Go on with the data from this time on; a paused replay stays paused there."""
         with self._changed:
             self._seek_ns = to_ns
             self._changed.notify_all()

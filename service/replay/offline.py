@@ -50,7 +50,7 @@ class OfflineReplay:
     write : callable
         Takes each result line, without its line end.
     from_ns, to_ns : int, optional
-        Only blocks recorded from `from_ns` up to, and without, `to_ns`.
+        Only blocks from `from_ns` up to, and without, `to_ns`, in the time of the data.
     """
 
     def __init__(
@@ -67,8 +67,9 @@ class OfflineReplay:
         self._keys = keys
         self._machine = machine = installed.machine
         self._write = write
-        self._from_ns = source.start_ns if from_ns is None else from_ns
-        self._to_ns = source.end_ns + 1 if to_ns is None else to_ns
+        span = source.span(keys)
+        self._from_ns = span.start_ns if from_ns is None else from_ns
+        self._to_ns = span.end_ns + 1 if to_ns is None else to_ns
         self._monitor = MachineMonitor(installed)
         self.identity = Identity(
             site=machine.site,
@@ -105,7 +106,7 @@ class OfflineReplay:
         control = Control() if control is None else control
         begin_s = time.perf_counter()
         keys = {self._keys.stream, self._keys.descriptor}
-        for message in self._source.messages(keys, from_ns=self._from_ns, to_ns=self._to_ns):
+        for time_ns, message in self._source.timed(keys, from_ns=self._from_ns, to_ns=self._to_ns):
             if control.stopped:
                 break
             self._messages += 1
@@ -114,10 +115,12 @@ class OfflineReplay:
                 continue
             self._take(message)
             if on_progress is not None:
-                on_progress(self._progress(message.log_time_ns))
+                on_progress(self._progress(time_ns))
         if not control.stopped:
             for report in self._monitor.flush():
                 self._note(report)
+            if on_progress is not None:
+                on_progress(self._progress(self._to_ns - 1))
         return self._summary(time.perf_counter() - begin_s, stopped=control.stopped)
 
     def _describe(self, message: RecordedMessage) -> None:
@@ -148,10 +151,9 @@ class OfflineReplay:
         return all(text.startswith(("site is ", "machine is ")) for text in self._differences)
 
     def _progress(self, at_ns: int) -> ReplayProgress:
-        length_ns = max(1, min(self._to_ns, self._source.end_ns) - max(self._from_ns, self._source.start_ns))
-        done_ns = at_ns - max(self._from_ns, self._source.start_ns)
+        length_ns = max(1, self._to_ns - 1 - self._from_ns)
         return ReplayProgress(
-            fraction=min(1.0, max(0.0, done_ns / length_ns)),
+            fraction=min(1.0, max(0.0, (at_ns - self._from_ns) / length_ns)),
             position_ns=at_ns,
             messages=self._messages,
             windows=self._windows,

@@ -10,6 +10,7 @@ from pathlib import Path
 from models.errors import MachineFileError, RecordingError
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.recording import RecordedMessage, RecordingSummary, read_recording, summarize_recording
+from service.replay.data_time import DataSpan, clock_key, data_start_ns, place_of, span_of
 
 __all__ = ["RecordingSource", "clock", "parse_moment"]
 
@@ -29,6 +30,9 @@ class RecordingSource:
     Files may come in any order and may overlap, as a capture around an alarm overlaps the files it was taken from: a
     message that is in both is read once.
 
+    Times are those of the data, see `service.replay.data_time`, whenever and however fast these were recorded. For a
+    machine without blocks or reports that can be read, the time of recording stands in.
+
     Parameters
     ----------
     paths : sequence of Path
@@ -47,8 +51,7 @@ class RecordingSource:
         if not filled:
             raise RecordingError(f"{', '.join(str(path) for path in paths)}: no message in there")
         self._files = sorted(filled, key=lambda file: (file.summary.start_ns, file.summary.end_ns))
-        self.start_ns = self._files[0].summary.start_ns
-        self.end_ns = max(file.summary.end_ns for file in self._files)
+        self._spans: dict[tuple[Path, str], DataSpan | None] = {}
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -97,28 +100,94 @@ class RecordingSource:
             raise MachineFileError(f"{place}: no sample blocks of {wanted}; machines with sample blocks: {listed}")
         return there[name]
 
+    @property
+    def start_ns(self) -> int:
+        """Earliest data of any machine."""
+        return self.span().start_ns
+
+    @property
+    def end_ns(self) -> int:
+        """End of the latest data of any machine."""
+        return self.span().end_ns
+
+    def span(self, *machines: MachineKeys) -> DataSpan:
+        """Which data there are of some machines; without any, of all.
+
+        Raises
+        ------
+        RecordingError
+            Where damage is met.
+        """
+        places = {place_of(keys.stream) for keys in machines} or {place_of(key) for key in self.keys}
+        found = [span for file in self._files for place in sorted(places) if (span := self._span(file, place))]
+        found = found or [_recorded(file) for file in self._files]
+        return DataSpan(
+            min(span.start_ns for span in found),
+            max(span.end_ns for span in found),
+            found[0].first_ns,
+            found[-1].newest_ns,
+        )
+
+    def between(self, from_: str | None, to: str | None, *machines: MachineKeys) -> tuple[int, int]:
+        """From when up to, and without, when the options ``--from`` and ``--to`` ask for data.
+
+        Parameters
+        ----------
+        from_, to : str or None
+            As `parse_moment` takes them.
+        *machines : MachineKeys
+            Whose data; without any, of all.
+
+        Raises
+        ------
+        MachineFileError
+            If a time cannot be read, or there are no data in between.
+        """
+        span = self.span(*machines)
+        from_ns = span.start_ns if from_ is None else parse_moment(from_, span.start_ns, "--from")
+        to_ns = span.end_ns + 1 if to is None else parse_moment(to, span.start_ns, "--to")
+        if from_ns >= to_ns or from_ns > span.end_ns or to_ns <= span.start_ns:
+            raise MachineFileError(
+                f"--from {from_ or 0} --to {to or 'the end'}: nothing was recorded in between; the data are of "
+                f"{clock(span.start_ns)} to {clock(span.end_ns)} UTC"
+            )
+        return max(from_ns, span.start_ns), min(to_ns, span.end_ns + 1)
+
     def descriptor(self, keys: MachineKeys, before_ns: int | None = None) -> RecordedMessage | None:
-        """Latest channel descriptor recorded up to a time; without a time, or if there was none by then, the first."""
+        """Channel descriptor that held at a time; without a time, or if there was none by then, the first."""
         first: RecordedMessage | None = None
         latest: RecordedMessage | None = None
         for message in self.messages({keys.descriptor}):
             first = first or message
-            if before_ns is None or message.log_time_ns > before_ns:
+            if before_ns is None:
                 break
-            latest = message
+            if self._following_ns(keys, message) <= before_ns:
+                latest = message
         return latest or first
 
     def messages(
         self, keys: Collection[str] | None = None, *, from_ns: int | None = None, to_ns: int | None = None
     ) -> Iterator[RecordedMessage]:
-        """Read messages.
+        """Read messages, as `timed` does."""
+        if from_ns is None and to_ns is None:
+            for group in self._overlapping():
+                yield from _read(group, None if keys is None else frozenset(keys))
+            return
+        for _, message in self.timed(keys, from_ns=from_ns, to_ns=to_ns):
+            yield message
+
+    def timed(
+        self, keys: Collection[str] | None = None, *, from_ns: int | None = None, to_ns: int | None = None
+    ) -> Iterator[tuple[int, RecordedMessage]]:
+        """Read messages, each with the time that the data had reached.
 
         Parameters
         ----------
         keys : collection of str, optional
             Only these.
         from_ns, to_ns : int, optional
-            Only those recorded from `from_ns` up to, and without, `to_ns`.
+            Only from `from_ns` up to, and without, `to_ns`. A block is where its first sample is; what was recorded
+            between two blocks of a machine goes with the first of them.
 
         Raises
         ------
@@ -127,12 +196,51 @@ class RecordingSource:
         """
         wanted = None if keys is None else frozenset(keys)
         for group in self._overlapping():
-            inside = [file for file in group if _touches(file, wanted, from_ns, to_ns)]
-            streams = [read_recording(file.path, keys=wanted, from_ns=from_ns, to_ns=to_ns) for file in inside]
-            if len(streams) == 1:
-                yield from streams[0]
-            else:
-                yield from _once(heapq.merge(*streams, key=lambda message: message.log_time_ns))
+            inside = [file for file in group if self._touches(file, wanted, from_ns, to_ns)]
+            reached: dict[str, int] = {}
+            clocks: set[str] = set()
+            for file in inside:
+                for place in _places(file, wanted):
+                    if span := self._span(file, place):
+                        reached.setdefault(place, span.first_ns)
+                        clocks |= {key for key in (clock_key(file.summary.messages, place),) if key}
+            for message in _read(inside, None if wanted is None else wanted | clocks):
+                place = place_of(message.key)
+                if message.key in clocks:
+                    start_ns = data_start_ns(message)
+                    reached[place] = reached[place] if start_ns is None else start_ns
+                time_ns = reached.get(place, message.log_time_ns)
+                if (
+                    (wanted is None or message.key in wanted)
+                    and (from_ns is None or time_ns >= from_ns)
+                    and (to_ns is None or time_ns < to_ns)
+                ):
+                    yield time_ns, message
+
+    def _span(self, file: _File, place: str) -> DataSpan | None:
+        """Data of a machine in one file, read once."""
+        known = (file.path, place)
+        if known not in self._spans:
+            key = clock_key(file.summary.messages, place)
+            self._spans[known] = None if key is None else span_of(file.path, file.summary, key)
+        return self._spans[known]
+
+    def _touches(self, file: _File, keys: frozenset[str] | None, from_ns: int | None, to_ns: int | None) -> bool:
+        """Whether a file has messages of these keys between two times."""
+        spans = [self._span(file, place) or _recorded(file) for place in _places(file, keys)]
+        return any(
+            (from_ns is None or span.end_ns >= from_ns) and (to_ns is None or span.start_ns < to_ns) for span in spans
+        )
+
+    def _following_ns(self, keys: MachineKeys, message: RecordedMessage) -> int:
+        """Time of the first data that were recorded after a message."""
+        since_ns = message.log_time_ns
+        for file in self._files:
+            if file.summary.end_ns >= since_ns and keys.stream in file.summary.messages:
+                for block in read_recording(file.path, keys={keys.stream}, from_ns=since_ns):
+                    if (start_ns := data_start_ns(block)) is not None:
+                        return start_ns
+        return since_ns
 
     def _overlapping(self) -> Iterator[list[_File]]:
         """Files in groups that share no stretch of time with each other; few are open at a time."""
@@ -148,11 +256,25 @@ class RecordingSource:
         yield group
 
 
-def _touches(file: _File, keys: frozenset[str] | None, from_ns: int | None, to_ns: int | None) -> bool:
-    summary = file.summary
-    if keys is not None and not keys & summary.messages.keys():
-        return False
-    return (from_ns is None or summary.end_ns >= from_ns) and (to_ns is None or summary.start_ns < to_ns)
+def _places(file: _File, keys: frozenset[str] | None) -> set[str]:
+    """Machines of which a file has messages of these keys."""
+    return {place_of(key) for key in file.summary.messages if keys is None or key in keys}
+
+
+def _recorded(file: _File) -> DataSpan:
+    """Times of recording, where the data say nothing."""
+    start_ns, end_ns = file.summary.start_ns, file.summary.end_ns
+    return DataSpan(start_ns, end_ns, start_ns, end_ns)
+
+
+def _read(files: Sequence[_File], keys: frozenset[str] | None) -> Iterator[RecordedMessage]:
+    """Messages of files that may overlap, in the order of recording."""
+    inside = [file for file in files if keys is None or keys & file.summary.messages.keys()]
+    if len(inside) == 1:
+        yield from read_recording(inside[0].path, keys=keys)
+    else:
+        streams = [read_recording(file.path, keys=keys) for file in inside]
+        yield from _once(heapq.merge(*streams, key=lambda message: message.log_time_ns))
 
 
 def _once(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
@@ -169,7 +291,7 @@ def _once(messages: Iterator[RecordedMessage]) -> Iterator[RecordedMessage]:
 
 
 def parse_moment(text: str, start_ns: int, option: str) -> int:
-    """Time that an option names: seconds after the start of the recording, or a date and time.
+    """Time that an option names: seconds after the start of the data, or a date and time.
 
     Parameters
     ----------
@@ -177,7 +299,7 @@ def parse_moment(text: str, start_ns: int, option: str) -> int:
         ``90``, ``+90`` or ``90s``; or ``2026-01-01T00:02:30Z`` (UTC if it has no zone); or nanoseconds since 1970 as
         ``1767225750000000000ns``.
     start_ns : int
-        Start of the recording.
+        Start of the data.
     option : str
         Name of the option, for the message.
 
@@ -201,7 +323,7 @@ def parse_moment(text: str, start_ns: int, option: str) -> int:
         moment = datetime.fromisoformat(text)
     except ValueError as error:
         raise MachineFileError(
-            f"{option} is {text!r}, expected seconds after the start of the recording, such as 90, "
+            f"{option} is {text!r}, expected seconds after the start of the data, such as 90, "
             "or a time such as 2026-01-01T00:02:30Z"
         ) from error
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from models.alarm_names import STREAM_LOST
@@ -13,7 +14,7 @@ from service.worker import MachineWorker
 from simulator.recorder import record
 from tests.service.live import LAB
 
-__all__ = ["digest_of", "lines_of", "recording", "split", "write"]
+__all__ = ["digest_of", "hurried", "lines_of", "recording", "split", "write"]
 
 
 def recording(path: Path, stream: Sequence[SampleBlock], machine: Machine = LAB) -> Path:
@@ -29,6 +30,16 @@ def write(path: Path, messages: Sequence[RecordedMessage]) -> Path:
         for message in messages:
             writer.write(message)
     return path
+
+
+def hurried(source: Path, path: Path, pace: float = 20.0, at_ns: int = 1_790_000_000 * 10**9) -> Path:
+    """The same messages as a recorder has them whose stream came faster than real time, on another day."""
+    messages = list(read_recording(source))
+    begin_ns = messages[0].log_time_ns
+    for number, one in enumerate(messages):
+        time_ns = at_ns + round((one.log_time_ns - begin_ns) / pace)
+        messages[number] = replace(one, log_time_ns=time_ns, publish_time_ns=time_ns)
+    return write(path, messages)
 
 
 def split(source: Path, folder: Path, at: int) -> list[Path]:

@@ -97,9 +97,7 @@ def test_a_restarted_publisher_is_followed_forward_in_time() -> None:
 
 def far(shift_s: int, run: int, count: int = 12) -> list[SampleBlock]:
     """Blocks that go on elsewhere in time, from sequence 0 in a run of their own, else as if nothing had happened."""
-    return [
-        block(n, sequence=n if run == 1 else n - 1, run=run, shift_ns=shift_s * 10**9) for n in range(1, count + 1)
-    ]
+    return [block(n, sequence=n if run == 1 else n - 1, run=run, shift_ns=shift_s * 10**9) for n in range(1, count + 1)]
 
 
 @pytest.mark.parametrize("run", [1, 2], ids=["same run", "new run"])

@@ -52,7 +52,7 @@ def stream_of(path: Path, machine: Machine = LAB, seconds: tuple[float, float] |
     source = RecordingSource([path])
     from_ns, to_ns = source.start_ns, source.end_ns + 1
     if seconds is not None:
-        from_ns, to_ns = (START_NS + round(limit * S) + 1 for limit in seconds)
+        from_ns, to_ns = (START_NS + round(limit * S) for limit in seconds)
     return RecordedStream(source, machine.keys, from_ns, to_ns)
 
 
@@ -260,7 +260,7 @@ def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
 def test_no_full_window_is_said(faulty: Path) -> None:
     source = RecordingSource([faulty])
     with pytest.raises(RotorwatchError, match=r"a window is 60 s, usable data are 30 s"):
-        latest_window(source, LAB.keys, LAB, source.start_ns, START_NS + 30 * S + 1)
+        latest_window(source, LAB.keys, LAB, source.start_ns, START_NS + 30 * S)
 
 
 def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[str, object]]) -> None:

@@ -30,7 +30,7 @@ from service.runtime import Runtime, running
 from simulator.scenario import parse_fault
 from tests.service.live import START_NS, endpoint, scenario_blocks, until
 from tests.service.monitored import OPEN
-from tests.service.replaying import recording
+from tests.service.replaying import hurried, recording
 
 M = TypeVar("M", bound=BaseModel)
 ID = "demo/lab/20260101T000000Z.mcap"
@@ -43,6 +43,7 @@ GET_MODELS: dict[str, type[BaseModel]] = {
     f"{REPLAYS}/{{replay_id}}/reports": ReplayReportList,
     f"{REPLAYS}/{{replay_id}}/alarms": ReplayAlarmList,
 }
+QUICK = "demo/lab/20270101T000000Z.mcap"
 DAY_NS = 86_400 * 10**9
 ENDED = ("finished", "stopped", "failed")
 
@@ -65,6 +66,7 @@ def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
     recording(folder / ID, scenario_blocks(85.0, parse_fault("c_bz=0.5@0")))
     recording(folder / "demo/lab/20260101T010000Z.mcap", scenario_blocks(3.0, start_ns=START_NS + 3600 * 10**9))
+    hurried(folder / "demo/lab/20260101T010000Z.mcap", folder / QUICK)
     (folder / "demo/pump").mkdir()
     (folder / "demo/pump/20260101T020000Z.mcap.part").write_bytes(b"being written")
     (folder / "secret.mcap").write_text("secret", encoding="utf-8")
@@ -116,6 +118,12 @@ def test_recordings_are_listed(client: httpx.Client) -> None:
     assert get(client, RECORDINGS, RecordingList, site="demo", machine="fan").recordings == ()
     detail = get(client, f"{RECORDINGS}/{ID}", RecordingDetail)
     assert detail.keys == {"rotorwatch/demo/lab/descriptor": 1, "rotorwatch/demo/lab/stream": 850}
+    quick = get(client, f"{RECORDINGS}/{QUICK}", RecordingDetail)  # recorded in 0.15 s, on another day
+    assert (quick.data_start_ns, quick.data_end_ns) == (START_NS + 3600 * 10**9, START_NS + 3603 * 10**9)
+    assert quick.start_ns > START_NS + DAY_NS
+    third = ended(client, start(client, recordings=[QUICK], from_ns=quick.data_end_ns - 10**9))
+    assert third.summary is not None
+    assert third.summary.blocks == 10
 
 
 def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, directory: Path) -> None:
@@ -240,6 +248,8 @@ def test_a_stretch_and_another_machine(client: httpx.Client) -> None:
     assert done.summary is not None
     assert done.summary.bundle is None
     assert done.summary.blocks == 300
+    assert done.progress is not None
+    assert done.progress.fraction == 1.0
     failed = ended(client, start(client, from_ns=START_NS + DAY_NS))
     assert failed.state == "failed"
     assert "nothing was recorded in between" in failed.error
