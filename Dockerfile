@@ -3,13 +3,15 @@ FROM python:3.11.13-slim-bookworm AS build
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src
 # Dependencies first, so that a change of the source does not fetch them again.
-COPY constraints.txt pyproject.toml README.md ./
+COPY constraints.txt pyproject.toml README.md LICENSE ./
 RUN python -m venv /opt/venv \
-    && mkdir models service simulator \
+    && mkdir models rotorwatch service simulator \
     && touch models/__init__.py service/__init__.py simulator/__init__.py \
+    && echo '__version__ = "0"' > rotorwatch/__init__.py \
     && /opt/venv/bin/pip install --constraint constraints.txt . \
     && /opt/venv/bin/pip uninstall --yes rotorwatch
 COPY models models
+COPY rotorwatch rotorwatch
 COPY service service
 COPY simulator simulator
 RUN /opt/venv/bin/pip install --constraint constraints.txt --no-deps .

@@ -1,8 +1,11 @@
 # make demo    set everything up and run the demo (FAULT=c_by ONCE=1 SEED=7 PACE=20)
 # make test    set everything up and run all checks
 # make format  let ruff put the code in order
+# make wheels  build both wheels into dist/, and run the demo out of the wheel under every Python there is here
+# make floors  run the demo and the tests below with the lowest versions that pyproject.toml admits
 
-PYTHON ?= python3.11
+PYTHONS := $(foreach minor,11 12 13,$(shell command -v python3.$(minor) 2>/dev/null))
+PYTHON ?= $(or $(firstword $(PYTHONS)),python3.11)
 VENV := .venv
 BIN := $(VENV)/bin
 RUN := $(VENV)/.run
@@ -14,13 +17,13 @@ PACE ?= 10
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: setup demo test lint types contracts tests format train clean
+.PHONY: setup demo test lint types contracts tests format wheels floors train clean
 
 setup: $(READY)
 
 # What runs needs no torch; training and the checks do.
 $(RUN): pyproject.toml constraints.txt
-	@command -v $(PYTHON) >/dev/null || { echo "rotorwatch needs Python 3.11 ($(PYTHON) not found; say make PYTHON=...)"; exit 1; }
+	@command -v $(PYTHON) >/dev/null || { echo "rotorwatch needs Python 3.11, 3.12 or 3.13 (none found; say make PYTHON=...)"; exit 1; }
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo "installing what rotorwatch needs (a minute the first time) ..."
 	@$(INSTALL) .
@@ -53,6 +56,30 @@ tests: $(READY)
 format: $(READY)
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+# From a copy: setuptools builds in the tree, and would pack what is left there of older trees.
+wheels:
+	@rm -rf dist build && mkdir -p build/source && cp -r pyproject.toml README.md LICENSE models rotorwatch service simulator build/source
+	@set -e; for python in $(PYTHONS); do \
+	  rm -rf build/venv && $$python -m venv build/venv; \
+	  test -d dist || build/venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir dist build/source build/source/rotorwatch; \
+	  build/venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt dist/rotorwatch-*.whl; \
+	  (cd build && venv/bin/python --version && venv/bin/rotorwatch demo --once); \
+	done
+
+FLOORS := $(CURDIR)/build/floors
+FLOOR_TESTS := tests/signals tests/interchange $(patsubst %,tests/service/test_%.py,access_http api api_events client metrics \
+  plots replay_http rotorwatch_cli snapshots store transport webhooks)
+
+floors:
+	@rm -rf $(FLOORS) && $(PYTHON) -m venv $(FLOORS)
+	@$(FLOORS)/bin/python -m pip install --quiet --disable-pip-version-check 'uv>=0.9'
+	@$(FLOORS)/bin/uv pip compile --quiet --python $(FLOORS)/bin/python --resolution lowest-direct --output-file $(FLOORS)/floors.txt \
+	  $(patsubst %,--extra %,plots io postgres peers dev) pyproject.toml
+	@$(FLOORS)/bin/uv pip install --quiet --python $(FLOORS)/bin/python --requirement $(FLOORS)/floors.txt
+	@$(FLOORS)/bin/uv pip install --quiet --python $(FLOORS)/bin/python --no-deps --editable .
+	$(FLOORS)/bin/rotorwatch demo --once --pace 20
+	PATH=$(FLOORS)/bin:$$PATH $(FLOORS)/bin/pytest -n0 -W default $(FLOOR_TESTS)  # old libraries use what is deprecated now
 
 train: $(READY)
 	$(BIN)/rotortrain train --machine lab --out models/bundles/lab

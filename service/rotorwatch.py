@@ -15,7 +15,15 @@ from service.commands import replay as replay_commands
 from service.commands import watching as watching_commands
 from service.commands import webhook as webhook_commands
 from service.commands.replay import NamespaceOption, in_namespace
-from service.commands.running import ENDPOINT, ConnectOption, LinkOption, ListenOption, exit_codes, one_blas_thread
+from service.commands.running import (
+    ENDPOINT,
+    ConnectOption,
+    LinkOption,
+    ListenOption,
+    VersionOption,
+    exit_codes,
+    one_blas_thread,
+)
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from service.config import ServiceSettings
@@ -30,6 +38,11 @@ app = typer.Typer(
     help="Condition monitoring of rotating machines: which parameter changed, by how much, how sure.",
     epilog="Exit codes: 0 fine, 1 trouble at run time, 2 a file or argument that cannot be used.",
 )
+
+
+@app.callback()
+def _program(_version: VersionOption = False) -> None:
+    pass
 
 
 @app.command()

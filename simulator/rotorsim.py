@@ -20,6 +20,7 @@ from models.link_file import load_link
 from models.machine import Machine, load_machine
 from models.signals.link import LinkSettings
 from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
+from simulator.version import VersionOption
 
 if TYPE_CHECKING:  # the stream imports scipy, which --help must not wait for
     from simulator.messages import BlockStream, RunSummary
@@ -65,6 +66,11 @@ _FaultOption = Annotated[
 ]
 _BlockOption = Annotated[float, typer.Option("--block-s", help="Length of a block, s; 0.02 to 0.5 is sensible.")]
 _EncodingOption = Annotated[_Encoding, typer.Option(help="Raw samples with a fixed header, or Arrow IPC streams.")]
+
+
+@app.callback()
+def _program(_version: VersionOption = False) -> None:
+    pass
 
 
 @app.command()

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from models.errors import RotorwatchError
+from simulator.version import VersionOption
 
 __all__ = ["app"]
 
@@ -36,6 +37,11 @@ DrawsOption = Annotated[
     int, typer.Option(min=2000, help="Random machines and conditions drawn for the amortised networks.")
 ]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
+
+
+@app.callback()
+def _program(_version: VersionOption = False) -> None:
+    pass
 
 
 @app.command()

@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from models.machine import Machine
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), ROOT / "rotorwatch" / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def fields_of(model: type[BaseModel]) -> set[str]:

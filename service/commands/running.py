@@ -17,6 +17,7 @@ __all__ = [
     "LinkOption",
     "ListenOption",
     "ToOption",
+    "VersionOption",
     "exit_codes",
     "one_blas_thread",
 ]
@@ -47,6 +48,19 @@ FromOption = Annotated[
     ),
 ]
 ToOption = Annotated[str | None, typer.Option("--to", metavar="TIME", help="Data before then; the same.")]
+
+
+def _say_version(wanted: bool) -> None:
+    if wanted:
+        from rotorwatch import __version__  # noqa: PLC0415  # brings an HTTP client, which nothing else waits for
+
+        typer.echo(f"rotorwatch {__version__}")
+        raise typer.Exit
+
+
+VersionOption = Annotated[
+    bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
+]
 
 
 def one_blas_thread() -> None:

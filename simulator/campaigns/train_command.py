@@ -22,6 +22,7 @@ from models.diagnosis.networks.relation_training import calibrate, train_network
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
 from models.physics.parameters import PARAMETERS
+from rotorwatch import __version__
 from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
 from simulator.campaigns.feature_draws import FeatureDraws, batches
 from simulator.campaigns.progress import bars
@@ -95,8 +96,9 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
         else:
             amortised = _train_amortised(machine, n_draws, seed, processes, bar)
             amortised = _calibrate_amortised(machine, amortised, n_windows, seed, processes, bar)
-    versions = {name: version(name) for name in ("rotorwatch", "numpy", "torch")} | {
-        "python": platform.python_version()
+    versions = {name: version(name) for name in ("numpy", "torch")} | {
+        "rotorwatch": __version__,
+        "python": platform.python_version(),
     }
     training_record = Training(
         seed=seed,

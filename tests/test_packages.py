@@ -1,0 +1,146 @@
+"""What is installed: both wheels are built and looked into, and the code runs where nothing of it is installed."""
+
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from collections.abc import Iterator
+from email import message_from_bytes
+from email.message import Message
+from pathlib import Path
+
+import pytest
+
+import rotorwatch
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("models", "rotorwatch", "service", "simulator")
+SHIPPED = {".py", ".toml", ".json", ".safetensors", ".jinja", ".mako", ".typed"}
+PROGRAMS = {
+    "rotorsim": "simulator.rotorsim",
+    "rotortrain": "simulator.rotortrain",
+    "rotorwatch": "service.rotorwatch",
+}
+
+
+@pytest.fixture(scope="module")
+def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Both wheels by their distribution's name, from a copy: setuptools builds in the tree, and keeps what was."""
+    copy, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheels")
+    for package in PACKAGES:
+        left_out = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
+        shutil.copytree(ROOT / package, copy / package, ignore=left_out)
+    for name in ("pyproject.toml", "README.md", "LICENSE", "tests"):
+        place = ROOT / name
+        shutil.copytree(place, copy / name) if place.is_dir() else shutil.copy(place, copy)
+    build = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(out)]
+    done = subprocess.run([*build, str(copy), str(copy / "rotorwatch")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return {path.name.split("-")[0]: path for path in out.glob("*.whl")}
+
+
+@pytest.fixture(scope="module")
+def others(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything that is installed here, but for rotorwatch."""
+    folder = tmp_path_factory.mktemp("others")
+    for entry in Path(sysconfig.get_path("purelib")).iterdir():
+        if "rotorwatch" not in entry.name and entry.suffix != ".pth":
+            (folder / entry.name).symlink_to(entry)
+    return folder
+
+
+def in_new_process(code: str, *paths: Path, cwd: Path, arguments: tuple[str, ...] = ()) -> str:
+    """Run code that finds the standard library and these folders, and no installed package; what it printed."""
+    begin = f"import sys; sys.path[:0] = {[str(path) for path in paths]}; "
+    done = subprocess.run(
+        [sys.executable, "-I", "-S", "-c", begin + code, *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def metadata(wheel: Path) -> Message:
+    with zipfile.ZipFile(wheel) as archive:
+        (name,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        return message_from_bytes(archive.read(name))
+
+
+def requirements(wheel: Path) -> list[str]:
+    return metadata(wheel).get_all("Requires-Dist", [])
+
+
+def contents(wheel: Path) -> Iterator[str]:
+    with zipfile.ZipFile(wheel) as archive:
+        yield from (name for name in archive.namelist() if ".dist-info/" not in name)
+
+
+def files_of(*packages: str) -> set[str]:
+    return {
+        str(path.relative_to(ROOT))
+        for package in packages
+        for path in (ROOT / package).rglob("*")
+        if path.suffix in SHIPPED and path != ROOT / "rotorwatch" / "pyproject.toml" and "build" not in path.parts
+    }
+
+
+def test_one_wheel_brings_the_programs_with_all_their_files(wheels: dict[str, Path]) -> None:
+    assert set(contents(wheels["rotorwatch"])) == files_of(*PACKAGES)
+
+
+def test_the_client_is_a_wheel_of_its_own(wheels: dict[str, Path]) -> None:
+    assert set(contents(wheels["rotorwatch_client"])) == files_of("rotorwatch")
+    needed = [
+        line for line in metadata(wheels["rotorwatch_client"]).get_all("Requires-Dist", []) if "extra" not in line
+    ]
+    assert {line.split("<")[0].split(">")[0] for line in needed} == {"httpx", "httpx-sse", "pydantic"}
+
+
+def test_both_wheels_say_version_and_licence(wheels: dict[str, Path]) -> None:
+    for wheel in wheels.values():
+        found = metadata(wheel)
+        assert found["Version"] == rotorwatch.__version__
+        assert found["License-Expression"] == "Apache-2.0"
+        with zipfile.ZipFile(wheel) as archive:
+            (licence,) = (name for name in archive.namelist() if name.endswith("licenses/LICENSE"))
+            assert archive.read(licence) == (ROOT / "LICENSE").read_bytes()
+
+
+def test_the_wheels_agree_on_what_they_need(wheels: dict[str, Path]) -> None:
+    client = {line.split(";")[0] for line in requirements(wheels["rotorwatch_client"])}
+    assert client <= set(requirements(wheels["rotorwatch"]))
+
+
+def test_the_installed_client_loads_neither_server_nor_database_nor_numbers(
+    wheels: dict[str, Path], others: Path, tmp_path: Path
+) -> None:
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path / "site")]
+    subprocess.run([*install, str(wheels["rotorwatch_client"])], check=True)
+    code = "from rotorwatch import Client; Client().close(); print(*sorted(sys.modules)); print(Client.__module__)"
+    loaded, where = in_new_process(code, tmp_path / "site", others, cwd=tmp_path).splitlines()
+    assert where == "rotorwatch.client.client"
+    heavy = {"numpy", "scipy", "fastapi", "starlette", "uvicorn", "sqlalchemy", "zenoh", "models", "service"}
+    assert not heavy & set(loaded.split())
+    code = "import rotorwatch.client.alarm_log; print('models' in sys.modules, 'service' in sys.modules)"
+    assert in_new_process(code, tmp_path / "site", others, cwd=tmp_path) == "False False"
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_programs_run_from_a_checkout_that_is_not_installed_and_say_their_version(
+    others: Path, tmp_path: Path, program: str
+) -> None:
+    code = f"from {PROGRAMS[program]} import app; app(prog_name='{program}')"
+    said = in_new_process(code, ROOT, others, cwd=tmp_path, arguments=("--version",))
+    assert said == f"{program} {rotorwatch.__version__}"
+
+
+def test_a_checkout_that_is_not_installed_can_be_imported(others: Path, tmp_path: Path) -> None:
+    code = (
+        "import importlib.metadata as m, service.runtime, service.asyncapi, simulator.campaigns.train_command; "
+        "print([d.name for d in m.distributions() if d.name.startswith('rotorwatch')])"
+    )
+    assert in_new_process(code, ROOT, others, cwd=tmp_path) == "[]"
