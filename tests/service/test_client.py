@@ -152,7 +152,7 @@ def test_tokens(seen: tuple[Runtime, MachineWorker], monkeypatch: pytest.MonkeyP
         assert caught.value.status == 401
         with pytest.raises(AccessRefused, match="an access token is needed"):
             next(stranger.events())
-    with Rotorwatch(runtime.http_url, "rw_000000000000_" + 43 * "0") as mistaken:
+    with Client(runtime.http_url, "rw_000000000000_" + 43 * "0") as mistaken:
         with pytest.raises(AccessRefused, match="not valid") as caught:
             mistaken.machines()
         assert caught.value.status == 401

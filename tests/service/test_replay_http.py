@@ -121,6 +121,7 @@ def test_recordings_are_listed(client: httpx.Client) -> None:
     quick = get(client, f"{RECORDINGS}/{QUICK}", RecordingDetail)  # recorded in 0.15 s, on another day
     assert (quick.data_start_ns, quick.data_end_ns) == (START_NS + 3600 * 10**9, START_NS + 3603 * 10**9)
     assert quick.start_ns > START_NS + DAY_NS
+    assert quick.data_end_ns is not None
     third = ended(client, start(client, recordings=[QUICK], from_ns=quick.data_end_ns - 10**9))
     assert third.summary is not None
     assert third.summary.blocks == 10
