@@ -9,8 +9,10 @@ __all__ = [
     "ALARM_TEXT",
     "CLOCK",
     "DATA",
+    "FAULT",
     "GAP",
     "MODEL",
+    "OVERLOADED",
     "PHASE_REFERENCE",
     "SHAPE",
     "STREAM_LOST",
@@ -27,6 +29,9 @@ SHAPE = "shape"
 STREAM_LOST = "stream-lost"
 """The alarm that says: no data come any more."""
 
+FAULT, OVERLOADED = "monitor-fault", "monitor-overloaded"
+"""The alarms on the monitor itself: a defect, or a history that refuses; and a computer that cannot keep up."""
+
 DATA = "data-"
 """What the names of all alarms of data health begin with."""
 
@@ -38,6 +43,8 @@ ALARM_TEXT: Mapping[str, str] = MappingProxyType(
         MODEL: "outside the model",
         SHAPE: "vibration changed",
         STREAM_LOST: "stream lost",
+        FAULT: "fault in the monitor",
+        OVERLOADED: "monitor overloaded",
         GAP: "data health, gap",
         CLOCK: "data health, clock",
         PHASE_REFERENCE: "data health, phase reference",
@@ -60,5 +67,5 @@ def data_alarm(kind: str) -> str:
 
 
 def of_the_machine(name: str) -> bool:
-    """Whether an alarm says something of the machine; what is wrong with the data is none of it."""
-    return not name.startswith(DATA) and name != STREAM_LOST
+    """Whether an alarm says something of the machine; what is wrong with the data or the monitor is none of it."""
+    return not name.startswith(DATA) and name not in {STREAM_LOST, FAULT, OVERLOADED}

@@ -195,6 +195,21 @@ class SuppressRule(BaseModel):
                 raise ValueError(f"while_alarm: {self.while_alarm} would suppress itself")
         return self
 
+    @property
+    def identity(self) -> str:
+        """What the rule depends on; rules that depend on the same thing hold together.
+
+        Examples
+        --------
+        >>> SuppressRule(alarms=("model",), below_rpm=600, because="coasting down").identity
+        'below_rpm=600.0'
+        """
+        return next(
+            f"{name}={value}"
+            for name in ("while_alarm", "below_rpm", "above_rpm")
+            if (value := getattr(self, name)) is not None
+        )
+
 
 class AlarmSettings(BaseModel):
     """When a parameter change becomes an alarm; all times are data time."""

@@ -61,21 +61,24 @@ def health(
     record: MachineHealth,
     stream: StreamStatus,
     *,
-    no_data_reason: str = "",
     queue_dropped_blocks: int = 0,
     link_missed_blocks: int = 0,
     worker_errors: int = 0,
     last_worker_error: str = "",
     restart: str = "",
 ) -> Health:
-    """Convert a machine's health; with a reason for it, the state is no-data, and the alarms stay as they are."""
+    """Convert a machine's health; silence is the state of a machine without a raised alarm, and is said of any."""
     latest = record.latest
+    silence = ""
+    if stream.silent:
+        since_ns = stream.silent_since_ns
+        silence = f"no data since {'the monitor started' if since_ns is None else rfc3339(since_ns)[:19] + 'Z'}"
     window = None if latest is None else report(identity, latest)
     return Health(
         site=identity.site,
         machine=identity.machine,
-        state=HealthState.NO_DATA if no_data_reason else record.state,
-        reason=no_data_reason or ("" if latest is None else latest.reason),
+        state=HealthState.NO_DATA if stream.silent and not record.state.alarmed else record.state,
+        reason="; ".join(filter(None, (silence, record.reason))),
         filled=record.filled,
         window_start_ns=None if window is None else window.start_ns,
         window_end_ns=None if window is None else window.end_ns,

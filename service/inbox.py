@@ -3,7 +3,7 @@
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 __all__ = ["Inbox", "RawBlock"]
@@ -11,11 +11,19 @@ __all__ = ["Inbox", "RawBlock"]
 
 @dataclass(frozen=True, slots=True)
 class RawBlock:
-    """One message of the stream as it arrived."""
+    """One message of the stream as it arrived.
+
+    Attributes
+    ----------
+    payload, attachment, encoding : bytes, bytes, str
+    dropped_before : int
+        Messages that arrived before it and were thrown away because the queue was full.
+    """
 
     payload: bytes
     attachment: bytes
     encoding: str
+    dropped_before: int = 0
 
 
 class Inbox:
@@ -54,7 +62,9 @@ class Inbox:
                 self._changed.wait_for(lambda: self._closed or len(self._blocks) < self._bound)
             elif len(self._blocks) >= self._bound:
                 self._dropped += len(self._blocks)
+                before = len(self._blocks) + sum(one.dropped_before for one in self._blocks)
                 self._blocks.clear()
+                block = replace(block, dropped_before=before)
             if not self._closed:
                 self._blocks.append(block)
                 self._changed.notify_all()

@@ -11,19 +11,18 @@ into another one, which goes on as if nothing had happened.
 """
 
 from collections import Counter, deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from models.alarm_names import CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST, data_alarm
+from models.alarm_names import MODEL, SHAPE
 from models.arrivals import Arrivals, Arrived
 from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
 from models.commissioning.installed import Installed
 from models.diagnosis.moments import HopMoments, plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sensors.finding import FAULT_KINDS, SensorFinding
 from models.diagnosis.verdict.detectable import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
 from models.diagnosis.verdict.stretch import Stretch, stretch_of
@@ -31,12 +30,12 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Gate, Reason, Verdict
 from models.signals.block import SampleBlock
-from models.signals.channels import with_channel_names
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState
 from service.alarms.alarm import AlarmEvent, Evidence
 from service.alarms.book import AlarmBook
+from service.alarms.data_path import DataPathAlarms
 from service.alarms.operation import Operation
 from service.reports import DataQuality, MachineHealth, MonitorReport, MonitorState, WindowReport
 from service.residuals import Evaluation, evaluator_for
@@ -69,6 +68,7 @@ class MachineMonitor:
         settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
         self._test = SequentialTest(settings, by=self._evaluator.by)
         self._alarms = AlarmBook(machine.alarms)
+        self._data_path = DataPathAlarms(self._alarms, machine)
         self._quality = DataQuality()
         self._refused: Counter[str] = Counter()
         self._latest: WindowReport | None = None
@@ -76,12 +76,25 @@ class MachineMonitor:
         self._end_ns: int | None = None
         self._reached_ns: int | None = None
         self._kept_is_valid = True
+        self._drops: dict[tuple[int, int], int] = {}
+        self._dropped = 0
+        self._fault = ""
+        self._defect: Exception | None = None
         self._statistics: WindowStatistics | None = None
         self._newest: deque[SampleBlock] = deque()
         self._newest_samples = 0
 
-    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> tuple[MonitorReport, ...]:
+    def step_payload(
+        self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
+    ) -> tuple[MonitorReport, ...]:
         """Decode a message of the stream and take what is in order now as `step` does.
+
+        Parameters
+        ----------
+        payload, attachment, encoding : bytes, bytes, str
+            See `models.signals.wire`.
+        dropped_before : int
+            Messages before this one that this computer could not keep up with.
 
         Returns
         -------
@@ -89,11 +102,14 @@ class MachineMonitor:
             One per block that was taken: none while a block waits for an earlier one, several when that has come.
             Undecodable bytes are a refusal like any other.
         """
+        self._dropped += dropped_before
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
             name = f"{self.machine.site}/{self.machine.name}"
             return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
+        if self._dropped:
+            self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
         self._due.extend(self._arrivals.take(block, schema_hash))
         return self._step_due()
 
@@ -123,11 +139,26 @@ class MachineMonitor:
         Returns
         -------
         MonitorReport
-            Immutable; refused blocks and gaps are stated in it, never raised.
+            Immutable; refused blocks, gaps and defects of the monitor are stated in it, never raised.
         """
-        verdict = self._judged(block, schema_hash)
+        dropped = self._drops.pop((block.run, block.sequence), 0)
+        verdict = self._judged(block, schema_hash, dropped)
         if not verdict.accepted:
+            self._dropped += dropped
             return MonitorReport(verdict)
+        windows: list[WindowReport] = []
+        try:
+            for end_ns in self._hops(block, verdict, dropped):
+                windows.append(self._evaluate(end_ns))
+        except Exception as error:  # whatever it is, the machine must not look healthy on account of it
+            self._window.gap()
+            self._failed(error, block.end_ns)
+        fault, self._defect = self._defect, None
+        length_s = float(block.samples.shape[0] / block.rate_hz)
+        return MonitorReport(verdict, tuple(windows), self._alarms.take(), length_s, fault)
+
+    def _hops(self, block: SampleBlock, verdict: Verdict, dropped: int) -> Iterable[int]:
+        """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
         if not verdict.continuous:
             self._window.gap()
         self._keep(block, continuous=verdict.continuous and not verdict.clock_step_s)
@@ -140,12 +171,28 @@ class MachineMonitor:
             # Until now the time of day was all there was; shelving goes on by the time of the data.
             self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
         self._alarms.passed(block.start_ns)
-        self._stream_alarms(verdict, block.start_ns)
+        self._data_path.accepted(verdict, block.start_ns, dropped)
         self._end_ns = block.end_ns
-        windows = tuple(
-            self._evaluate(end_ns) for end_ns in self._window.feed(self._plan.to_si(block.samples), block.start_ns)
-        )
-        return MonitorReport(verdict, windows, self._alarms.take(), float(block.samples.shape[0] / block.rate_hz))
+        return self._window.feed(self._plan.to_si(block.samples), block.start_ns)
+
+    def fault(self, what: str, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Raise the alarm on the monitor itself; it clears once windows are evaluated again.
+
+        Parameters
+        ----------
+        what : str
+            What is wrong.
+        time_ns : int
+            Data time that has been reached.
+        """
+        self._data_path.fault(what, time_ns)
+        return self._alarms.take()
+
+    def _failed(self, error: Exception, time_ns: int) -> None:
+        """A defect: nothing can be said of the machine until a window is evaluated again."""
+        self._defect = error
+        self._fault = f"a defect in the monitor, not in the machine: {type(error).__name__}: {error}"
+        self._data_path.fault(self._fault, time_ns)
 
     def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Take note of time that has passed, with data or without.
@@ -157,8 +204,7 @@ class MachineMonitor:
         """
         self._reached_ns = time_ns
         self._alarms.passed(time_ns)
-        if self._end_ns is not None and time_ns - self._end_ns >= self._lost_ns:
-            self._lost(self._end_ns)
+        self._data_path.passed(time_ns, self._end_ns)
         return self._alarms.take()
 
     @property
@@ -263,7 +309,7 @@ class MachineMonitor:
     def health(self) -> MachineHealth:
         """Where the machine stands now."""
         # What operators did since the latest window counts at once.
-        state = self._state(self._calm)
+        state = self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm)
         return MachineHealth(
             state,
             self._window.filled,
@@ -271,6 +317,8 @@ class MachineMonitor:
             self._alarms.alarms,
             self._quality,
             self._alarms.next_sequence - 1,
+            self._fault or ("" if self._latest is None else self._latest.reason),
+            self._end_ns,
         )
 
     def _keep(self, block: SampleBlock, *, continuous: bool) -> None:
@@ -283,7 +331,7 @@ class MachineMonitor:
         while self._newest_samples - self._newest[0].samples.shape[0] >= _NEWEST_SAMPLES:
             self._newest_samples -= self._newest.popleft().samples.shape[0]
 
-    def _judged(self, block: SampleBlock, schema_hash: str) -> Verdict:
+    def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Verdict:
         """What the gate says; of the data that another monitor had before this one it knows nothing."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
@@ -296,6 +344,12 @@ class MachineMonitor:
             elif late_s > ingest.time_tolerance_s:
                 text = f"{name}: {late_s:.6g} s of data are missing over the restart"
                 verdict = Verdict(text=text, gap_s=late_s)
+        if dropped and verdict.gap_s > 0:
+            text = (
+                f"{self.machine.site}/{self.machine.name}: {dropped} blocks ({verdict.gap_s:.6g} s of data) were "
+                "not evaluated: the monitor cannot keep up"
+            )
+            verdict = replace(verdict, text=text)
         return self._count(verdict)
 
     def _count(self, verdict: Verdict) -> Verdict:
@@ -316,66 +370,29 @@ class MachineMonitor:
             )
         return verdict
 
-    def _stream_alarms(self, verdict: Verdict, start_ns: int) -> None:
-        """Alarms on the stream itself, at an accepted block."""
-        alarms, settings = self._alarms, self.machine
-        before_ns = start_ns - round(verdict.gap_s * 1e9)
-        if verdict.gap_s >= settings.ingest.no_data_after_s:
-            self._lost(before_ns)
-        alarms.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
-        if verdict.gap_s > 0 and verdict.gap_s >= settings.alarms.gap_s:
-            missing = Evidence(before_ns, start_ns)
-            alarms.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
-        if verdict.clock_step_s and not verdict.new_run:
-            alarms.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
-        alarms.suppress(None, start_ns)
-
-    @property
-    def _lost_ns(self) -> int:
-        return round(self.machine.ingest.no_data_after_s * 1e9)
-
-    def _lost(self, end_ns: int) -> None:
-        """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
-        note = f"no usable data for {self.machine.ingest.no_data_after_s:g} s; what was raised stays raised"
-        due_ns = end_ns + self._lost_ns
-        self._alarms.update_state(STREAM_LOST, True, due_ns, note, evidence=Evidence(end_ns, due_ns), at_once=True)
-        self._alarms.suppress(None, due_ns)
-
-    def _found_again_ns(self, start_ns: int) -> int:
-        """When the silence ended; data that came late, but without a gap, are older than the alarm on them."""
-        raised_ns = next((one.raised_ns for one in self._alarms.alarms if one.name == STREAM_LOST), None)
-        late = raised_ns is not None and 0 <= raised_ns - start_ns <= self._lost_ns
-        return raised_ns if raised_ns is not None and late else start_ns
-
-    def _sensor_alarms(self, findings: tuple[SensorFinding, ...], statistics: WindowStatistics) -> None:
-        """One alarm for each kind of fault, with a sentence for each channel it is found in."""
-        said: dict[str, list[str]] = {}
-        for found in findings:
-            # Whatever is wrong with the shaft's angle costs the phase reference.
-            name = PHASE_REFERENCE if found.states == ("theta",) else data_alarm(found.kind)
-            said.setdefault(name, []).append(found.text)
-        evidence = Evidence(statistics.start_ns, statistics.end_ns)
-        for name in (PHASE_REFERENCE, *map(data_alarm, FAULT_KINDS)):
-            note = "; ".join(said.get(name, ()))
-            self._alarms.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
-
     def _evaluate(self, end_ns: int) -> WindowReport:
-        """Evaluate the window as it is after a completed hop."""
-        report = self._latest = self._evaluated(end_ns)
+        """Evaluate the window as it is after a completed hop; a defect is a reason why it cannot be."""
+        self._fault = ""
+        try:
+            report = self._evaluated(end_ns)
+        except Exception as error:
+            self._failed(error, end_ns)
+            state = self._state(HealthState.NOT_EVALUABLE)
+            report = WindowReport(end_ns, end_ns, state, self._window.filled, reason=self._fault)
+        self._latest = report
         self._alarms.suppress(None, end_ns)
         return report
 
     def _evaluated(self, end_ns: int) -> WindowReport:
         filled = self._window.filled
-        self._alarms.update_state(GAP, False, end_ns)
-        self._alarms.update_state(CLOCK, False, end_ns)
+        self._data_path.hop(end_ns)
         statistics = self._statistics = self._window.statistics()
         if statistics is None:
             return WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
         speed_rad_s = statistics.speed_rad_s
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
-        self._sensor_alarms(findings, statistics)
+        self._data_path.sensors(findings, statistics)
         if findings:
             return WindowReport(
                 statistics.start_ns,
@@ -393,7 +410,7 @@ class MachineMonitor:
             return WindowReport(
                 statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
             )
-        evaluation = self._named(evaluation)
+        evaluation = evaluation.named(self.machine.sensors)
         looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
         whole = self._test.settings.window_hops
         looks[whole] = _stretch(evaluation.deciding, statistics)
@@ -421,18 +438,6 @@ class MachineMonitor:
             ),
             reason="" if evaluation.deciding.evaluable else _why_nothing(evaluation.deciding),
             shapes=evaluation.shapes,
-        )
-
-    def _named(self, evaluation: Evaluation) -> Evaluation:
-        """The same with sentences in the names of this machine's channels."""
-        channels = self.machine.sensors
-        suspect = with_channel_names(evaluation.deciding.suspect, channels)
-        return replace(
-            evaluation,
-            deciding=replace(evaluation.deciding, suspect=suspect),
-            shapes=tuple(
-                replace(one, sentence=with_channel_names(one.sentence, channels)) for one in evaluation.shapes
-            ),
         )
 
     def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> None:

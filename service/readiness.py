@@ -59,3 +59,5 @@ def _reasons(
             yield f"{place}: the thread that evaluates its blocks has stopped"
         elif machine.worker_busy_s > STUCK_S:
             yield f"{place}: one block has been in the monitor for {machine.worker_busy_s:.0f} s"
+        if machine.trouble:
+            yield f"{place}: {machine.trouble}"

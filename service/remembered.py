@@ -10,9 +10,19 @@ from service.alarms.book import NO_ALARMS
 from service.conversion import report as report_json
 from service.monitor import MachineMonitor
 from service.reports import MonitorState, WindowReport
-from service.store.records import Checkpoint, CheckpointHead, CheckpointStep, StoredEvent, StoredReading, StoredReport
+from service.store.errors import StoreError
+from service.store.machine import MachineStore
+from service.store.records import (
+    Checkpoint,
+    CheckpointHead,
+    CheckpointStep,
+    Step,
+    StoredEvent,
+    StoredReading,
+    StoredReport,
+)
 
-__all__ = ["FORMAT", "checkpoint_step", "restored", "stored_event", "stored_readings", "stored_report"]
+__all__ = ["FORMAT", "StepWriter", "checkpoint_step", "restored", "stored_event", "stored_readings", "stored_report"]
 
 FORMAT = 1
 """Goes up when what a monitor remembers changes its form."""
@@ -58,6 +68,66 @@ def stored_event(identity: Identity, event: AlarmEvent, recorded_ns: int) -> Sto
         actor=event.actor,
         text=said.model_dump_json(),
     )
+
+
+class StepWriter:
+    """Commits what one machine's monitor says, and what it remembers afterwards, in one step.
+
+    What the history refuses is tried again with the next step: the log takes no event that comes after a missing one.
+
+    Parameters
+    ----------
+    history : MachineStore
+    identity : Identity
+
+    Attributes
+    ----------
+    refused : StoreError or None
+        Why the history has refused the latest step; None if it has not.
+    """
+
+    def __init__(self, history: MachineStore, identity: Identity) -> None:
+        self._history = history
+        self._identity = identity
+        self._owed: tuple[AlarmEvent, ...] = ()
+        self._kept: tuple[int, ...] = ()
+        self.refused: StoreError | None = None
+
+    def keeps(self, hops: tuple[int, ...]) -> None:
+        """Take note of the hops that are in the history already."""
+        self._kept = hops
+
+    def owe(self, events: tuple[AlarmEvent, ...]) -> None:
+        """Take note of events that go into the next step."""
+        self._owed += events
+
+    def commit(
+        self, monitor: MachineMonitor, windows: tuple[WindowReport, ...], recorded_ns: int
+    ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
+        """Commit windows, the events that are owed, and the state of the monitor.
+
+        Returns
+        -------
+        tuple
+            Reports and events as they are to be published, and whether all of it is in the database now.
+        """
+        state = monitor.state(self._kept)
+        reports = tuple(stored_report(self._identity, window) for window in windows)
+        told = tuple(stored_event(self._identity, event, recorded_ns) for event in self._owed)
+        step = Step(
+            reports=reports,
+            readings=stored_readings(windows),
+            events=told,
+            checkpoint=checkpoint_step(self._identity, state, recorded_ns),
+        )
+        try:
+            written = self._history.commit(step)
+        except StoreError as error:  # operators must hear of it all the same
+            self._kept = ()
+            self.refused = error
+            return reports, told, False
+        self._kept, self._owed, self.refused = state.hops, (), None
+        return reports, told, written
 
 
 def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -> CheckpointStep:

@@ -111,12 +111,15 @@ class MonitorReport:
         What happened to alarms.
     data_s : float
         Length of the block, if it was accepted.
+    fault : Exception or None
+        A defect of the monitor that came to light with the block; what it cost is said in `windows` and `events`.
     """
 
     verdict: Verdict
     windows: tuple[WindowReport, ...] = ()
     events: tuple[AlarmEvent, ...] = ()
     data_s: float = 0.0
+    fault: Exception | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +149,25 @@ class MonitorState:
 
 @dataclass(frozen=True, slots=True)
 class MachineHealth:
-    """Where the machine stands: the latest window, the alarms, the quality of the data, the latest event's number."""
+    """Where the machine stands.
+
+    Attributes
+    ----------
+    state : HealthState
+    filled : float
+        Fraction of a full window.
+    latest : WindowReport or None
+        The latest window.
+    alarms : tuple of Alarm
+        All that have been seen so far.
+    quality : DataQuality
+    sequence : int
+        Number of the latest alarm event.
+    reason : str
+        Why nothing is said of the machine; empty if something is.
+    end_ns : int or None
+        End of the newest data; None before the first.
+    """
 
     state: HealthState
     filled: float
@@ -154,3 +175,5 @@ class MachineHealth:
     alarms: tuple[Alarm, ...]
     quality: DataQuality
     sequence: int = -1
+    reason: str = ""
+    end_ns: int | None = None

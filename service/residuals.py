@@ -5,8 +5,8 @@ which only healthy recordings are known is compared with its baseline (`Baseline
 no equation, each channel with its own healthy form.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -32,6 +32,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import BundleError, CheckpointError, EstimationError
 from models.machine import Machine, MachineFile
 from models.physics.parameters import PARAMETERS
+from models.signals.channels import Channel, with_channel_names
 
 __all__ = ["Evaluation", "Opinion", "WindowEvaluator", "evaluator_for"]
 
@@ -91,6 +92,14 @@ class Evaluation:
     opinions: tuple[Opinion, ...]
     speed_rad_s: float | None
     shapes: tuple[ChannelShape, ...] = ()
+
+    def named(self, channels: Sequence[Channel]) -> "Evaluation":
+        """The same with sentences in the names of a machine's channels."""
+        return replace(
+            self,
+            deciding=replace(self.deciding, suspect=with_channel_names(self.deciding.suspect, channels)),
+            shapes=tuple(replace(one, sentence=with_channel_names(one.sentence, channels)) for one in self.shapes),
+        )
 
 
 class WindowEvaluator(Protocol):

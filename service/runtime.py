@@ -143,6 +143,7 @@ class Runtime:
                 worker_errors=worker.errors,
                 last_worker_error=worker.last_error,
                 worker_busy_s=round(pulse.busy_s, 1),
+                trouble=worker.trouble,
                 history_waiting=worker.history.waiting,
                 recording="off" if (recorder := self.recorder_status(worker)) is None else recorder.text,
             )

@@ -25,12 +25,11 @@ from service.descriptor import descriptor_mismatch
 from service.inbox import Inbox, RawBlock
 from service.logs import Limiter, logger
 from service.monitor import MachineMonitor
-from service.remembered import checkpoint_step, restored, stored_event, stored_readings, stored_report
+from service.remembered import StepWriter, restored
 from service.reports import MachineHealth, MonitorReport, WindowReport
 from service.snapshots.desk import LatestData, SnapshotDesk
-from service.store.errors import StoreError
 from service.store.machine import MachineStore
-from service.store.records import Step, StoredEvent, StoredReport
+from service.store.records import StoredEvent, StoredReport
 
 __all__ = ["Clocks", "MachineWorker", "Outlet", "Tally"]
 
@@ -137,10 +136,10 @@ class MachineWorker:
         self._on_events = on_events
         self._log = logger(machine=f"{machine.site}/{machine.name}")
         self._limiter = Limiter(clocks.monotonic_s)
-        self._kept: tuple[int, ...] = ()
+        self._steps = StepWriter(history, self.identity)
         self._unpublished: tuple[StoredEvent, ...] = ()
         self._asleep_s = 0.0
-        self._owed: tuple[AlarmEvent, ...] = ()
+        self._unevaluated_s = 0.0
         self._monitor, self.restart = self._restored(installed)
         self._snapshot: MachineHealth = self._monitor.health()
         self._begin_s = clocks.monotonic_s()
@@ -167,7 +166,7 @@ class MachineWorker:
                 monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
         monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
-        self._kept = monitor.hops
+        self._steps.keeps(monitor.hops)
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
         # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
@@ -179,6 +178,18 @@ class MachineWorker:
     def alive(self) -> bool:
         """Whether the thread runs."""
         return self._thread.is_alive()
+
+    @property
+    def trouble(self) -> str:
+        """Why the machine is not monitored as it should be although data come in; empty if it is."""
+        refused = self._steps.refused
+        reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
+        if self.history.trouble:
+            reasons.append(f"the history does not take what happens: {self.history.trouble}")
+        if self._unevaluated_s > 2 * self.machine.window.hop_s and not self._silent:
+            why = self._snapshot.reason
+            reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
+        return "; ".join(reasons)
 
     def start(self, outlet: Outlet) -> None:
         """Start the thread; it publishes to `outlet`."""
@@ -217,23 +228,17 @@ class MachineWorker:
 
     def health(self) -> Health:
         """Where the machine stands now."""
-        now_s = self._clocks.monotonic_s()
-        latest_s = self._latest_data_s
-        silent_s = now_s - (self._begin_s if latest_s is None else latest_s)
-        limit_s = self.machine.ingest.no_data_after_s
-        reason = ""
-        if silent_s > limit_s:
-            since = "since the monitor started" if latest_s is None else f"for more than {limit_s:g} s"
-            reason = f"no usable block {since}"
+        latest_s, snapshot, silent = self._latest_data_s, self._snapshot, self._silent
         return conversion.health(
             self.identity,
-            self._snapshot,
+            snapshot,
             StreamStatus(
                 publisher_alive=self._publisher_alive,
-                data_age_s=None if latest_s is None else round(max(0.0, now_s - latest_s), 3),
+                data_age_s=None if latest_s is None else round(max(0.0, self._clocks.monotonic_s() - latest_s), 3),
+                silent=silent,
+                silent_since_ns=snapshot.end_ns if silent else None,
                 descriptor_mismatch=self._mismatch,
             ),
-            no_data_reason=reason,
             queue_dropped_blocks=self.inbox.dropped,
             link_missed_blocks=self._missed,
             worker_errors=self.errors,
@@ -316,6 +321,12 @@ class MachineWorker:
     def _place(self) -> str:
         return f"{self.machine.site}/{self.machine.name}"
 
+    @property
+    def _silent(self) -> bool:
+        """Whether no usable block has come for longer than a silence may last."""
+        latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
+        return self._clocks.monotonic_s() - latest_s > self.machine.ingest.no_data_after_s
+
     def _data_now_ns(self) -> int:
         """Data time that has been reached: end of the newest data, and what has passed since."""
         end_ns = self._monitor.end_ns
@@ -353,6 +364,7 @@ class MachineWorker:
                     item()
             except Exception as error:  # one bad block must not end the monitoring of the machine
                 self._failed(error)
+                self._fault(f"{type(error).__name__}: {error}")
         # An orderly end keeps where the monitor stands to the last block: going on needs no publisher's cache.
         self._conclude((), (), always=True)
 
@@ -362,9 +374,18 @@ class MachineWorker:
         if (withheld := self._limiter.admit("error")) is not None:
             self._log.error("something was lost to an error in the monitor", withheld=withheld, exc_info=error)
 
+    def _fault(self, what: str) -> None:
+        """Let operators hear that something is wrong here, once."""
+        try:
+            events = self._monitor.fault(what, self._data_now_ns())
+            if events:
+                self._conclude((), events)
+        except Exception as error:  # there is nobody left to tell
+            self._failed(error)
+
     def _take(self, block: RawBlock) -> None:
         begin_s = self._clocks.monotonic_s()
-        reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding)
+        reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
         tally = self.tally
         self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
         self._conclude_reports(reports)
@@ -378,6 +399,10 @@ class MachineWorker:
                     self._operated_ns = 0  # perhaps by another clock
                 self._latest_data_s = self._clocks.monotonic_s()
                 self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
+            if report.fault is not None:
+                self._failed(report.fault)
+            evaluated = report.windows and report.fault is None
+            self._unevaluated_s = 0.0 if evaluated else self._unevaluated_s + report.data_s
         self._conclude(
             tuple(window for report in reports for window in report.windows),
             tuple(event for report in reports for event in report.events),
@@ -388,7 +413,7 @@ class MachineWorker:
     ) -> tuple[str, ...]:
         """Commit, then let it be seen and publish; returns the events as they are published."""
         events += self._monitor.take_events()  # left behind by a defect
-        self._owed += events
+        self._steps.owe(events)
         snapshot = self._monitor.health()
         reports: tuple[StoredReport, ...] = ()
         told: tuple[StoredEvent, ...] = ()
@@ -408,32 +433,18 @@ class MachineWorker:
             self._publish([one.text for one in reports], texts)
         except Exception as error:  # the network's, of whatever kind; who lacks an event asks for it
             self._failed(error)
+        if self._steps.refused is not None:
+            self._fault(f"the history refuses what happens: {self._steps.refused}")
         return texts
 
     def _commit(self, windows: tuple[WindowReport, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
-        """Bring windows, events and the monitor's state into the history, as they are to be published.
-
-        What it refuses is tried again with the next step: the log takes no event that comes after a missing one.
-        """
-        recorded_ns = self._clocks.utc_ns()
-        state = self._monitor.state(self._kept)
-        reports = tuple(stored_report(self.identity, window) for window in windows)
-        told = tuple(stored_event(self.identity, event, recorded_ns) for event in self._owed)
-        step = Step(
-            reports=reports,
-            readings=stored_readings(windows),
-            events=told,
-            checkpoint=checkpoint_step(self.identity, state, recorded_ns),
-        )
+        """Bring windows, events and the monitor's state into the history, as they are to be published."""
         begin_s = self._clocks.monotonic_s()
-        try:
-            if not self.history.commit(step):
-                self._warn("history", "the history cannot be written; what happened waits in memory and is published")
-        except StoreError as error:  # operators must hear of it all the same
-            self._kept = ()
-            self._failed(error)
-        else:
-            self._kept, self._owed = state.hops, ()
+        reports, told, written = self._steps.commit(self._monitor, windows, self._clocks.utc_ns())
+        if self._steps.refused is not None:
+            self._failed(self._steps.refused)
+        elif not written:
+            self._warn("history", "the history cannot be written; what happened waits in memory and is published")
         tally = self.tally
         self.tally = replace(
             tally,

@@ -25,6 +25,11 @@ class HealthState(StrEnum):
     NO_DATA = "no-data"
     NOT_EVALUABLE = "not-evaluable"
 
+    @property
+    def alarmed(self) -> bool:
+        """Whether an alarm on the machine is raised: silence hides nothing of that."""
+        return self in {HealthState.ALERT, HealthState.DANGER}
+
 
 State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
 
@@ -120,6 +125,13 @@ class StreamStatus(BaseModel):
     publisher_alive: bool = Field(
         description="a publisher's liveliness token is there; publishers need not have one", examples=[True]
     )
+    silent: bool = Field(
+        description="no usable block for longer than `no_data_after_s` of the machine file", examples=[False]
+    )
+    silent_since_ns: int | None = Field(
+        description="end of the newest data, while it is silent; null while data come, or if none ever came",
+        examples=[None],
+    )
     data_age_s: float | None = Field(
         description="time since the last accepted block was processed; null before the first", examples=[0.04]
     )
@@ -137,11 +149,14 @@ class Health(BaseModel):
     machine: Name
     state: HealthState = Field(
         description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
-        "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence; outranks everything, see "
-        "`alarms`) or not-evaluable",
+        "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence, and no alarm on the "
+        "machine is raised; see `stream.silent`) or not-evaluable",
         examples=["alert"],
     )
-    reason: str = Field(description="why the state is no-data or not-evaluable; empty otherwise", examples=[""])
+    reason: str = Field(
+        description="since when there are no data, and why nothing is said of the machine; empty otherwise",
+        examples=[""],
+    )
     filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
     window_start_ns: int | None = Field(
         description="oldest data of the latest window", examples=[EXAMPLE_NS - 60_000_000_000]

@@ -32,6 +32,11 @@ class MachineReadiness(BaseModel):
     worker_busy_s: float = Field(
         description="how long the thread has been at work on the same block; more than 60 is a reason", examples=[0.0]
     )
+    trouble: str = Field(
+        description="why the machine is not monitored as it should be although data come in: no window has been "
+        "evaluated for two hops, or the history refuses what happens; empty if it is",
+        examples=[""],
+    )
     history_waiting: int = Field(description="steps that are not in the history yet", examples=[0])
     recording: str = Field(
         description="off, idle (nothing has arrived), recording, or failing: why. Monitoring goes on all the same",

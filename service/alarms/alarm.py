@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from models.alarm_names import ALARM_TEXT, CLOCK, GAP, MODEL, PHASE_REFERENCE, SHAPE, STREAM_LOST
+from models.alarm_names import ALARM_TEXT, CLOCK, FAULT, GAP, MODEL, OVERLOADED, PHASE_REFERENCE, SHAPE, STREAM_LOST
 from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
@@ -16,6 +16,8 @@ _CLEARED: Mapping[str, str] = MappingProxyType(
         MODEL: "the model describes the machine again",
         SHAPE: "the vibration is as it was",
         STREAM_LOST: "data come again",
+        FAULT: "the monitor works again",
+        OVERLOADED: "the monitor keeps up again",
         GAP: "the data are without gaps again",
         CLOCK: "the clock of the data runs steadily again",
         PHASE_REFERENCE: "the phase reference is there again",
@@ -98,8 +100,10 @@ class Alarm:
         Latest data that decided.
     shelf : Shelf or None
         Only while shelved.
+    rules : tuple of str
+        Identities of the rules that suppress it now; empty if none, whatever the state.
     suppressed_by : str
-        Rules that suppress it now, in words; empty if none, whatever the state.
+        The same in words.
     out_of_service_by, out_of_service_reason : str
         Who took it out of service, and why; empty otherwise.
     owed : AlarmState
@@ -123,6 +127,7 @@ class Alarm:
     note: str = ""
     evidence: Evidence | None = None
     shelf: Shelf | None = None
+    rules: tuple[str, ...] = ()
     suppressed_by: str = ""
     out_of_service_by: str = ""
     out_of_service_reason: str = ""

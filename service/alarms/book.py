@@ -33,7 +33,6 @@ class _Page:
 
 
 _PAGE = TypeAdapter(_Page)
-_REASONS = "; "
 
 NO_ALARMS = _PAGE.dump_json(_Page((), 0)).decode()
 """What `AlarmBook.checkpoint` gives where nothing has happened yet."""
@@ -182,17 +181,22 @@ class AlarmBook:
         """
         events: list[AlarmEvent] = []
         ruled = [name for rule in self._settings.suppress for name in rule.alarms]
-        left = [alarm.name for alarm in self.alarms if alarm.suppressed_by]
+        left = [alarm.name for alarm in self.alarms if alarm.rules]
         for name in dict.fromkeys((*ruled, *left)):
             alarm = self._known(name, time_ns)
-            rules = [rule for rule in self._settings.suppress if name in rule.alarms]
-            because = _REASONS.join(rule.because for rule in rules if self._applies(rule, alarm, speed_rpm))
-            if because == alarm.suppressed_by:
+            holding = [
+                rule
+                for rule in self._settings.suppress
+                if name in rule.alarms and self._applies(rule, alarm, speed_rpm)
+            ]
+            rules = tuple(rule.identity for rule in holding)
+            if rules == alarm.rules:
                 continue
-            alarm = replace(alarm, suppressed_by=because)
-            if because and alarm.state is not AlarmState.SUPPRESSED:
+            because = "; ".join(dict.fromkeys(rule.because for rule in holding))
+            alarm = replace(alarm, rules=rules, suppressed_by=because)
+            if rules and alarm.state is not AlarmState.SUPPRESSED:
                 events += self._happen(alarm, Happening.SUPPRESS, EventKind.SUPPRESSED, time_ns, reason=because)
-            elif not because:
+            elif not rules:
                 events += self._happen(alarm, Happening.UNSUPPRESS, EventKind.UNSUPPRESSED, time_ns)
             else:
                 self._alarms[name] = alarm
@@ -302,7 +306,7 @@ class AlarmBook:
         if rule.while_alarm is not None:
             return self.present(rule.while_alarm)
         if speed_rpm is None:
-            return f"{_REASONS}{rule.because}{_REASONS}" in f"{_REASONS}{alarm.suppressed_by}{_REASONS}"
+            return rule.identity in alarm.rules
         if rule.below_rpm is not None:
             return speed_rpm < rule.below_rpm
         return rule.above_rpm is not None and speed_rpm > rule.above_rpm
@@ -366,7 +370,7 @@ class AlarmBook:
     def _suppressed_again(self, name: str, time_ns: int) -> tuple[AlarmEvent, ...]:
         """An alarm that comes back among the others is suppressed if a rule still says so."""
         alarm = self._alarms[name]
-        if not alarm.suppressed_by or not alarm.state.annunciated:
+        if not alarm.rules or not alarm.state.annunciated:
             return ()
         return self._happen(alarm, Happening.SUPPRESS, EventKind.SUPPRESSED, time_ns, reason=alarm.suppressed_by)
 

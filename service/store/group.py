@@ -46,6 +46,10 @@ class Claim:
         Whether the lock in PostgreSQL is held, as far as is known.
     lost : StoreError or None
         Why this monitor must not write the machine any more.
+    trouble : str
+        Why the database, which works, does not take what waits; empty if it does.
+    retry_s : float
+        When that is tried again, by the clock of the history's loop.
     """
 
     machine_id: int
@@ -55,6 +59,8 @@ class Claim:
     steps: int
     locked: bool = True
     lost: StoreError | None = None
+    trouble: str = ""
+    retry_s: float = 0.0
 
 
 @dataclass(slots=True)

@@ -53,6 +53,11 @@ class MachineStore:
         """Steps that are not in the database yet."""
         return self._claim.backlog.steps
 
+    @property
+    def trouble(self) -> str:
+        """Why the database, which works, does not take what waits; empty if it does."""
+        return self._claim.trouble
+
     def last_sequence(self) -> int:
         """Sequence of the latest alarm event that was committed, or waits to be; -1 if there is none."""
         return self._last_sequence

@@ -141,7 +141,7 @@ class Writer:
         if self._stopping.is_set():
             raise StoreError("the history is closed")
         claim.backlog.add(step, recorded_ns, packed)
-        if self.trouble:
+        if self.trouble or claim.trouble:
             return False  # the machine's thread must not wait for a database that does not answer
         heard: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
         claim.backlog.waiting.heard.append(heard)
@@ -153,34 +153,46 @@ class Writer:
 
     async def _run(self) -> None:
         while True:
-            await self._wake.wait()
+            troubled = any(claim.trouble for claim in self._claims.values())
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), self._retry_s if troubled else None)
             self._wake.clear()
-            while ready := [claim for claim in self._claims.values() if claim.backlog.take() is not None]:
+            while ready := [claim for claim in self._claims.values() if self._due(claim)]:
                 if await self._write(ready):
-                    self._recover()
                     continue
                 if self._stopping.is_set():
                     return
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(self._stopping.wait(), self._retry_s)
+                if self.trouble:
+                    with suppress(TimeoutError):
+                        await asyncio.wait_for(self._stopping.wait(), self._retry_s)
             if self._stopping.is_set():
                 return
 
+    def _due(self, claim: Claim) -> bool:
+        """Whether something of the machine is to be written now; what the database did not take has to wait."""
+        waits = claim.trouble and not self._stopping.is_set() and asyncio.get_running_loop().time() < claim.retry_s
+        return not waits and claim.backlog.take() is not None
+
     async def _write(self, ready: list[Claim]) -> bool:
-        """Write one transaction; say whether the database has taken it."""
+        """Write one transaction; say whether the database has taken all of it."""
         try:
             refused = await self._commit(ready)
         except Exception as error:
             # Nothing narrower: whatever a driver raises, this task must go on, or no machine would be written again.
             await self._disconnect(broken=True)
-            if len(ready) > 1 and not _is_operational(error):
+            if _is_operational(error):
+                self._fail(ready, str(self._database.failure(error)))
+            elif len(ready) > 1:
                 # The database is well, one machine's step is not: the others shall not wait for it.
                 return all([await self._write([claim]) for claim in ready])
-            self._fail(ready, str(self._database.failure(error)))
+            else:
+                self._refuse(ready[0], str(self._database.failure(error)))
             return False
+        self._recover()
         for claim in ready:
             bundle, error_text = claim.backlog.attempt, refused.get(claim)
             claim.backlog.done()
+            claim.trouble = ""
             if bundle is None:
                 continue
             if error_text is None:
@@ -195,9 +207,15 @@ class Writer:
             _log.error("the history cannot be written; it waits in memory", why=trouble)
         self.trouble = trouble
         for claim in ready:
-            for bundle in (claim.backlog.attempt, claim.backlog.waiting):
-                if bundle is not None:
-                    bundle.settle(None, written=False)
+            _put_off(claim)
+
+    def _refuse(self, claim: Claim, trouble: str) -> None:
+        """The database does not take one machine's step: that machine's trouble, and tried again after a while."""
+        if trouble != claim.trouble:
+            _log.error("the history does not take what happens", machine=claim.title, why=trouble)
+        claim.trouble = trouble
+        claim.retry_s = asyncio.get_running_loop().time() + self._retry_s
+        _put_off(claim)
 
     def _recover(self) -> None:
         if not self.trouble:
@@ -242,6 +260,13 @@ class Writer:
                 await connection.invalidate()  # whatever state it is in: it is not used again
         with suppress(SQLAlchemyError, OSError):
             await connection.close()
+
+
+def _put_off(claim: Claim) -> None:
+    """Let nobody wait for what is not written yet."""
+    for bundle in (claim.backlog.attempt, claim.backlog.waiting):
+        if bundle is not None:
+            bundle.settle(None, written=False)
 
 
 def _is_operational(error: Exception) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.alarm_names import CLOCK, GAP, STREAM_LOST
+from models.alarm_names import CLOCK, FAULT, GAP, STREAM_LOST
 from models.checkpoint import from_bytes, to_bytes
 from models.commissioning.installed import Installed, install
 from models.errors import CheckpointError
@@ -190,8 +190,8 @@ def test_a_defect_after_an_alarm_loses_no_event(tmp_path: Path, monkeypatch: pyt
         assert at.worker.errors == 1
         at.put(block(45, run=2, sequence=1))
         at.worker.operate(order("acknowledge", GAP))
-        assert at.log() == [*TOLD, (3, "acknowledged", GAP)]
-        assert len(at.outlet.events) == 4
+        assert at.log() == [*TOLD, (3, "raised", FAULT), (4, "acknowledged", GAP)]
+        assert len(at.outlet.events) == 5
 
 
 def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -205,11 +205,11 @@ def test_what_the_history_refused_goes_with_the_next_step(tmp_path: Path, monkey
     watched(monkeypatch, refuse)
     with bench(tmp_path) as at:
         at.put(block(0), block(30, run=2, sequence=0))
-        assert at.log() == []
-        assert [len(at.outlet.events), at.worker.errors] == [3, 1]  # operators hear of it all the same
+        # Operators hear of it all the same, and what was refused goes into the log before the alarm on that.
+        assert [len(at.outlet.events), at.worker.errors] == [4, 1]
         at.worker.operate(order("acknowledge", GAP))
-        assert [kind for _, kind, _ in at.log()] == ["raised", "cleared", "raised", "acknowledged"]
-        assert len(at.outlet.events) == 4  # and once
+        assert [kind for _, kind, _ in at.log()] == ["raised", "cleared", "raised", "raised", "acknowledged"]
+        assert len(at.outlet.events) == 5  # and once
     with bench(tmp_path) as at:
         assert at.worker.restart.startswith("went on where it stood")
 
@@ -398,6 +398,21 @@ def test_an_unknown_speed_keeps_only_what_depends_on_it() -> None:
     book.suppress(500.0, 3)
     assert book.suppress(None, 4) == ()
     assert next(one.suppressed_by for one in book.alarms if one.name == "model") == "slow; coasting"
+
+
+def test_rules_with_the_same_words_are_told_apart() -> None:
+    rules = [
+        {"alarms": ["model"], "while_alarm": "data-stuck", "because": "known"},
+        {"alarms": ["model"], "below_rpm": 600, "because": "known"},
+    ]
+    book = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
+    book.update_state("data-stuck", True, 0, at_once=True)
+    book.suppress(1320.0, 1)  # the machine turns fast: only the stuck sensor suppresses
+    book.update_state("data-stuck", False, 2, at_once=True)
+    again = AlarmBook(AlarmSettings.model_validate({"suppress": rules}))
+    again.restore(book.checkpoint())
+    for one in (book, again):
+        assert named(one.suppress(None, 2)) == [("unsuppressed", "model")]
 
 
 def test_a_rule_on_a_lost_stream_holds_while_it_is_lost() -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 
 import httpx
 import pytest
@@ -133,7 +134,9 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
     health = conversion.health(
         IDENTITY,
         MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", beyond_ns=1),), DataQuality(), -1),
-        StreamStatus(publisher_alive=False, data_age_s=None, descriptor_mismatch=()),
+        StreamStatus(
+            publisher_alive=False, silent=False, silent_since_ns=None, data_age_s=None, descriptor_mismatch=()
+        ),
     )
     text = health.model_dump_json()
 
@@ -150,17 +153,22 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
     assert Health.model_validate_json(text) == health
 
 
-def test_no_data_outranks_a_raised_alarm_and_hides_it_not() -> None:
+def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
     state = AlarmState.UNACKNOWLEDGED
     alarm = Alarm("k_by", state, present=True, raised_ns=5, occurrence=1, change=-0.3, standard_error=0.01)
     latest = WindowReport(0, 7, HealthState.HEALTHY, 1.0)
     record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), DataQuality(), 0)
-    stream = StreamStatus(publisher_alive=True, data_age_s=9.0, descriptor_mismatch=())
-    health = conversion.health(IDENTITY, record, stream, no_data_reason="silence")
-    assert health.state == "no-data"
-    assert health.reason == "silence"
+    lost = StreamStatus(
+        publisher_alive=True, data_age_s=9.0, silent=True, silent_since_ns=1_767_225_600 * 10**9, descriptor_mismatch=()
+    )
+    health = conversion.health(IDENTITY, record, lost)
+    assert health.state == "alert"
+    assert health.reason == "no data since 2026-01-01T00:00:00Z"
     assert [(entry.name, entry.raised) for entry in health.alarms] == [("k_by", True)]
-    assert conversion.health(IDENTITY, record, stream).state == "alert"
+    calm = replace(record, state=HealthState.HEALTHY, alarms=())
+    assert conversion.health(IDENTITY, calm, lost).state == "no-data"
+    flowing = lost.model_copy(update={"silent": False, "silent_since_ns": None})
+    assert conversion.health(IDENTITY, calm, flowing).state == "healthy"
 
 
 def test_event_identity_is_stable_and_differs_between_events() -> None:

@@ -98,9 +98,11 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
             def latest() -> Health:
                 return Health.model_validate_json(topics.texts("/health")[-1])
 
-            until(lambda: latest().state == "no-data", "silence on the topic")
+            until(lambda: latest().stream.silent, "silence on the topic")
             silent = latest()
-            assert silent.reason == "no usable block for more than 0.5 s"
+            assert silent.state == "danger"  # what stands is seen, with the silence beside it
+            assert silent.stream.silent_since_ns == stream[-1].end_ns
+            assert silent.reason.startswith("no data since 2026-01-01T00:0")
             assert [alarm.name for alarm in silent.alarms if alarm.raised and alarm.name != STREAM_LOST] == ["c_bz"]
             assert silent.parameters == published[-1].parameters
             said = [Health.model_validate_json(text).state.value for text in topics.texts("/health")]
@@ -122,7 +124,8 @@ def test_data_after_silence_end_it(tmp_path: Path) -> None:
     address = endpoint()
     with service(address, file) as (_, worker), open_session(address) as session:
         until(lambda: worker.health().state == "no-data", "silence from the start")
-        assert worker.health().reason == "no usable block since the monitor started"
+        assert worker.health().reason == "no data since the monitor started"
+        assert worker.health().stream.silent_since_ns is None
         assert worker.health().stream.data_age_s is None
         feed = Feed(session, load_machine(file))
         feed.put_good()
@@ -140,10 +143,12 @@ def test_data_after_silence_end_it(tmp_path: Path) -> None:
 class _Poisoned(MachineMonitor):
     """A monitor with a defect that one payload brings to light."""
 
-    def step_payload(self, payload: bytes, attachment: bytes, encoding: str) -> tuple[MonitorReport, ...]:
+    def step_payload(
+        self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
+    ) -> tuple[MonitorReport, ...]:
         if encoding == "poison":
             raise ZeroDivisionError("defect in the monitor")
-        return super().step_payload(payload, attachment, encoding)
+        return super().step_payload(payload, attachment, encoding, dropped_before)
 
 
 def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,6 +163,7 @@ def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.
         health = worker.health()
         assert health.worker_errors == 1
         assert health.last_worker_error == "ZeroDivisionError: defect in the monitor"
+        until(lambda: "monitor-fault" in {one.name for one in worker.alarms().alarms if one.raised}, "the alarm on it")
         answer = httpx.get(f"{runtime.http_url}/readyz", trust_env=False)
         assert answer.status_code == 200
         assert answer.json()["machines"][0]["worker_errors"] == 1

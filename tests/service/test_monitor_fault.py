@@ -1,0 +1,219 @@
+"""A defect in the monitor, a history that refuses, a computer that cannot keep up: each is said to be what it is."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.alarm_names import FAULT, GAP, OVERLOADED, STREAM_LOST
+from models.commissioning.installed import install
+from models.machine import Machine
+from models.signals.wire import encode_block
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.health import HealthState
+from service.alarms.alarm import AlarmEvent
+from service.inbox import Inbox, RawBlock
+from service.monitor import MachineMonitor
+from service.residuals import KnownMachineEvaluator
+from service.runtime import running
+from service.store.errors import StoreError
+from service.store.records import Step
+from tests.service.live import (
+    LAB,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    send,
+    service,
+    settings,
+    until,
+)
+from tests.service.monitored import client
+from tests.service.test_alarm_trouble import bench, block, named, order, watched
+
+DEFECT = "a defect of the evaluation"
+
+
+def defective(*_: object) -> None:
+    raise RuntimeError(DEFECT)
+
+
+def machine_in_order() -> Machine:
+    """The rotor kit without patience for late blocks."""
+    fields = LAB.model_dump()
+    fields["ingest"] |= {"reorder_blocks": 0}
+    return Machine.model_validate(fields)
+
+
+def raised(monitor: MachineMonitor) -> set[str]:
+    return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
+
+
+def test_a_defect_in_evaluation_is_an_alarm_and_no_health(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = MachineMonitor(install(LAB, None))
+    stream = scenario_blocks(150.0)
+    for one in stream[:660]:
+        monitor.step(one)
+    assert monitor.health().state is HealthState.HEALTHY
+    with monkeypatch.context() as patch:
+        patch.setattr(KnownMachineEvaluator, "evaluate", defective)
+        reports = [monitor.step(one) for one in stream[660:710]]
+    (window,) = (window for report in reports for window in report.windows)
+    assert window.state is HealthState.NOT_EVALUABLE
+    assert DEFECT in window.reason
+    assert [str(report.fault) for report in reports if report.fault is not None] == [DEFECT]
+    assert [event for report in reports for event in named(report.events)] == [("raised", FAULT)]
+    health = monitor.health()
+    assert (health.state, raised(monitor)) == (HealthState.NOT_EVALUABLE, {FAULT})
+    assert DEFECT in health.reason
+    # And when it is over, that is said as well.
+    events = [event for one in stream[710:] for event in monitor.step(one).events]
+    assert named(tuple(events)) == [("cleared", FAULT)]
+    assert monitor.health().state is HealthState.HEALTHY
+    assert monitor.health().reason == ""
+
+
+def test_a_defect_before_the_evaluation_is_no_health_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    monitor = MachineMonitor(install(LAB, None))
+    stream = scenario_blocks(75.0)
+    for one in stream[:660]:
+        monitor.step(one)
+    monkeypatch.setattr(monitor._window, "feed", defective)
+    report = monitor.step(stream[660])
+    assert str(report.fault) == DEFECT
+    assert named(report.events) == [("raised", FAULT)]
+    assert monitor.health().state is HealthState.NOT_EVALUABLE
+    assert DEFECT in monitor.health().reason
+
+
+def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(KnownMachineEvaluator, "evaluate", defective)
+    address = endpoint()
+    quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
+    with service(address, machine_file(tmp_path, quiet), when_full="wait") as (runtime, worker):
+        send(address, scenario_blocks(74.0), worker.machine)
+        until(lambda: worker.tally.windows == 13, "all windows")
+        with client(runtime) as http:
+            health = http.get("/api/v1/machines/demo/lab/health").json()
+            assert health["state"] == "not-evaluable"
+            assert DEFECT in health["reason"]
+            assert [alarm["name"] for alarm in health["alarms"] if alarm["raised"]] == [FAULT]
+            answer = http.get("/readyz")
+        assert answer.status_code == 503
+        (reason,) = answer.json()["reasons"]
+        assert reason.startswith("demo/lab: ")
+        assert DEFECT in reason
+        assert worker.errors == worker.tally.windows - 11  # windows that were full
+
+
+def test_what_the_history_refuses_of_one_machine_is_that_machines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusing = [True]
+
+    def refuse(step: Step) -> None:
+        if refusing and step.events:
+            raise StoreError("demo/lab: refused")
+
+    watched(monkeypatch, refuse)
+    with bench(tmp_path) as at:
+        at.put(block(0), block(30, run=2, sequence=0))
+        assert {FAULT, GAP} <= {alarm.name for alarm in at.worker.alarms().alarms if alarm.raised}
+        assert "refused" in at.worker.trouble
+        assert at.store.trouble == ""
+        refusing.clear()
+        at.worker.operate(order("acknowledge", GAP))
+        assert at.worker.trouble == ""
+        assert (3, "raised", FAULT) in at.log()
+
+
+# Overload
+
+
+@pytest.fixture
+def stuffed() -> tuple[MachineMonitor, Callable[[int, int], None]]:
+    """A monitor, and what gives it a block with so many dropped before it."""
+    monitor = MachineMonitor(install(machine_in_order(), None))
+    stream = scenario_blocks(60.0)
+
+    def give(number: int, dropped: int) -> None:
+        monitor.step_payload(*encode_block(stream[number], ""), dropped)
+
+    return monitor, give
+
+
+def test_what_the_monitor_dropped_itself_is_no_fault_of_the_stream(
+    stuffed: tuple[MachineMonitor, Callable[[int, int], None]],
+) -> None:
+    monitor, give = stuffed
+    for number in range(20):
+        give(number, 0)
+    give(120, 100)  # 10 s, longer than a silence may last
+    assert raised(monitor) == {OVERLOADED}
+    assert {alarm.name for alarm in monitor.health().alarms} & {GAP, STREAM_LOST} == set()
+    (alarm,) = monitor.health().alarms
+    assert "100 blocks" in alarm.note
+    assert "10 s" in alarm.note
+    for number in range(121, 130):
+        give(number, 0)
+    give(150, 20)
+    (alarm,) = monitor.health().alarms
+    assert "120 blocks" in alarm.note
+    assert "12 s" in alarm.note
+    # A hole in the stream itself is still one.
+    give(450, 0)
+    assert raised(monitor) == {OVERLOADED, GAP}
+
+
+def test_overload_clears_when_the_monitor_keeps_up(
+    stuffed: tuple[MachineMonitor, Callable[[int, int], None]],
+) -> None:
+    monitor = stuffed[0]
+    stream = scenario_blocks(100.0)
+    events: list[AlarmEvent] = []
+    for number, one in enumerate(stream[:20] + stream[60:]):
+        (report,) = monitor.step_payload(*encode_block(one, ""), 40 if number == 20 else 0)
+        events += report.events
+    assert [(event.kind, event.alarm.name) for event in events] == [
+        (EventKind.RAISED, OVERLOADED),
+        (EventKind.CLEARED, OVERLOADED),
+    ]
+
+
+def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
+    address = endpoint()
+    quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
+    plan = settings(address, machine_file(tmp_path, quiet), bound=30)
+    with running(plan) as runtime, open_session(address) as session:
+        worker = runtime.machines()[0]
+        feed = Feed(session, worker.machine)
+        feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 1, "first block")
+        held = np.zeros(1, dtype=bool)
+        worker.inbox.call(lambda: until(lambda: bool(held[0]), "the end of the hold-up"))
+        for _ in range(40):
+            feed.put_good()
+        until(lambda: worker.inbox.dropped == 30, "a queue that was thrown away")
+        held[0] = True
+        until(lambda: worker.health().quality.gaps == 1, "what came after")
+        (alarm,) = worker.alarms().alarms
+        assert (alarm.name, alarm.raised) == (OVERLOADED, True)
+        assert "30 blocks" in alarm.note
+        assert "cannot keep up" in worker.health().quality.last_gap
+        (event,) = worker.history.events()
+        assert event.alarm == OVERLOADED
+
+
+def test_a_queue_counts_what_it_drops_for_the_block_that_comes_next() -> None:
+    inbox = Inbox(2, "drop")
+    for number in range(5):
+        inbox.put(RawBlock(bytes([number]), b"", ""))
+    assert inbox.dropped == 4
+    (left,) = (inbox.get(),)
+    assert isinstance(left, RawBlock)
+    assert (left.payload, left.dropped_before) == (bytes([4]), 4)
