@@ -73,7 +73,7 @@ _AlarmName = Annotated[
     str,
     Field(
         description="k_by, c_by, k_bz, c_bz, e, EI, model (outside the model), shape (vibration changed), data-... "
-        "(data health, by kind) or stream-lost",
+        "(data health, by kind), monitor-... (fault or overload of the monitor) or stream-lost",
         examples=["k_by"],
     ),
 ]

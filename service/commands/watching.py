@@ -132,7 +132,7 @@ def status(
         Console(soft_wrap=True).print(table)
         for remark in remarks:
             typer.echo(remark)
-        if any(health.state in _BAD_STATES for health in healths):
+        if any(health.state in _BAD_STATES or any(one.raised for one in health.alarms) for health in healths):
             raise typer.Exit(1)
 
 

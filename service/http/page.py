@@ -42,11 +42,12 @@ def _machine(health: Health) -> str:
     place = f"/api/v1/machines/{name}"
     links = ", ".join(f'<a href="{place}/{part}">{part}</a>' for part in _ROUTES)
     raised = {alarm.name: alarm.severity for alarm in health.alarms if alarm.raised}
+    silent = ' <span class="no-data">no data</span>' if health.stream.silent and health.state != "no-data" else ""
     reason = f"<p>{html.escape(health.reason)}</p>" if health.reason else ""
     suspect = f" Best explained by: {html.escape(health.suspect)}." if health.suspect else ""
     verdict = f"<p>{html.escape(health.verdict.text)}.{suspect}</p>" if health.verdict else ""
     return (
-        f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span></h2>'
+        f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span>{silent}</h2>'
         f"{reason}{verdict}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
         f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>"
         f"{_alarms(health)}{_table(health, raised)}{_shapes(health)}"

@@ -111,6 +111,8 @@ _FAMILIES = (
     _Family("gauge", "machine_state", "1 for the state of health the machine is in, 0 for others", _state, ("state",)),
     _Family("gauge", "publisher_alive", "1 if a publisher of the stream is there",
             _one(lambda machine: machine.health.stream.publisher_alive)),
+    _Family("gauge", "stream_silent", "1 if no usable block has come for longer than a silence may last",
+            _one(lambda machine: machine.health.stream.silent)),
     _Family("gauge", "data_age_seconds", "Time since the last accepted block was processed; missing before the first",
             _one(lambda machine: machine.health.stream.data_age_s)),
     _Family("counter", "blocks_accepted_total", "Blocks accepted",
