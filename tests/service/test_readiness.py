@@ -150,10 +150,18 @@ def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> No
     assert (found.ready, found.reasons) == (False, (reason,))
 
 
+def test_the_trouble_of_one_machine_is_a_reason_that_names_it() -> None:
+    machines = [machine(), machine(machine="pump", trouble="no window was evaluated")]
+    found = readiness_of(
+        session_open=True, machines=machines, history_open=True, history_trouble="", failing_webhooks=()
+    )
+    assert found.reasons == ("demo/pump: no window was evaluated",)
+
+
 def machine(**changes: object) -> MachineReadiness:
     fields: dict[str, object] = {
         "site": "demo", "machine": "lab", "state": HealthState.NO_DATA, "worker_alive": True, "worker_errors": 3,
-        "last_worker_error": "ValueError", "worker_busy_s": 59.9, "history_waiting": 4, "recording": "failing: full",
+        "last_worker_error": "ValueError", "worker_busy_s": 59.9, "trouble": "", "history_waiting": 4, "recording": "failing: full",
     }  # fmt: skip
     return MachineReadiness.model_validate(fields | changes)
 
