@@ -161,7 +161,8 @@ def test_the_trouble_of_one_machine_is_a_reason_that_names_it() -> None:
 def machine(**changes: object) -> MachineReadiness:
     fields: dict[str, object] = {
         "site": "demo", "machine": "lab", "state": HealthState.NO_DATA, "worker_alive": True, "worker_errors": 3,
-        "last_worker_error": "ValueError", "worker_busy_s": 59.9, "trouble": "", "history_waiting": 4, "recording": "failing: full",
+        "last_worker_error": "ValueError", "worker_busy_s": 59.9, "trouble": "", "history_waiting": 4,
+        "recording": "failing: full",
     }  # fmt: skip
     return MachineReadiness.model_validate(fields | changes)
 
