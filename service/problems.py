@@ -18,7 +18,7 @@ from rotorwatch.records.monitor import Problem
 from service.logs import logger
 from service.store.errors import StoreError
 
-__all__ = ["add_problems", "problem_answer", "problem_responses", "responses"]
+__all__ = ["add_problems", "problem_answer", "problem_responses", "responses", "share_problems"]
 
 _PROBLEM = "application/problem+json"
 _ANYWHERE = (422, 429, 500)
@@ -30,6 +30,8 @@ _HEADERS: dict[int, dict[str, Any]] = {
     401: {"WWW-Authenticate": {"description": "how to show who you are", "schema": {"type": "string"}}},
     429: {"Retry-After": {"description": "seconds to wait", "schema": {"type": "integer"}}},
 }
+# As in RFC 9110; Python's own words for them depend on its version.
+_TITLES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
 _DETAILS = {
     400: "There was an error parsing the body",
     401: "an access token is needed, as header Authorization: Bearer rw_…",
@@ -79,24 +81,40 @@ def responses(
 
 def problem_responses(*problems: int, guarded: bool = True) -> dict[int | str, dict[str, Any]]:
     """OpenAPI entries of the problems a request may meet, those that any request may meet included."""
-    found: dict[int | str, dict[str, Any]] = {}
-    for status in sorted({*problems, *_ANYWHERE, *(_GUARDED if guarded else ())}):
-        phrase = HTTPStatus(status).phrase
-        shown: dict[str, Any] = {**example(Problem), "title": phrase, "status": status}
-        if status in _DETAILS:
-            shown["detail"] = _DETAILS[status]
-        found[status] = {
-            "description": phrase,
-            "content": {_PROBLEM: {"schema": Problem.model_json_schema(), "example": shown}},
-        }
-        if status in _HEADERS:
-            found[status]["headers"] = _HEADERS[status]
-    return found
+    statuses = sorted({*problems, *_ANYWHERE, *(_GUARDED if guarded else ())})
+    return {status: {"description": _title(status)} for status in statuses}
+
+
+def share_problems(description: dict[str, Any]) -> None:
+    """Describe each problem once, in the components of an OpenAPI description, and refer to it from its operations."""
+    components = description["components"]
+    components["schemas"]["Problem"] = Problem.model_json_schema()
+    shared = components["responses"] = {}
+    answers = (route["responses"] for routes in description["paths"].values() for route in routes.values())
+    for found in answers:
+        for status in [int(text) for text in found if int(text) >= HTTPStatus.BAD_REQUEST]:
+            name = _title(status).replace(" ", "")
+            found[str(status)] = {"$ref": f"#/components/responses/{name}"}
+            shared[name] = _response(status)
+
+
+def _response(status: int) -> dict[str, Any]:
+    """Description of a problem, with an example."""
+    shown = {**example(Problem), "title": _title(status), "status": status}
+    if status in _DETAILS:
+        shown["detail"] = _DETAILS[status]
+    content = {_PROBLEM: {"schema": {"$ref": "#/components/schemas/Problem"}, "example": shown}}
+    headers = {"headers": _HEADERS[status]} if status in _HEADERS else {}
+    return {"description": _title(status), "content": content, **headers}
+
+
+def _title(status: int) -> str:
+    return _TITLES.get(status, HTTPStatus(status).phrase)
 
 
 def problem_answer(request: Request, status: int, detail: str, more: dict[str, Any] | None = None) -> JSONResponse:
     """Answer with a problem; `more` are fields beyond those of RFC 9457."""
-    problem = Problem(title=HTTPStatus(status).phrase, status=status, detail=detail, instance=request.url.path)
+    problem = Problem(title=_title(status), status=status, detail=detail, instance=request.url.path)
     return JSONResponse({**problem.model_dump(), **(more or {})}, status, media_type=_PROBLEM)
 
 

@@ -7,16 +7,22 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import iter_route_contexts
 
+from service.problems import share_problems
+
 __all__ = ["DescribedApp", "only_known_arguments"]
 
 _STRICT = "/api/"
 
 
 class DescribedApp(FastAPI):
-    """An application whose examples keep their nulls, which FastAPI leaves out wherever they are."""
+    """An application with a description that programs can be generated from.
+
+    Operations are called as their functions, problems are described once, and examples keep their nulls, which FastAPI
+    leaves out wherever they are.
+    """
 
     def __init__(self, **arguments: Any) -> None:
-        super().__init__(**arguments)
+        super().__init__(generate_unique_id_function=lambda route: route.name, **arguments)
         self._arguments: Mapping[Any, frozenset[str]] | None = None
 
     def arguments(self, endpoint: object) -> frozenset[str]:
@@ -45,6 +51,8 @@ class DescribedApp(FastAPI):
                 described = routes.get(method.lower())
                 if described is not None:
                     _restore(described["responses"], context.responses)
+        share_problems(description)
+        _simplify(description)
         return description
 
 
@@ -75,3 +83,26 @@ def _restore(described: dict[str, Any], declared: dict[int | str, dict[str, Any]
         for kind, part in answer.get("content", {}).items():
             if "example" in part:
                 described[str(status)]["content"][kind]["example"] = part["example"]
+
+
+def _simplify(schema: Any) -> None:
+    """Make a schema such that programs can be generated from it, and small.
+
+    Says of every tuple also what all of its values are, which generators read that do not know `prefixItems`, and
+    leaves out titles that only repeat the name of a field.
+    """
+    if isinstance(schema, list):
+        for one in schema:
+            _simplify(one)
+    elif isinstance(schema, dict):
+        for one in schema.values():
+            _simplify(one)
+        properties, own = schema.get("properties"), schema.get("schema")
+        for field in (*(properties.values() if isinstance(properties, dict) else ()), own):
+            if isinstance(field, dict):
+                field.pop("title", None)
+        if isinstance(own, dict) and own.get("description") == schema.get("description"):  # an argument's
+            own.pop("description", None)
+        if isinstance(first := schema.get("prefixItems"), list):
+            different = [one for number, one in enumerate(first) if one not in first[:number]]
+            schema["items"] = different[0] if len(different) == 1 else {"anyOf": different}

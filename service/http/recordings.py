@@ -97,7 +97,7 @@ def add_recording_routes(app: FastAPI, index: RecordingIndex | None, guard: Guar
             **problem_responses(400, 404, 409, 416, 422),
         },
     )
-    def download(site: str, machine: str, name: str) -> FileResponse:
+    def download_recording(site: str, machine: str, name: str) -> FileResponse:
         """The file itself; ranges may be asked for."""
         found = found_recording(index, f"{site}/{machine}/{name}")
         if not found.complete:

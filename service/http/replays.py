@@ -180,13 +180,13 @@ def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> No
         return _job(desk, replay_id)
 
     @router.get("/{replay_id}/reports", dependencies=[guard.read], responses=responses(ReplayReportList, 404, 422))
-    def reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayReportList:
+    def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayReportList:
         """Window reports of an offline replay; the history of the live machine has none of them."""
         found, following = _results(desk, replay_id, "/report", offset, limit)
         return ReplayReportList(reports=tuple(Report.model_validate_json(one) for one in found), next_offset=following)
 
     @router.get("/{replay_id}/alarms", dependencies=[guard.read], responses=responses(ReplayAlarmList, 404, 422))
-    def alarms(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayAlarmList:
+    def replay_alarms(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayAlarmList:
         """Alarm events of an offline replay; nobody else hears of them."""
         found, following = _results(desk, replay_id, "/alarm/event", offset, limit)
         events = tuple(AlarmCloudEvent.model_validate_json(one) for one in found)
@@ -198,7 +198,7 @@ def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> No
         response_class=StreamingResponse,
         responses={200: {"content": {"text/event-stream": {}}}, **problem_responses(404, 422)},
     )
-    def events(replay_id: str) -> StreamingResponse:
+    def replay_events(replay_id: str) -> StreamingResponse:
         """Progress as server-sent events until the end: `progress`, then `end`, each with the replay as data."""
         _job(desk, replay_id)
         return StreamingResponse(
@@ -218,32 +218,32 @@ def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> N
         dependencies=guarded,
         responses=responses(ReplayJob, *problems, 409, status_code=201),
     )
-    def start(
+    def start_replay(
         request: Annotated[ReplayRequest, Body(openapi_examples=_shown("an hour of yesterday", ReplayRequest))],
     ) -> ReplayJob:
         """Start a replay, in a process of its own."""
         return desk.start(request)
 
     @router.delete("/{replay_id}", dependencies=guarded, responses=responses(ReplayJob, 404, 422))
-    def stop(replay_id: str) -> ReplayJob:
+    def stop_replay(replay_id: str) -> ReplayJob:
         """Stop a replay; what it found so far stays."""
         _job(desk, replay_id)
         return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
 
     @router.post("/{replay_id}/pause", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def pause(replay_id: str, order: _NoOrder = None) -> ReplayJob:
+    def pause_replay(replay_id: str, order: _NoOrder = None) -> ReplayJob:
         """Pause a paced replay."""
         _ = order
         return _order(desk, replay_id, "pause")
 
     @router.post("/{replay_id}/resume", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def resume(replay_id: str, order: _NoOrder = None) -> ReplayJob:
+    def resume_replay(replay_id: str, order: _NoOrder = None) -> ReplayJob:
         """Let a paused replay go on."""
         _ = order
         return _order(desk, replay_id, "resume")
 
     @router.post("/{replay_id}/seek", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def seek(
+    def seek_in_replay(
         replay_id: str, place: Annotated[ReplaySeek, Body(openapi_examples=_shown("to a time", ReplaySeek))]
     ) -> ReplayJob:
         """Let a paced replay go on elsewhere; a monitor ignores what it has heard already."""
