@@ -7,12 +7,14 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import AfterValidator
 
 from models.machine import MachineFile, load_machine
+from rotorwatch import __version__
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
 from rotorwatch.records.monitor import Alive, Readiness
 from service.access.guard import Guard
 from service.http.description import DescribedApp, only_known_arguments
+from service.http.docs import add_docs_routes
 from service.http.events import add_event_routes
 from service.http.history import add_history_routes
 from service.http.operations import add_operation_routes
@@ -68,11 +70,12 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     """
     app = DescribedApp(
         title="rotorwatch",
+        version=__version__,
         description=_DESCRIPTION,
         openapi_tags=_TAGS,
         dependencies=[guard.gate, Depends(only_known_arguments)],
         openapi_url=None,  # the guard serves it
-        docs_url=None,  # the usual pages load their scripts from elsewhere
+        docs_url=None,  # the usual pages load their scripts from elsewhere; `service.http.docs` does not
         redoc_url=None,
     )
     add_problems(app)
@@ -85,6 +88,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_replay_routes(app, service.replays, guard)
     add_service_routes(app, service, guard)
     _add_readiness_routes(app, service, guard)
+    add_docs_routes(app, guard)
     guard.protect(app)
     return app
 

@@ -32,8 +32,8 @@ def front_page(healths: tuple[Health, ...]) -> str:
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="{_RELOAD_S}">'
         f"<title>rotorwatch</title><style>{_STYLE}</style><h1>rotorwatch</h1>{machines}"
-        '<p>Monitoring, not machine protection. <a href="/openapi.json">API description (OpenAPI)</a>, '
-        '<a href="/readyz">readiness</a></p></html>'
+        '<p>Monitoring, not machine protection. <a href="/docs">HTTP API</a>, '
+        '<a href="/openapi.json">its description (OpenAPI)</a>, <a href="/readyz">readiness</a></p></html>'
     )
 
 

@@ -66,3 +66,27 @@ def test_a_browser_asks_for_the_token_and_shows_the_machine(browser: Browser, ru
         assert shown.status == 200
         page.get_by_role("heading", name="demo/lab").wait_for()
         kept(page, "front")
+
+
+def test_the_page_of_the_api_works_without_anything_from_elsewhere(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url
+    given = HttpCredentials(username="anybody", password=token(runtime, Scope.READ, name="reader"), origin=url)
+    asked: list[str] = []
+    faults: list[str] = []
+    with browser.new_context(http_credentials=given) as context:
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.goto(f"{url}/docs")
+        page.get_by_role("heading", name="rotorwatch").wait_for()
+        kept(page, "docs")
+        page.locator("#operations-machines-machines").get_by_role("button").first.click()
+        page.get_by_role("button", name="Execute").click()
+        shown = page.locator("#operations-machines-machines .live-responses-table")
+        shown.get_by_text("200", exact=True).first.wait_for()
+        assert '"machine": "lab"' in shown.inner_text()
+        kept(page, "docs-tried")
+    assert len(asked) >= 5
+    assert all(one.startswith((f"{url}/", "data:", "blob:")) for one in asked), asked
+    assert not faults

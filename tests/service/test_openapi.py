@@ -24,6 +24,7 @@ from fastapi.routing import iter_route_contexts
 from schemathesis.core.result import Ok
 from schemathesis.specs.openapi import checks
 
+from rotorwatch import __version__
 from service.access.guard import Guard
 from service.access.scopes import Scope
 from service.http.app import create_app
@@ -35,7 +36,7 @@ POSITIVE, NEGATIVE = schemathesis.GenerationMode.POSITIVE, schemathesis.Generati
 STREAMS = {"/api/v1/events", "/api/v1/replays/{replay_id}/events"}
 PUBLIC = {("GET", "/healthz")}
 #: What is there and in no description of an interface for programs.
-UNDESCRIBED = {("GET", "/"), ("GET", "/openapi.json")}
+UNDESCRIBED = {("GET", "/"), ("GET", "/openapi.json"), ("GET", "/docs"), ("GET", "/docs/{name}")}
 VALUES = {"site": "demo", "machine": "lab", "name": "k_by", "replay_id": "0123456789ab"}
 CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
 #: Of the checks there are, those that a description can be held to.
@@ -150,6 +151,19 @@ def test_a_browser_shows_the_page_with_the_token_as_password(runtime: Runtime) -
         problem(browser.get("/", auth=("anybody", token(runtime, OPERATE, name="no screen"))), 403)
 
 
+def test_the_page_of_the_api_loads_nothing_from_elsewhere(http: httpx.Client) -> None:
+    page = http.get("/docs")
+    assert page.headers["content-type"] == "text/html; charset=utf-8"
+    loaded = re.findall(r'(?:src|href|url)(?:=|: )"([^"]*)"', page.text)
+    assert len(loaded) == 4
+    for one in loaded:
+        if one != "data:,":
+            assert one.startswith("/")
+            assert http.get(one).status_code == 200, one
+    assert "http" not in page.headers["content-security-policy"]
+    problem(http.get("/docs/core.py"), 422)
+
+
 def test_everything_is_described_with_examples(description: dict[str, Any]) -> None:
     """Every argument in words, every body and answer with an example that its own schema accepts."""
     schemas = description["components"]["schemas"]
@@ -192,6 +206,7 @@ def inner(value: object) -> Iterator[dict[str, Any]]:
 
 
 def test_generators_find_names_and_forms_that_they_understand(description: dict[str, Any]) -> None:
+    assert description["info"]["version"] == __version__
     names = [route["operationId"] for methods in description["paths"].values() for route in methods.values()]
     assert len(set(names)) == len(names)
     for name in names:
