@@ -4,12 +4,14 @@ The format is described for people without this library in ``docs/wire.md``; the
 """
 
 import struct
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from models.errors import WireError
+from models.signals.arrow import read_arrow, write_arrow
 from models.signals.block import SampleBlock
 
 __all__ = ["ARROW_ENCODING", "BLOCK_ENCODING", "HEADER_BYTES", "decode_block", "encode_arrow", "encode_block"]
@@ -21,7 +23,9 @@ _HEADER = struct.Struct("<qQdBBHI")  # start_ns, sequence, rate_hz, dtype, chann
 HEADER_BYTES = _HEADER.size
 _DTYPES: dict[int, np.dtype[np.float32] | np.dtype[np.float64]] = {1: np.dtype("<f4"), 2: np.dtype("<f8")}
 _DTYPE_CODES = {"f4": 1, "f8": 2}
-_MAX_SAMPLES = 1_000_000
+_MAX_SAMPLES, _MAX_CHANNELS = 1_000_000, 255
+_SLOWEST_HZ, _FASTEST_HZ = 1e-3, 1e6
+_LONGEST_NUMBER = 32
 _ARROW_FIELDS = ("start_ns", "sequence", "rate_hz", "run")
 
 
@@ -52,17 +56,8 @@ def encode_arrow(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, st
     payload, attachment, encoding
         As `encode_block`; the attachment is empty.
     """
-    import pyarrow as pa  # noqa: PLC0415  # 50 ms that only users of Arrow should pay
-
-    n_channels = block.samples.shape[1]
-    flat = pa.array(np.ascontiguousarray(block.samples).reshape(-1))
-    column = pa.FixedSizeListArray.from_arrays(flat, n_channels)
     metadata = {name: repr(getattr(block, name)) for name in _ARROW_FIELDS}
-    schema = pa.schema([pa.field("samples", column.type)], metadata=metadata)
-    sink = pa.BufferOutputStream()
-    with pa.ipc.new_stream(sink, schema) as writer:
-        writer.write_batch(pa.record_batch([column], schema=schema))
-    return sink.getvalue().to_pybytes(), b"", f"{ARROW_ENCODING};{schema_hash}"
+    return write_arrow(block.samples, metadata), b"", f"{ARROW_ENCODING};{schema_hash}"
 
 
 def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[SampleBlock, str]:
@@ -101,47 +96,39 @@ def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
             f"payload has {len(payload)} bytes, expected {expected} for {n_samples} samples × {n_channels} channels"
         )
     samples: npt.NDArray[Any] = np.frombuffer(payload, dtype=_DTYPES[code]).reshape(n_samples, n_channels)
-    return SampleBlock(start_ns, sequence, run, _checked_rate(rate_hz), samples)
+    return _checked(start_ns, sequence, run, rate_hz, samples)
 
 
 def _decode_arrow(payload: bytes) -> SampleBlock:
-    import pyarrow as pa  # noqa: PLC0415  # 50 ms that only users of Arrow should pay
+    samples, metadata = read_arrow(payload)
+    numbers = {field: _metadata_number(metadata, field) for field in _ARROW_FIELDS}
+    return _checked(**numbers, samples=samples)
 
+
+def _metadata_number(metadata: Mapping[str, bytes], field: str) -> Any:
+    text = metadata.get(field, b"")[:_LONGEST_NUMBER].decode("ascii", "replace")
     try:
-        with pa.ipc.open_stream(payload) as reader:
-            table = reader.read_all()
-        metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-        column = table.column("samples").combine_chunks()
-        n_channels = column.type.list_size
-        samples = column.flatten().to_numpy(zero_copy_only=False).reshape(-1, n_channels)
-    except (pa.ArrowInvalid, pa.ArrowTypeError, KeyError, AttributeError, OSError, UnicodeDecodeError) as error:
-        raise WireError(f"Arrow stream without a fixed-size-list column 'samples': {error}") from error
-    if samples.dtype not in (np.float32, np.float64):
-        raise WireError(f"Arrow column 'samples' holds {samples.dtype}, expected float32 or float64")
-    _check_shape(*samples.shape)
-    start_ns = _metadata_number(metadata, "start_ns", "int")
-    sequence = _metadata_number(metadata, "sequence", "int")
-    run = _metadata_number(metadata, "run", "int")
-    rate_hz = _metadata_number(metadata, "rate_hz", "float")
-    return SampleBlock(int(start_ns), int(sequence), int(run), _checked_rate(rate_hz), samples)
-
-
-def _metadata_number(metadata: dict[str, str], field: str, kind: Literal["int", "float"]) -> float | int:
-    text = metadata.get(field)
-    try:
-        return int(text or "") if kind == "int" else float(text or "")
+        return float(text) if field == "rate_hz" else int(text)
     except ValueError as error:
         raise WireError(f"Arrow schema metadata field {field!r} is {text!r}, expected a number") from error
+
+
+def _checked(start_ns: int, sequence: int, run: int, rate_hz: float, samples: npt.NDArray[Any]) -> SampleBlock:
+    """A block whose fields are within what the header can say, whatever it came in."""
+    _check_shape(*samples.shape)
+    for field, value, least, most in (
+        ("start_ns", start_ns, -(2**63), 2**63 - 1),
+        ("sequence", sequence, 0, 2**64 - 1),
+        ("run", run, 0, 2**16 - 1),
+        ("rate_hz", rate_hz, _SLOWEST_HZ, _FASTEST_HZ),
+    ):
+        if not least <= value <= most:
+            raise WireError(f"header field {field} is {value}, expected {least} to {most}")
+    return SampleBlock(start_ns, sequence, run, rate_hz, samples)
 
 
 def _check_shape(n_samples: int, n_channels: int) -> None:
     if not 1 <= n_samples <= _MAX_SAMPLES:
         raise WireError(f"header field samples is {n_samples}, expected 1 to {_MAX_SAMPLES}")
-    if n_channels < 1:
-        raise WireError("header field channels is 0, expected at least 1")
-
-
-def _checked_rate(rate_hz: float) -> float:
-    if not 0 < rate_hz <= 1e6:
-        raise WireError(f"header field rate_hz is {rate_hz}, expected above 0 and at most 1e6")
-    return rate_hz
+    if not 1 <= n_channels <= _MAX_CHANNELS:
+        raise WireError(f"header field channels is {n_channels}, expected 1 to {_MAX_CHANNELS}")
