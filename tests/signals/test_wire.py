@@ -6,7 +6,6 @@ The examples of the page run here, so that it cannot lie.
 import ctypes
 import json
 import re
-import socket
 import struct
 import subprocess
 import sys
@@ -38,6 +37,7 @@ from models.signals.wire import (
     encode_arrow,
     encode_block,
 )
+from tests.loopback import endpoint
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
 Encoder = Callable[[SampleBlock, str], tuple[bytes, bytes, str]]
@@ -268,11 +268,9 @@ def test_the_page_arrow_example_is_a_block() -> None:
 def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     script = tmp_path / "example.py"
     script.write_text(_page_blocks("python")[0], encoding="utf-8")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    address = endpoint()
     config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("listen/endpoints", json.dumps([address]))
     config.insert_json5("scouting/multicast/enabled", "false")
     received: list[tuple[str, bytes, bytes, str]] = []
     complete = threading.Event()
@@ -286,7 +284,7 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
     with zenoh.open(config) as session:
         session.declare_subscriber("rotorwatch/demo/rig7/*", keep)
         begin = time.time_ns()
-        with subprocess.Popen([sys.executable, str(script), endpoint, "4"]) as process:
+        with subprocess.Popen([sys.executable, str(script), address, "4"]) as process:
             assert complete.wait(30)
             assert process.wait(30) == 0
     descriptors = [payload for key, payload, _, _ in received if key.endswith("/descriptor")]

@@ -1,7 +1,6 @@
 """The publisher over real Zenoh sessions on loopback. Everything is waited for, nothing is slept for."""
 
 import json
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,6 +22,7 @@ from simulator.publisher import PublishError, PublishSettings, publish
 from simulator.scenario import Scenario, load_scenario, parse_fault
 from simulator.stream import blocks
 from simulator.truth import TruthRecord
+from tests.loopback import endpoint
 
 
 @pytest.fixture(scope="module")
@@ -31,11 +31,9 @@ def loaded() -> tuple[Scenario, Machine]:
     return scenario.overridden(duration_s=6.0, faults=[parse_fault("k_by=-0.25@3")]), machine
 
 
-@pytest.fixture
-def endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+@pytest.fixture(name="endpoint")
+def _endpoint() -> str:
+    return endpoint()
 
 
 @pytest.fixture

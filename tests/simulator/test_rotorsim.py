@@ -19,6 +19,7 @@ from simulator.rotorsim import app
 from simulator.scenario import load_scenario
 from simulator.stream import DEFAULT_START_NS, blocks
 from simulator.truth import TruthRecord
+from tests.loopback import endpoint
 
 ROOT = Path(__file__).parents[2]
 
@@ -137,11 +138,9 @@ def test_a_run_time_failure_exits_1() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    address = endpoint()
     config = zenoh.Config()
-    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("listen/endpoints", json.dumps([address]))
     config.insert_json5("scouting/multicast/enabled", "false")
     three = threading.Event()
     gone = threading.Event()
@@ -158,7 +157,7 @@ def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
     with zenoh.open(config) as session:
         session.declare_subscriber("rotorwatch/demo/lab/stream", keep)
         session.liveliness().declare_subscriber("rotorwatch/demo/lab/alive/publisher", watch)
-        command = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", endpoint, "--block-s", "0.05"]
+        command = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", address, "--block-s", "0.05"]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             assert three.wait(60)
             process.send_signal(number)
