@@ -92,7 +92,8 @@ def run(
         one_blas_thread()
         from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
         from service.logs import configure_logging  # noqa: PLC0415
-        from service.runtime import running, stop_request  # noqa: PLC0415  # must see the variables set above
+        from service.runtime import running  # noqa: PLC0415  # must see the variables set above
+        from service.stopping import stop_request  # noqa: PLC0415
 
         settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
         configure_logging(settings.log)
@@ -149,7 +150,7 @@ def router(listen: ListenOption = None, connect: ConnectOption = None, link: Lin
     with exit_codes():
         from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
         from models.signals.link import LinkSettings  # noqa: PLC0415
-        from service.runtime import stop_request  # noqa: PLC0415
+        from service.stopping import stop_request  # noqa: PLC0415
         from service.transport import route  # noqa: PLC0415
 
         settings = LinkSettings(listen=(ENDPOINT,)) if link is None else load_link(link)

@@ -17,14 +17,11 @@ snapshots, or asks it to do something between two blocks (operators; the passing
 is noticed on the monotonic clock; the time of day is used for what is recorded when, and for how long a restart took.
 """
 
-import signal
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import FrameType
 
 import uvicorn
 from fastapi import FastAPI
@@ -55,7 +52,7 @@ from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.webhooks.desk import WebhookDesk
 from service.worker import MachineWorker
 
-__all__ = ["HttpError", "Runtime", "StopRequest", "running", "stop_request"]
+__all__ = ["HttpError", "Runtime", "running"]
 
 _TICK_S = 0.25
 _JOIN_S = 10.0
@@ -264,46 +261,6 @@ def running(settings: ServiceSettings) -> Iterator[Runtime]:
         yield runtime
     finally:
         runtime.stop()
-
-
-class StopRequest:
-    """Whether SIGINT or SIGTERM has come."""
-
-    def __init__(self) -> None:
-        self._asked = threading.Event()
-
-    def ask(self) -> None:
-        """Ask for the stop."""
-        self._asked.set()
-
-    def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait for the stop, at most so long, and say whether it was asked for.
-
-        Looks up again and again: the system may hand the signal to one of Zenoh's threads, and Python runs the handler
-        only when the main thread next does something.
-        """
-        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while not self._asked.wait(_TICK_S):
-            if deadline_s is not None and time.monotonic() >= deadline_s:
-                return False
-        return True
-
-
-@contextmanager
-def stop_request() -> Iterator[StopRequest]:
-    """Turn SIGINT and SIGTERM into a request to stop; the signals' former handlers come back afterwards."""
-    stop = StopRequest()
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        _ = number, frame
-        stop.ask()
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class _Supervisor:

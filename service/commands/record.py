@@ -78,7 +78,7 @@ def record(
         from service.config import LogSettings  # noqa: PLC0415
         from service.logs import configure_logging  # noqa: PLC0415
         from service.recording.recorder import MachineRecorder  # noqa: PLC0415
-        from service.runtime import stop_request  # noqa: PLC0415
+        from service.stopping import stop_request  # noqa: PLC0415
         from service.transport import Link, MachineTap  # noqa: PLC0415
 
         configure_logging(LogSettings())

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # these import numpy and pyarrow, which --help must not wait 
     from service.replay.control import Control
     from service.replay.source import RecordingSource
     from service.replay_link import NetworkPlan
-    from service.runtime import StopRequest
+    from service.stopping import StopRequest
 
 __all__ = ["NamespaceOption", "in_namespace", "register", "summary_lines"]
 
@@ -261,7 +261,7 @@ def _discard(_: object) -> None:
 @contextmanager
 def _stoppable(control: "Control") -> Iterator[None]:
     """SIGINT and SIGTERM end the replay in order."""
-    from service.runtime import stop_request  # noqa: PLC0415  # keeps --help quick
+    from service.stopping import stop_request  # noqa: PLC0415  # keeps --help quick
 
     over = threading.Event()
 

@@ -68,7 +68,7 @@ def watch(
             raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
         from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
         from models.signals.link import LinkSettings  # noqa: PLC0415
-        from service.runtime import stop_request  # noqa: PLC0415
+        from service.stopping import stop_request  # noqa: PLC0415
         from service.transport import follow  # noqa: PLC0415
 
         topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))

@@ -1,0 +1,52 @@
+"""The request to stop that a program gets as a signal."""
+
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+__all__ = ["StopRequest", "stop_request"]
+
+_TICK_S = 0.25
+
+
+class StopRequest:
+    """Whether SIGINT or SIGTERM has come."""
+
+    def __init__(self) -> None:
+        self._asked = threading.Event()
+
+    def ask(self) -> None:
+        """Ask for the stop."""
+        self._asked.set()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait for the stop, at most so long, and say whether it was asked for.
+
+        Looks up again and again: the system may hand the signal to one of Zenoh's threads, and Python runs the handler
+        only when the main thread next does something.
+        """
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._asked.wait(_TICK_S):
+            if deadline_s is not None and time.monotonic() >= deadline_s:
+                return False
+        return True
+
+
+@contextmanager
+def stop_request() -> Iterator[StopRequest]:
+    """Turn SIGINT and SIGTERM into a request to stop; the signals' former handlers come back afterwards."""
+    stop = StopRequest()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        _ = number, frame
+        stop.ask()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
