@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         program, *arguments = command.split()
         words = [sys.executable, "-m", _PROGRAMS[program]] if program in _PROGRAMS else [program]
         found = subprocess.run(
-            [*words, *arguments], cwd=place, env=variables, capture_output=True, text=True, timeout=250, check=False
+            [*words, *arguments], cwd=place, env=variables, capture_output=True, text=True, timeout=600, check=False
         )
         assert found.returncode == 0, f"{command}: {found.stdout}{found.stderr}"
     return place

@@ -19,7 +19,7 @@ EXAMPLE = ROOT / "docs" / "examples" / "fe_rotor"
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "service.rotorwatch", *map(str, arguments)]
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, env=clean, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300, env=clean, check=False)
 
 
 def sample(path: Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

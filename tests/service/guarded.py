@@ -60,7 +60,7 @@ class Guarded:
 
     def client(self, token: str = "", **arguments: Any) -> httpx.Client:
         headers = {"authorization": f"Bearer {token}"} if token else {}
-        return httpx.Client(base_url=self.url, trust_env=False, headers=headers, timeout=30.0, **arguments)
+        return httpx.Client(base_url=self.url, trust_env=False, headers=headers, timeout=180.0, **arguments)
 
     def token(self, *scopes: Scope, name: str = "ops", days: int | None = None, now_ns: int | None = None) -> str:
         return self.issue(*scopes, name=name, days=days, now_ns=now_ns)[1]
@@ -162,7 +162,7 @@ def served(app: FastAPI, host: str = "127.0.0.1", **arguments: Any) -> Iterator[
     finally:
         server.should_exit = True
         server.force_exit = True
-        thread.join(20)
+        thread.join(180)
         listening.close()
         assert not thread.is_alive()
 

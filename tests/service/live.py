@@ -63,7 +63,7 @@ _ALONE = {
 """Unless a test says otherwise, programs leave nothing behind and are open to everybody on this computer."""
 
 
-def until(condition: Callable[[], bool], what: str, timeout_s: float = 40.0) -> None:
+def until(condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> None:
     """Wait for a condition; a deadline ends a wait that would be in vain."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -133,7 +133,7 @@ def scenario_blocks(duration_s: float, *faults: Event, start_ns: int = START_NS,
 def send(connect: str, stream: list[SampleBlock], machine: MachineFile = LAB) -> None:
     """Publish blocks as the simulator does, as fast as the service takes them."""
     plan = PublishSettings(
-        link=LinkSettings(connect=(connect,)), pace=None, wait_for_subscriber_s=20.0, linger_s=0.0, drain_s=20.0
+        link=LinkSettings(connect=(connect,)), pace=None, wait_for_subscriber_s=180.0, linger_s=0.0, drain_s=180.0
     )
     summary = publish(machine, ((block, ()) for block in stream), plan)
     assert summary.blocks == len(stream)
@@ -216,7 +216,7 @@ class Program:
 
     def health(self, place: str = "demo/lab") -> Health:
         """Health of a machine over HTTP."""
-        answer = httpx.get(f"{self.url()}/api/v1/machines/{place}/health", trust_env=False)
+        answer = httpx.get(f"{self.url()}/api/v1/machines/{place}/health", trust_env=False, timeout=180.0)
         return Health.model_validate_json(answer.raise_for_status().content)
 
     def kill(self) -> None:
@@ -227,7 +227,7 @@ class Program:
     def stop(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Ask the program to stop and return its exit code."""
         self.process.send_signal(number)
-        return self.process.wait(30)
+        return self.process.wait(180)
 
 
 @contextmanager

@@ -73,7 +73,7 @@ def token(runtime: Runtime, *scopes: Scope, name: str = "anna") -> str:
 def client(runtime: Runtime, text: str = "") -> httpx.Client:
     """A client of the running service, with or without a token."""
     headers = {"authorization": f"Bearer {text}"} if text else {}
-    return httpx.Client(base_url=runtime.http_url, trust_env=False, headers=headers, timeout=30.0)
+    return httpx.Client(base_url=runtime.http_url, trust_env=False, headers=headers, timeout=180.0)
 
 
 def answered(answer: httpx.Response, model: type[M]) -> M:

@@ -64,7 +64,7 @@ class PostgresServer:
             stderr=subprocess.STDOUT if program != "pg_ctl" else subprocess.DEVNULL,
             env={"PATH": os.environ["PATH"], "LC_ALL": "C"},
             check=False,
-            timeout=120,
+            timeout=300,
         )
         assert done.returncode == 0, f"{program} {arguments}: {done.stdout!r}"
 

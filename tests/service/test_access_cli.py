@@ -172,7 +172,7 @@ def test_the_command_that_a_monitor_prints_creates_a_token_that_it_takes(
             ["sh", "-c", command], cwd=tmp_path, env=plain, capture_output=True, text=True, check=True
         )
         headers = {"authorization": f"Bearer {created.stdout.strip()}"}
-        assert httpx.get(f"{url}/api/v1/machines", headers=headers, trust_env=False).status_code == 200
+        assert httpx.get(f"{url}/api/v1/machines", headers=headers, trust_env=False, timeout=180.0).status_code == 200
 
 
 def test_the_hint_knows_where_the_history_is_and_shows_no_password(

@@ -167,7 +167,7 @@ def test_what_the_gate_does_not_stand_before_cannot_be_protected(monitor: Guarde
 
 def test_without_the_middleware_nobody_gets_past_the_gate(monitor: Guarded) -> None:
     app = application(monitor.guard, monitor.done)
-    with served(app) as url, httpx.Client(base_url=url, trust_env=False) as client:
+    with served(app) as url, httpx.Client(base_url=url, trust_env=False, timeout=180.0) as client:
         headers = {"authorization": f"Bearer {monitor.token(*Scope)}"}
         assert client.get("/health", headers=headers).status_code == 401
         assert client.post("/alarms/e/shelve", json={"reason": "r"}, headers=headers).status_code == 401

@@ -43,7 +43,7 @@ def test_https_is_served_and_nothing_older_than_tls_1_2(tmp_path: Path, authorit
             assert client.get("/health").status_code == 200
         with monitor.client(token, verify=trusting(trustme.CA())) as client, pytest.raises(httpx.ConnectError):
             client.get("/health")
-        with httpx.Client(trust_env=False) as client, pytest.raises(httpx.HTTPError):
+        with httpx.Client(trust_env=False, timeout=180.0) as client, pytest.raises(httpx.HTTPError):
             client.get(monitor.url.replace("https", "http"))
     assert tls_context(files(tmp_path, authority)).minimum_version == ssl.TLSVersion.TLSv1_2
 

@@ -205,7 +205,7 @@ class Following:
 
     def __exit__(self, *_: object) -> None:
         self._stop.set()
-        self._thread.join(20.0)
+        self._thread.join(180.0)
         assert not self._thread.is_alive()
 
     def sequences(self) -> list[int]:

@@ -185,7 +185,7 @@ def test_commands_in_the_page_work(served: tuple[str, str], tmp_path: Path) -> N
             cwd=tmp_path,
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=300,
             check=False,
         )
         ended_by_us = 28

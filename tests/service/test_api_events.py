@@ -266,7 +266,7 @@ def test_streams_end_when_the_service_stops() -> None:
             stopping.start()
             # An end, not a broken connection: the reader would raise.
             left += reader.events
-            stopping.join(30)
+            stopping.join(180)
             assert not stopping.is_alive()
         assert [event.event for event in left if event.event == "alarm"] == ["alarm"]
 
@@ -316,7 +316,7 @@ def test_while_the_history_cannot_be_read_a_stream_waits(shared: Runtime, monkey
         reader.next("start")
         monkeypatch.setattr(lab.history, "events", fail)
         happen(lab, 2)
-        assert asked.wait(20)
+        assert asked.wait(180)
         monkeypatch.setattr(lab.history, "events", read)
         assert [one.data.sequence for one in reader.alarms(2)] == [
             lab.history.last_sequence() - 1,

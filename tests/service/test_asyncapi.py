@@ -132,7 +132,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
             ("alarm_state", KEYS.alarm_state),
             ("alarm_log", f"{KEYS.alarm_event}?after=-1;limit=1000"),
         ):
-            (reply,) = session.get(selector, timeout=10.0)
+            (reply,) = session.get(selector, timeout=60.0)
             assert reply.ok is not None
             found.setdefault(name, []).append(reply.ok.payload.to_string())
         subscriber.undeclare()  # type: ignore[no-untyped-call]

@@ -258,7 +258,7 @@ def test_events_go_on_after_a_restart(tmp_path: Path) -> None:
             # Another listener, with the cursor of one of them.
             later = plant_events_after(other, heard[4].cursor, latest - 4)
         with gapped(plan(tmp_path, http=HttpSettings(port=port), access=OPEN), feed_it=False):
-            listener.join(40.0)  # a history without these events
+            listener.join(180.0)  # a history without these events
     assert [event.alarm.data.sequence for event in heard if event.alarm] == list(range(latest + 1))
     assert later == heard[5:]
     assert [type(error) for error in errors] == [LogReplaced]

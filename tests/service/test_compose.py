@@ -100,7 +100,7 @@ def check_health(name: str, *rewrites: tuple[str, str]) -> subprocess.CompletedP
     for old, new in rewrites:
         words = [word.replace(old, new) for word in words]
     command = [sys.executable, str(ROOT / "deploy/healthcheck.py"), *words]
-    return subprocess.run(command, capture_output=True, text=True, timeout=30, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=180, check=False)
 
 
 def test_the_commands_work_together(tmp_path: Path) -> None:
@@ -144,6 +144,6 @@ def test_the_commands_work_together(tmp_path: Path) -> None:
                 assert health.stream.descriptor_mismatch == ()
                 assert simulator.stop() == 0
             until(lambda: not monitor.health().stream.publisher_alive, "end of the simulator noticed")
-            assert httpx.get(f"{monitor.url()}/readyz", trust_env=False).status_code == 200
+            assert httpx.get(f"{monitor.url()}/readyz", trust_env=False, timeout=180.0).status_code == 200
             assert monitor.stop() == 0
         assert router.stop() == 0

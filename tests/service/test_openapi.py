@@ -248,7 +248,7 @@ def validated(case: schemathesis.Case[Any], url: str, text: str) -> int:
             )
         except httpx.InvalidURL:  # so long that nobody could send it
             hypothesis.reject()
-        with httpx.Client(trust_env=False) as reader:
+        with httpx.Client(trust_env=False, timeout=180.0) as reader:
             streamed = reader.send(request, stream=True)
             body = b"" if streamed.status_code == 200 else streamed.read()
             streamed.close()

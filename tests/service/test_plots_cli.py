@@ -73,7 +73,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffi
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: yellow\nfont.size: 20\n", encoding="utf-8")
     environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7"}
     command = [sys.executable, "-m", "service.rotorwatch", "plot", str(faulty), *arguments, "--out", str(other)]
-    subprocess.run(command, check=True, cwd=ROOT, env=environment, timeout=120, capture_output=True)
+    subprocess.run(command, check=True, cwd=ROOT, env=environment, timeout=300, capture_output=True)
     assert one.read_bytes() == other.read_bytes()
 
 

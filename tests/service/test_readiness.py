@@ -36,7 +36,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(tmp_path: Pat
     plan = settings(address, machine, when_full="wait")
     runtime = Runtime(plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")}))
     # As the runtime makes it, but not as patient with its database.
-    runtime.store = Store(f"sqlite:///{file}", Retention(), timeout_s=0.3, retry_s=0.05)
+    runtime.store = Store(f"sqlite:///{file}", Retention(), timeout_s=2.0, retry_s=0.05)
     runtime.start()
     try:
         with open_session(address) as session:
@@ -78,7 +78,7 @@ def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyP
     with service(endpoint()) as (runtime, worker):
         until(lambda: worker.alive, "the thread")
         assert asked(runtime)[0] == 200
-        worker.inbox.call(lambda: void(release.wait(60.0)))
+        worker.inbox.call(lambda: void(release.wait(600.0)))
         until(lambda: not runtime.readiness().ready, "the thread that does not answer")
         status, found = asked(runtime)
         assert status == 503
@@ -177,4 +177,4 @@ def test_liveness_is_not_readiness(tmp_path: Path) -> None:
     with service(endpoint()) as (runtime, worker):
         worker.stop()
         assert asked(runtime)[0] == 503
-        assert httpx.get(f"{runtime.http_url}/healthz", trust_env=False).json() == {"alive": True}
+        assert httpx.get(f"{runtime.http_url}/healthz", trust_env=False, timeout=180.0).json() == {"alive": True}

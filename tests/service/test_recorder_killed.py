@@ -26,7 +26,7 @@ NS = 1_000_000_000
 
 def recover(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "service.rotorwatch", "recover", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=180, check=False)
 
 
 class Sender:

@@ -23,7 +23,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "service.rotorwatch", "replay", *map(str, arguments)]
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=120, env=clean, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300, env=clean, check=False)
 
 
 def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tmp_path: Path) -> None:

@@ -82,7 +82,7 @@ def runtime(directory: Path) -> Iterator[Runtime]:
 
 @pytest.fixture
 def client(runtime: Runtime) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=30.0) as opened:
+    with httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as opened:
         yield opened
 
 
@@ -160,7 +160,7 @@ def test_a_recording_is_downloaded_whole_or_in_part(client: httpx.Client, direct
 def test_no_path_leads_out_of_the_directory(runtime: Runtime, place: str) -> None:
     """Sent as written: a client library would tidy the path up first."""
     for suffix in ("", "/download"):
-        connection = http.client.HTTPConnection(urlsplit(runtime.http_url).netloc, timeout=30)
+        connection = http.client.HTTPConnection(urlsplit(runtime.http_url).netloc, timeout=180.0)
         connection.request("GET", f"{RECORDINGS}/{place}{suffix}")
         answer = connection.getresponse()
         text = answer.read()
@@ -323,7 +323,10 @@ def test_openapi_tells_of_every_route(client: httpx.Client) -> None:
 
 
 def test_without_a_directory_the_answer_names_the_setting() -> None:
-    with running(plan(None)) as runtime, httpx.Client(base_url=runtime.http_url, trust_env=False) as client:
+    with (
+        running(plan(None)) as runtime,
+        httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as client,
+    ):
         assert "[recording] directory" in problem(client.get(RECORDINGS), 404).detail
         assert "[recording] directory" in problem(client.post(REPLAYS, json={"recordings": [ID]}), 404).detail
         assert get(client, REPLAYS, ReplayList).replays == ()
@@ -331,7 +334,10 @@ def test_without_a_directory_the_answer_names_the_setting() -> None:
 
 def test_switched_off_nothing_can_be_started(directory: Path) -> None:
     settings = plan(directory, enabled=False)
-    with running(settings) as runtime, httpx.Client(base_url=runtime.http_url, trust_env=False) as client:
+    with (
+        running(settings) as runtime,
+        httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as client,
+    ):
         found = problem(client.post(REPLAYS, json={"recordings": [ID]}), 403)
         assert "[replay] enabled" in found.detail
         assert len(get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings) == 3
@@ -358,7 +364,7 @@ def test_started_by_default_only_on_loopback(host: str, enabled: bool | None, ex
 def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path) -> None:
     folder = directory / ".replays"
     with running(plan(directory, kept=1)) as runtime, httpx.Client(
-        base_url=runtime.http_url, trust_env=False, timeout=30.0
+        base_url=runtime.http_url, trust_env=False, timeout=180.0
     ) as client:  # fmt: skip
         first = ended(client, start(client, to_ns=START_NS + 10**9))
         assert (folder / first.id).is_dir()

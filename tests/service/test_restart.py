@@ -33,7 +33,7 @@ def reaches(watched: Program, condition: Callable[[Health], bool], what: str) ->
         found[:] = [watched.health()]
         return condition(found[0])
 
-    until(look, what, timeout_s=60.0)
+    until(look, what, timeout_s=180.0)
     return found[0]
 
 
@@ -62,7 +62,9 @@ def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, 
             )
             after = watched.health()
         assert after.quality.gaps == 1
-        events = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/alarms/events", trust_env=False).json()["events"]
+        events = httpx.get(
+            f"{watched.url()}/api/v1/machines/demo/lab/alarms/events", trust_env=False, timeout=180.0
+        ).json()["events"]
         # What happened to the stream is told; nothing is said of the machine.
         # The silence between the runs may have been noticed; a start at another time is no clock that was set.
         assert told <= {event["data"]["name"] for event in events} <= told | {"stream-lost"}
@@ -72,7 +74,7 @@ def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, 
 
 def newest_full_window(watched: Program) -> int:
     """End of the newest window that was evaluated."""
-    answer = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/reports?limit=1", trust_env=False)
+    answer = httpx.get(f"{watched.url()}/api/v1/machines/demo/lab/reports?limit=1", trust_env=False, timeout=180.0)
     (report,) = ReportList.model_validate_json(answer.content).reports
     return report.end_ns if report.parameters and report.state == "healthy" else 0
 

@@ -33,7 +33,7 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
     """Run the command to its end."""
     command = [sys.executable, "-m", "service.rotorwatch", *arguments]
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60, env=clean, check=False)
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300, env=clean, check=False)
 
 
 def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
@@ -43,7 +43,7 @@ def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
         "print('loaded', sorted({name.split('.')[0] for name in sys.modules}))"
     )
     found = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=300, check=True
     )
     loaded = found.stdout.splitlines()[-1]
     assert loaded.startswith("loaded")
@@ -60,7 +60,7 @@ def test_the_service_never_imports_torch() -> None:
         "service.runtime.Runtime(ServiceSettings(machines=(MachineEntry(file='lab', bundle='lab'),)))\n"
         "assert 'numpy' in sys.modules\nassert 'torch' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60, check=True)
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=300, check=True)
 
 
 def test_numpy_computes_in_one_thread() -> None:
@@ -92,7 +92,7 @@ def test_run_says_where_it_is_and_stops_cleanly(tmp_path: Path, number: signal.S
         url = started.url()
         assert f"Zenoh listening on {address}" in started.output()
         assert "machine demo/lab, bundle " in started.output()
-        assert httpx.get(f"{url}/readyz", trust_env=False).json()["ready"]
+        assert httpx.get(f"{url}/readyz", trust_env=False, timeout=180.0).json()["ready"]
         assert started.stop(number) == 0
         lines = [json.loads(line) for line in started.errors().splitlines()]
         assert lines[-1]["event"] == "stopped"
@@ -107,7 +107,7 @@ def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Pat
         number = started.process.pid
         other = next(int(task.name) for task in Path(f"/proc/{number}/task").iterdir() if int(task.name) != number)
         assert ctypes.CDLL(None).tgkill(number, other, signal.SIGTERM) == 0
-        assert started.process.wait(20) == 0
+        assert started.process.wait(180) == 0
 
 
 def test_used_addresses_are_run_time_errors_that_name_them() -> None:

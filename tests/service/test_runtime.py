@@ -164,7 +164,7 @@ def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.
         assert health.worker_errors == 1
         assert health.last_worker_error == "ZeroDivisionError: defect in the monitor"
         until(lambda: "monitor-fault" in {one.name for one in worker.alarms().alarms if one.raised}, "the alarm on it")
-        answer = httpx.get(f"{runtime.http_url}/readyz", trust_env=False)
+        answer = httpx.get(f"{runtime.http_url}/readyz", trust_env=False, timeout=180.0)
         assert answer.status_code == 200
         assert answer.json()["machines"][0]["worker_errors"] == 1
 
@@ -191,7 +191,7 @@ def test_several_machines_have_nothing_to_do_with_each_other(tmp_path: Path) -> 
         assert second.health().quality.refused_blocks == {"malformed": 1}
         assert runtime.machine("demo", "rig-2") is second
         assert runtime.machine("demo", "rig-3") is None
-        listed = httpx.get(f"{runtime.http_url}/api/v1/machines", trust_env=False).json()["machines"]
+        listed = httpx.get(f"{runtime.http_url}/api/v1/machines", trust_env=False, timeout=180.0).json()["machines"]
         assert [entry["machine"] for entry in listed] == ["lab", "rig-2"]
 
 
@@ -258,6 +258,8 @@ def test_health_over_http_is_the_health_on_the_topic() -> None:
             feed.put_raw(b"", b"", "rubbish")
             until(lambda: bool(worker.health().quality.refused_blocks), "refusal")
             until(lambda: any("rubbish" in text for text in topics.texts("/health")), "refusal on the topic")
-        over_http = httpx.get(f"{runtime.http_url}/api/v1/machines/demo/lab/health", trust_env=False).json()
+        over_http = httpx.get(
+            f"{runtime.http_url}/api/v1/machines/demo/lab/health", trust_env=False, timeout=180.0
+        ).json()
         on_topic = json.loads(topics.texts("/health")[-1])
         assert over_http == on_topic

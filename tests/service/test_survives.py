@@ -32,11 +32,15 @@ def running(folder: Path, address: str, file: str) -> Any:
 
 def do(at: Program, kind: str, name: str, state: str, **order: object) -> None:
     body = {"reason": "told so", "expected_state": state, **order}
-    httpx.post(f"{at.url()}{ALARMS}/{name}/{kind}", json=body, trust_env=False).raise_for_status()
+    httpx.post(f"{at.url()}{ALARMS}/{name}/{kind}", json=body, trust_env=False, timeout=180.0).raise_for_status()
 
 
 def log(at: Program) -> list[tuple[str, str, int, int]]:
-    answer = httpx.get(f"{at.url()}{ALARMS}/events?after=-1&limit=1000", trust_env=False).raise_for_status().json()
+    answer = (
+        httpx.get(f"{at.url()}{ALARMS}/events?after=-1&limit=1000", trust_env=False, timeout=180.0)
+        .raise_for_status()
+        .json()
+    )
     found = [
         (one["data"]["kind"], one["data"]["name"], one["data"]["sequence"], one["data"]["occurrence"])
         for one in answer["events"]
@@ -45,7 +49,7 @@ def log(at: Program) -> list[tuple[str, str, int, int]]:
 
 
 def states(at: Program) -> dict[str, str]:
-    alarms = httpx.get(f"{at.url()}{ALARMS}", trust_env=False).raise_for_status().json()["alarms"]
+    alarms = httpx.get(f"{at.url()}{ALARMS}", trust_env=False, timeout=180.0).raise_for_status().json()["alarms"]
     return {alarm["name"]: alarm["state"] for alarm in alarms}
 
 
@@ -108,6 +112,6 @@ def test_two_monitors_do_not_write_one_history(tmp_path: Path) -> None:
     with running(tmp_path, endpoint(), file) as first:
         first.wait_for("HTTP API")
         with running(tmp_path, endpoint(), file) as second:
-            assert second.process.wait(30) == 1
+            assert second.process.wait(180) == 1
             assert "another monitor writes the history of demo/lab" in second.errors()
         assert first.stop() == 0

@@ -29,7 +29,7 @@ def monitor(folder: Path, address: str) -> Iterator[Program]:
 
 def shelve(running: Program) -> None:
     """Two events."""
-    with httpx.Client(base_url=running.url(), trust_env=False, headers={"if-match": "*"}) as http:
+    with httpx.Client(base_url=running.url(), trust_env=False, timeout=180.0, headers={"if-match": "*"}) as http:
         for action in ("shelve", "unshelve"):
             order = {"reason": "a test", **({"duration_s": 60.0} if action == "shelve" else {})}
             answer = http.post(f"{PLACE}/alarms/data-gap/{action}", json=order)
@@ -37,12 +37,12 @@ def shelve(running: Program) -> None:
 
 
 def log(running: Program) -> list[str]:
-    answer = httpx.get(f"{running.url()}{PLACE}/alarms/events?limit=1000", trust_env=False)
+    answer = httpx.get(f"{running.url()}{PLACE}/alarms/events?limit=1000", trust_env=False, timeout=180.0)
     return [event["id"] for event in sorted(answer.json()["events"], key=lambda event: event["sequence"])]
 
 
 def status(running: Program) -> dict[str, object]:
-    (found,) = httpx.get(f"{running.url()}/api/v1/webhooks", trust_env=False).json()["webhooks"]
+    (found,) = httpx.get(f"{running.url()}/api/v1/webhooks", trust_env=False, timeout=180.0).json()["webhooks"]
     assert isinstance(found, dict)
     return found
 
@@ -84,7 +84,7 @@ def test_killed_monitors_lose_nothing(tmp_path: Path, receiver: Hook) -> None:
 
     def takes_two(got: Got) -> tuple[int, Mapping[str, str]]:
         if len(taken) == 2:
-            over.wait(60.0)  # it has the event, and the monitor never hears of it
+            over.wait(600.0)  # it has the event, and the monitor never hears of it
             return 200, {}
         taken.append(got)
         return 200, {}

@@ -76,7 +76,7 @@ def test_rotorsim_says_what_it_cannot_use(tmp_path: Path) -> None:
     for mode, code, said in ((0o644, 2, "chmod 600"), (0o600, 1, "does not know the user lab")):
         kept(tmp_path / "p", "word-of-lab").chmod(mode)
         with program(tmp_path, *arguments) as publisher:
-            assert publisher.process.wait(60) == code
+            assert publisher.process.wait(180) == code
             assert said in publisher.errors()
             assert "Traceback" not in publisher.errors()
             assert "word-of-lab" not in publisher.errors() + publisher.output()

@@ -285,8 +285,8 @@ def test_the_page_python_example_is_received(tmp_path: Path) -> None:
         session.declare_subscriber("rotorwatch/demo/rig7/*", keep)
         begin = time.time_ns()
         with subprocess.Popen([sys.executable, str(script), address, "4"]) as process:
-            assert complete.wait(30)
-            assert process.wait(30) == 0
+            assert complete.wait(180)
+            assert process.wait(180) == 0
     descriptors = [payload for key, payload, _, _ in received if key.endswith("/descriptor")]
     descriptor = ChannelDescriptor.model_validate_json(descriptors[0])
     assert descriptor == ChannelDescriptor.model_validate_json(_page_blocks("json")[0])

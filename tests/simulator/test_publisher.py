@@ -103,7 +103,7 @@ def _publishing(
         yield stop, outcome
     finally:
         stop.set()
-        thread.join(60)
+        thread.join(180)
         assert not thread.is_alive()
 
 
@@ -116,7 +116,7 @@ def test_a_late_subscriber_gets_every_block_and_truth_from_the_start(
         stop,
         outcome,
     ):
-        assert half.wait(30)
+        assert half.wait(180)
         stream = _Received(monitor, machine.keys.stream)
         truth = _Received(monitor, machine.keys.truth)
         descriptor = _Received(monitor, machine.keys.descriptor)
@@ -149,7 +149,7 @@ def test_the_descriptor_answers_a_query_and_the_token_shows_who_is_there(
     )
     with _publishing(loaded, endpoint, pace=1.0) as (stop, _):
         _until(lambda: changes == [zenoh.SampleKind.PUT], "publisher")
-        replies = [reply.ok for reply in monitor.get(machine.keys.descriptor, timeout=10)]
+        replies = [reply.ok for reply in monitor.get(machine.keys.descriptor, timeout=60)]
         stop.set()
     ok = [reply for reply in replies if reply is not None]
     assert [str(reply.encoding) for reply in ok] == ["application/json"]
@@ -197,12 +197,12 @@ def test_nothing_is_sent_before_somebody_listens(
     monitor.liveliness().declare_subscriber(machine.keys.publisher_alive, lambda _: alive.set(), history=True)
     sent = threading.Event()
     with _publishing(loaded, endpoint, lambda _: sent.set(), pace=1.0, wait_for_subscriber_s=60.0) as (stop, outcome):
-        assert alive.wait(30)
+        assert alive.wait(180)
         # Answered by the waiting publisher: it is up, and has had every occasion to send.
-        assert len(list(monitor.get(machine.keys.descriptor, timeout=10))) == 1
+        assert len(list(monitor.get(machine.keys.descriptor, timeout=60))) == 1
         assert not sent.is_set()
         stream = _Received(monitor, machine.keys.stream)
-        assert sent.wait(30)
+        assert sent.wait(180)
         stop.set()
     assert isinstance(outcome[0], RunSummary)
     _until(lambda: stream.sequences[:1] == [0], "first block")

@@ -159,10 +159,10 @@ def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
         session.liveliness().declare_subscriber("rotorwatch/demo/lab/alive/publisher", watch)
         command = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", address, "--block-s", "0.05"]
         with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            assert three.wait(60)
+            assert three.wait(180)
             process.send_signal(number)
-            out, err = process.communicate(timeout=60)
-        assert gone.wait(30)
+            out, err = process.communicate(timeout=180)
+        assert gone.wait(180)
     assert (process.returncode, err) == (0, "")
     assert out.startswith("published ")
     assert out.endswith("s of data, on rotorwatch/demo/lab/stream\n")
