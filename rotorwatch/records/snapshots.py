@@ -150,7 +150,7 @@ class CorrelationSnapshot(BaseModel):
 
 
 class ChannelDensity(BaseModel):
-    """One-sided power spectral density of one channel without mean and 1×; n_lines values each."""
+    """One-sided power spectral density (mean square per hertz, no amplitude) without mean and 1×; n_lines values."""
 
     model_config = JSON
 

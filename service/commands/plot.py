@@ -78,15 +78,20 @@ def plot(
         float | None, typer.Option("--resolution", metavar="HZ", help="Distance of the lines of a spectrum, 0.5 Hz.")
     ] = None,
     density: Annotated[
-        bool, typer.Option("--density", help="Power spectral density instead of peak amplitudes.")
+        bool,
+        typer.Option("--density", help="Power spectral density, not amplitudes (displacement p-p, others rms)."),
     ] = False,
     scale: Annotated[
         Literal["log", "linear"] | None,
-        typer.Option("--scale", help="Of a spectrum; linear for peak amplitudes, log for densities and colours."),
+        typer.Option("--scale", help="Of a spectrum; linear for amplitudes, log for densities and colours."),
     ] = None,
     to_hz: Annotated[
         float | None,
-        typer.Option("--to-hz", metavar="HZ", help="Highest frequency shown; sampling rate over 2.56 if left out."),
+        typer.Option(
+            "--to-hz",
+            metavar="HZ",
+            help="Highest frequency shown; else as far as there is anything, 4× at least.",
+        ),
     ] = None,
     axis: Annotated[
         Literal["time", "speed"] | None, typer.Option("--axis", help="Waterfall: over time, or over the speed.")
@@ -144,7 +149,7 @@ def plot(
                 revolutions=revolutions or 8,
                 window_s=window or (20.0 if kind == "spectrum" else 4.0),
                 resolution_hz=resolution or 0.5,
-                scaling="density" if density else "peak",
+                scaling="density" if density else "amplitude",
                 log=(density or (kind == "waterfall" and not cascade)) if scale is None else scale == "log",
                 to_hz=to_hz,
                 over_speed=axis == "speed",

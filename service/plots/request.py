@@ -26,8 +26,6 @@ from service.replay.source import RecordingSource, parse_moment
 __all__ = ["Kind", "PlotRequest", "draw_plot"]
 
 Kind = Literal["trend", "correlation", "orbit", "spectrum", "waterfall"]
-_LINES = 2.56
-"""Sampling rate over the highest frequency that analysers show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +52,11 @@ class PlotRequest:
     window_s, resolution_hz : float
         Of a spectrum.
     scaling : str
-        ``peak`` or ``density``.
+        ``amplitude`` or ``density``.
     log : bool
         Whether amplitudes are on a logarithmic scale.
     to_hz : float or None
-        Highest frequency shown.
+        Highest frequency shown; None is as far as there is something to be seen.
     over_speed, cascade : bool
         For waterfalls: over the speed and not time; lines and not colours.
     look : Look
@@ -76,7 +74,7 @@ class PlotRequest:
     revolutions: int = 8
     window_s: float = 20.0
     resolution_hz: float = 0.5
-    scaling: Scaling = "peak"
+    scaling: Scaling = "amplitude"
     log: bool = False
     to_hz: float | None = None
     over_speed: bool = False
@@ -130,10 +128,10 @@ def _spectra(
     if not channels:
         raise MachineFileError(f"{stream.name} measures no displacement: name channels with --channel")
     rate_hz = stream.descriptor.rate_hz
-    up_to_hz = min(rate_hz / _LINES if request.to_hz is None else request.to_hz, rate_hz / 2)
-    if request.to_hz is not None and up_to_hz < 4 * request.resolution_hz:
+    up_to_hz = None if request.to_hz is None else min(request.to_hz, rate_hz / 2)
+    if request.to_hz is not None and request.to_hz < 4 * request.resolution_hz:
         raise MachineFileError(
-            f"--to-hz is {up_to_hz:g}, expected at least four lines of --resolution {request.resolution_hz:g} Hz"
+            f"--to-hz is {request.to_hz:g}, expected at least four lines of --resolution {request.resolution_hz:g} Hz"
         )
     log = request.log
     if request.kind == "spectrum":

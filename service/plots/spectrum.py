@@ -9,16 +9,55 @@ from scipy.signal import welch
 
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
-from models.signals.channels import Channel
+from models.signals.channels import Channel, Quantity
 from service.plots.stretches import RecordedStream, Stretch, begins_again
 
-__all__ = ["Spectrum", "Waterfall", "read_spectrum", "read_waterfall", "summed_power"]
+__all__ = [
+    "Scaling",
+    "Spectrum",
+    "Waterfall",
+    "lowest_hz",
+    "read_spectrum",
+    "read_waterfall",
+    "shown_as",
+    "summed_power",
+]
 
 _MOST_SPECTRA = 400
 _MOST_SPEEDS = 120
 _STEADY = 0.02
+_NYQUIST_OVER_SHOWN = 1.28
+"""Analysers show spectra up to the sampling rate over 2.56."""
 
-Scaling = Literal["peak", "density"]
+Scaling = Literal["amplitude", "density"]
+
+_SHOWN = {
+    "m": ("µm", 1e6),
+    "mm": ("µm", 1e3),
+    "um": ("µm", 1.0),
+    "m/s": ("mm/s", 1e3),
+    "m/s2": ("m/s²", 1.0),
+    "in/s2": ("in/s²", 1.0),
+}
+_SWINGS = (Quantity.DISPLACEMENT, Quantity.TILT)
+_CLEAR_OF_MEAN = 2
+_SHARE = 0.999
+_HIGHEST_ORDER = 4
+_ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+
+
+def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
+    """How values of a spectrum are stated, and the factor on a peak amplitude or a density in the channel's unit.
+
+    Amplitudes of displacement and tilt are peak to peak (ISO 20816-1: S_p-p), those of velocity, tilt rate and
+    acceleration root mean square.
+    """
+    unit, factor = _SHOWN.get(channel.unit, (channel.unit, 1.0))
+    if scaling == "density":
+        return (f"({unit})²/Hz" if "/" in unit or "²" in unit else f"{unit}²/Hz"), factor**2
+    if channel.quantity in _SWINGS:
+        return f"{unit} p-p", 2 * factor
+    return f"{unit} rms", float(factor / np.sqrt(2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +71,9 @@ class Spectrum:
     channels : tuple of Channel
     frequencies_hz : ndarray, shape (n_bins,)
     values : ndarray, shape (n_channels, n_bins)
-        Amplitude, peak, in the channel's unit; or its square over Hz.
+        As `shown_as` states them.
     scaling : str
-        ``peak`` or ``density``.
+        ``amplitude`` or ``density``.
     resolution_hz : float
         Distance of the lines.
     averages : int
@@ -53,6 +92,11 @@ class Spectrum:
     averages: int
     speed_rad_s: float
 
+    @property
+    def useful_hz(self) -> float:
+        """Up to which frequency there is something to be seen."""
+        return max(_useful_hz(self.frequencies_hz, one, self.scaling, self.speed_rad_s) for one in self.values)
+
 
 @dataclass(frozen=True, slots=True)
 class Waterfall:
@@ -67,9 +111,9 @@ class Waterfall:
     speed_rad_s : ndarray, shape (n_spectra,)
         Mean speed; nan without a shaft angle.
     values : ndarray, shape (n_spectra, n_bins)
-        Amplitude, peak, in the channel's unit; or its square over Hz.
+        As `shown_as` states them.
     scaling : str
-        ``peak`` or ``density``.
+        ``amplitude`` or ``density``.
     resolution_hz : float
     """
 
@@ -81,6 +125,12 @@ class Waterfall:
     values: FloatArray
     scaling: Scaling
     resolution_hz: float
+
+    @property
+    def useful_hz(self) -> float:
+        """Up to which frequency there is something to be seen."""
+        fastest = float(np.max(np.abs(self.speed_rad_s)))
+        return _useful_hz(self.frequencies_hz, self.values.max(axis=0), self.scaling, fastest)
 
     def over_speed(self) -> tuple[FloatArray, FloatArray]:
         """Mean spectra over the speed: edges of the speeds, rad/s, shape (n + 1,), and spectra, shape (n, n_bins).
@@ -143,7 +193,7 @@ def read_spectrum(
         end_ns=used[-1].end_ns,
         channels=channels,
         frequencies_hz=_lines(segment, rate_hz),
-        values=_values(total / averages, scaling),
+        values=np.stack([_values(power, one, scaling) for power, one in zip(total / averages, channels, strict=True)]),
         scaling=scaling,
         resolution_hz=rate_hz / segment,
         averages=averages,
@@ -172,7 +222,9 @@ def read_waterfall(
         while rows and begins_again(rows[-1][1], stretch.start_ns):
             rows.pop()  # of several runs at the same time the one that was recorded last is shown
         power, count = summed_power(stretch, segment, scaling)
-        rows.append((stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power[0] / count, scaling)))
+        rows.append(
+            (stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power[0] / count, channel, scaling))
+        )
     if len(rows) < 2:
         raise RotorwatchError(
             f"{stream.place}: {len(rows)} spectra of {stream.name} over {window_s:g} s without a gap, expected at "
@@ -202,7 +254,7 @@ def summed_power(stretch: Stretch, segment: int, scaling: Scaling) -> tuple[Floa
     segment : int
         Samples of a segment.
     scaling : str
-        ``peak``: squared amplitude of a sine; ``density``: one-sided power spectral density.
+        ``amplitude``: squared amplitude of a sine; ``density``: one-sided power spectral density.
 
     Returns
     -------
@@ -219,15 +271,33 @@ def summed_power(stretch: Stretch, segment: int, scaling: Scaling) -> tuple[Floa
         window="hann",
         nperseg=segment,
         noverlap=overlap,
-        scaling="spectrum" if scaling == "peak" else "density",
+        scaling="spectrum" if scaling == "amplitude" else "density",
         axis=0,
     )
-    factor = 2.0 if scaling == "peak" else 1.0  # the spectrum is that of rms values
+    factor = 2.0 if scaling == "amplitude" else 1.0  # the spectrum is that of rms values
     return np.asarray(mean.T * factor * count, dtype=np.float64), count
 
 
-def _values(power: FloatArray, scaling: Scaling) -> FloatArray:
-    return np.sqrt(power) if scaling == "peak" else power
+def lowest_hz(resolution_hz: float) -> float:
+    """From which frequency on a Hann window lets nothing of the mean through."""
+    return _CLEAR_OF_MEAN * resolution_hz
+
+
+def _useful_hz(frequencies_hz: FloatArray, values: FloatArray, scaling: Scaling, speed_rad_s: float) -> float:
+    """Up to four times the running speed, or as far as all but a thousandth of the power lies and half as far again."""
+    resolved = frequencies_hz >= lowest_hz(float(frequencies_hz[1]))
+    power = np.cumsum((values if scaling == "density" else values**2) * resolved)
+    reached_hz = float(frequencies_hz[np.searchsorted(power, _SHARE * power[-1])])
+    turns_hz = abs(speed_rad_s) / (2 * np.pi) if np.isfinite(speed_rad_s) else 0.0
+    wanted_hz = max(1.5 * reached_hz, _HIGHEST_ORDER * turns_hz, 8 * float(frequencies_hz[1]))
+    decade = 10.0 ** np.floor(np.log10(wanted_hz))
+    rounded_hz = next((step * decade for step in _ROUND if step * decade >= wanted_hz * (1 - 1e-3)), 10 * decade)
+    return min(float(rounded_hz), float(frequencies_hz[-1]) / _NYQUIST_OVER_SHOWN)
+
+
+def _values(power: FloatArray, channel: Channel, scaling: Scaling) -> FloatArray:
+    _, factor = shown_as(channel, scaling)
+    return factor * (np.sqrt(power) if scaling == "amplitude" else power)
 
 
 def _segment(stream: RecordedStream, window_s: float, resolution_hz: float) -> int:

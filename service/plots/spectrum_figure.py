@@ -1,18 +1,18 @@
 """Pictures of spectra: of a moment, and one after the other."""
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
 from models.signals.channels import Channel
 from rotorwatch.records.alarms import AlarmEventData
-from service.plots.spectrum import Spectrum, Waterfall
+from service.plots.spectrum import Spectrum, Waterfall, lowest_hz, shown_as
 from service.plots.style import (
     COLOURS,
     INK,
     PLATE,
-    UNIT_TEXT,
     Look,
     alarm_lines,
     as_dates,
@@ -24,31 +24,31 @@ from service.plots.style import (
 
 __all__ = ["paint_cascade", "paint_map", "paint_spectrum"]
 
-_DECADES = 4.0
+_DECADES = 4
 _MOST_TRACES = 60
 _ORDERS = (1, 2)
 
 
-def paint_spectrum(found: Spectrum, name: str, look: Look, *, log: bool, up_to_hz: float) -> Figure:
+def paint_spectrum(found: Spectrum, name: str, look: Look, *, log: bool, up_to_hz: float | None = None) -> Figure:
     """A panel for each channel."""
     count = len(found.channels)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 1.75 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    shown = (found.frequencies_hz > 0) & (found.frequencies_hz <= up_to_hz)
+    limits_hz, shown = _shown(found, up_to_hz)
     frequency = found.frequencies_hz[shown]
     for axes, channel, values in zip(panels, found.channels, found.values[:, shown], strict=True):
         axes.plot(frequency, values, color=COLOURS[0], linewidth=0.9)
         axes.set_title(f"{channel.name}   {_place(channel)}", fontweight="bold")
-        axes.set_ylabel(_unit(channel, found.scaling))
+        axes.set_ylabel(shown_as(channel, found.scaling)[0])
         top = float(values.max()) or 1.0
         if log:
             axes.set_yscale("log")
-            floor = max(float(values[values > 0].min(initial=top)), top * 10.0**-6)
+            floor = max(float(values[values > 0].min(initial=top)), top * _depth(found))
             axes.set_ylim(0.7 * floor, 2.5 * top)
         else:
             axes.set_ylim(0, 1.15 * top)
         _orders(axes, found, values, frequency, channel)
-    panels[-1].set_xlim(0, up_to_hz)
+    panels[-1].set_xlim(limits_hz)
     panels[-1].set_xlabel("frequency, Hz")
     heading(
         figure,
@@ -67,12 +67,12 @@ def paint_map(
     *,
     over_speed: bool,
     log: bool,
-    up_to_hz: float,
+    up_to_hz: float | None = None,
 ) -> Figure:
     """Spectra as rows of colour."""
     figure = Figure(figsize=look.size_in or (9.5, 6.0), layout="constrained")
     axes = figure.subplots()
-    shown = (found.frequencies_hz > 0) & (found.frequencies_hz <= up_to_hz)
+    limits_hz, shown = _shown(found, up_to_hz)
     frequency = found.frequencies_hz[shown]
     half = found.resolution_hz / 2
     columns = np.append(frequency - half, frequency[-1] + half)
@@ -83,13 +83,13 @@ def paint_map(
     else:
         rows, values = _rows_in_time(found, found.values[:, shown])
     top = float(np.nanmax(values)) or 1.0
-    norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * 10**-_DECADES), top)
+    norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * _depth(found)), top)
     mesh = axes.pcolormesh(
         columns, rows, values, norm=norm if log else Normalize(0, top), cmap="cividis", rasterized=True
     )
-    figure.colorbar(mesh, ax=axes, label=_unit(found.channel, found.scaling), pad=0.02, aspect=32)
+    figure.colorbar(mesh, ax=axes, label=shown_as(found.channel, found.scaling)[0], pad=0.02, aspect=32)
     axes.grid(visible=False)
-    axes.set_xlim(0, up_to_hz)
+    axes.set_xlim(limits_hz)
     axes.set_xlabel("frequency, Hz")
     _order_lines(axes, found, rows, over_speed=over_speed)
     if over_speed:
@@ -109,12 +109,12 @@ def paint_cascade(
     *,
     over_speed: bool,
     log: bool,
-    up_to_hz: float,
+    up_to_hz: float | None = None,
 ) -> Figure:
     """Spectra as lines, one behind the other."""
     figure = Figure(figsize=look.size_in or (9.5, 7.0), layout="constrained")
     axes = figure.subplots()
-    shown = (found.frequencies_hz > 0) & (found.frequencies_hz <= up_to_hz)
+    limits_hz, shown = _shown(found, up_to_hz)
     frequency = found.frequencies_hz[shown]
     if over_speed:
         edges, values = found.over_speed()
@@ -132,7 +132,7 @@ def paint_cascade(
         axes.fill_between(frequency, at, at + scale * line, color="white", linewidth=0, zorder=2 + order)
         axes.plot(frequency, at + scale * line, color=COLOURS[0], linewidth=0.7, zorder=2 + order)
     axes.set_ylim(base[0] - step, base[-1] + 1.05 * scale)
-    axes.set_xlim(0, up_to_hz)
+    axes.set_xlim(limits_hz)
     axes.set_xlabel("frequency, Hz")
     axes.grid(visible=False)
     if over_speed:
@@ -151,7 +151,7 @@ def paint_cascade(
                 f"{number}×", (number * running[-1], base[-1]), xytext=(6, 12), textcoords="offset points",
                 fontsize=9, color=COLOURS[1], annotation_clip=True, zorder=300, bbox=PLATE,
             )  # fmt: skip
-    full = f"{top:.3g} {_unit(found.channel, found.scaling).partition(', ')[0]}"
+    full = f"{top:.3g} {shown_as(found.channel, found.scaling)[0]}"
     right = axes.get_xlim()[1]
     axes.annotate(
         "", (right * 0.985, base[-1]), (right * 0.985, base[-1] + scale), arrowprops={"arrowstyle": "|-|", "color": INK}
@@ -208,8 +208,8 @@ def _orders(axes: Axes, found: Spectrum, values: np.ndarray, frequency: np.ndarr
             continue
         near = np.abs(frequency - at) <= 1.5 * found.resolution_hz
         axes.axvline(at, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
-        unit = UNIT_TEXT.get(channel.unit, channel.unit)
-        high = f": {values[near].max():.3g} {unit}" if found.scaling == "peak" and near.any() else ""
+        unit, _ = shown_as(channel, found.scaling)
+        high = f": {values[near].max():.3g} {unit}" if found.scaling == "amplitude" and near.any() else ""
         axes.annotate(
             f"{order}×", (at, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -2),
             textcoords="offset points", ha="left", va="top", fontsize=8, color=COLOURS[1],
@@ -241,11 +241,16 @@ def _place(channel: Channel) -> str:
     return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.direction}"
 
 
-def _unit(channel: Channel, scaling: str) -> str:
-    unit = UNIT_TEXT.get(channel.unit, channel.unit)
-    if scaling == "peak":
-        return f"{unit}, peak"
-    return f"({unit})²/Hz" if "/" in unit else f"{unit}²/Hz"
+def _shown(found: Spectrum | Waterfall, up_to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
+    """Ends of the frequency axis, and the lines between them."""
+    low, high = lowest_hz(found.resolution_hz), found.useful_hz if up_to_hz is None else up_to_hz
+    slack = 1e-6 * found.resolution_hz
+    return (low, high), (found.frequencies_hz >= low - slack) & (found.frequencies_hz <= high + slack)
+
+
+def _depth(found: Spectrum | Waterfall) -> float:
+    """Smallest height that is shown, over the greatest: 80 dB below."""
+    return float(10.0 ** (-_DECADES if found.scaling == "amplitude" else -2 * _DECADES))
 
 
 def _method(found: Spectrum) -> str:

@@ -24,7 +24,6 @@ __all__ = [
     "PLATE",
     "SEVERITY_COLOURS",
     "STATE_COLOURS",
-    "UNIT_TEXT",
     "Look",
     "alarm_lines",
     "alarm_text",
@@ -53,7 +52,6 @@ STATE_COLOURS = {
     "no-data": "#000000",
 }
 SEVERITY_COLOURS = {"alert": "#E69F00", "danger": "#D55E00"}
-UNIT_TEXT = {"um": "µm"}
 PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 """Behind a text that stands on lines or colours."""
 

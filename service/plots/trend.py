@@ -149,7 +149,7 @@ def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to
 def trend_of(
     reports: list[Report], alarms: tuple[AlarmEventData, ...], limits: AlarmSettings | None, origin: str
 ) -> Trend:
-    """Reports as series.
+    """Reports as series, in the order in which they were recorded.
 
     While a window straddles a change, the readings are those of the data since the change: a mean of before and after
     describes no state of the machine.
@@ -159,7 +159,11 @@ def trend_of(
     RotorwatchError
         If no parameter was read in any report.
     """
-    ordered = [report for _, report in sorted({report.end_ns: report for report in reports}.items())]
+    ordered: list[Report] = []
+    for report in {report.model_dump_json(): report for report in reports}.values():  # repetitions left out
+        while ordered and ordered[-1].end_ns >= report.end_ns:
+            ordered.pop()  # of several runs at the same time the one that was recorded last is shown
+        ordered.append(report)
     series = {name: np.full((3, len(ordered)), np.nan) for name in PARAMETER_TEXT}
     for number, report in enumerate(ordered):
         verdict = report.verdict

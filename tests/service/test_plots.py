@@ -18,9 +18,11 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Report
 from service.plots.correlation import correlations_of, latest_window
 from service.plots.orbit import read_orbits
-from service.plots.spectrum import read_spectrum, read_waterfall
+from service.plots.spectrum import read_spectrum, read_waterfall, shown_as
+from service.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
 from service.plots.stretches import RecordedStream
-from service.plots.trend import read_trend, trend_machine
+from service.plots.style import Look
+from service.plots.trend import read_trend, trend_machine, trend_of
 from service.replay.offline import OfflineReplay
 from service.replay.source import RecordingSource
 from simulator.scenario import load_scenario, parse_fault
@@ -144,23 +146,62 @@ def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("off_line", [0.0, 0.25, 0.5])
-def test_the_peak_of_a_sine_is_its_amplitude_within_the_scalloping_of_the_window(
-    tmp_path: Path, off_line: float
+@pytest.mark.parametrize(("name", "stated", "factor"), [("y2", "µm p-p", 2.0), ("y2_dot", "mm/s rms", 0.5**0.5)])
+def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_window(
+    tmp_path: Path, off_line: float, name: str, stated: str, factor: float
 ) -> None:
+    """Displacement peak to peak, velocity rms."""
     hz, amplitude = 50.0 + 0.5 * off_line, 12.0
     path = recording(
-        tmp_path / "sine.mcap", machine_blocks({"y2": lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
+        tmp_path / "sine.mcap", machine_blocks({name: lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
     )
     stream = stream_of(path)
-    found = read_spectrum(stream, stream.channels(["y2"]), 20.0, 0.5, "peak")
+    found = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "amplitude")
     scalloping = abs(np.sinc(off_line) / (1 - off_line**2))  # of the Hann window
-    assert found.values[0].max() == pytest.approx(amplitude * scalloping, rel=1e-3)
+    assert found.values[0].max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
     assert found.frequencies_hz[found.values[0].argmax()] == pytest.approx(hz, abs=0.251)
     assert (found.averages, found.resolution_hz) == (19, 0.5)
-    assert found.end_ns == START_NS + 21 * S
-    assert found.start_ns == START_NS + 1 * S
-    density = read_spectrum(stream, stream.channels(["y2"]), 20.0, 0.5, "density")
+    assert (found.start_ns, found.end_ns) == (START_NS + 1 * S, START_NS + 21 * S)
+    density = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "density")
     assert density.values[0].sum() * 0.5 == pytest.approx(amplitude**2 / 2, rel=1e-3)
+    panel = paint_spectrum(found, "demo/lab", Look(), log=False).axes[0]
+    assert panel.get_ylabel() == stated
+    fall = read_waterfall(stream, stream.channels([name])[0], 4.0, 0.5, "amplitude")
+    assert fall.values.max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
+
+
+def test_metres_are_shown_as_engineers_read_them() -> None:
+    factors = {"y1": {"m": 2e6, "mm": 2e3, "mil": 2.0}, "y1_dot": {"m/s": 1e3 * 0.5**0.5, "in/s": 0.5**0.5}}
+    said = []
+    for name, units in factors.items():
+        for unit, expected in units.items():
+            channel = next(one for one in LAB.sensors if one.name == name).model_copy(update={"unit": unit})
+            text, factor = shown_as(channel, "amplitude")
+            said.append(text)
+            assert factor == pytest.approx(expected)
+    assert said == ["µm p-p", "µm p-p", "mil p-p", "mm/s rms", "in/s rms"]
+
+
+def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
+    """Slow drift, and nothing above the second harmonic: neither makes the picture."""
+    signals = {
+        "theta": lambda t: (2 * np.pi * 20.0 * t) % (2 * np.pi),
+        "y1": lambda t: 3000 * np.sin(0.3 * t) + 10 * np.sin(2 * np.pi * 20.0 * t) + 4 * np.sin(2 * np.pi * 40.0 * t),
+    }
+    stream = stream_of(recording(tmp_path / "drift.mcap", machine_blocks(signals, 30.0)))
+    found = read_spectrum(stream, stream.channels(["y1"]), 20.0, 0.5, "amplitude")
+    fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
+    for log in (False, True):
+        panel = paint_spectrum(found, "demo/lab", Look(), log=log).axes[0]
+        assert panel.get_xlim() == (1.0, 80.0)  # two lines, from which on the window lets no mean through, to 4×
+        assert panel.get_ylim()[1] > 20
+    low, high = paint_spectrum(found, "demo/lab", Look(), log=True).axes[0].get_ylim()
+    assert high / low < 10**5
+    for paint in (paint_map, paint_cascade):
+        axes = paint(fall, "demo/lab", Look(), (), over_speed=False, log=True).axes[0]
+        assert axes.get_xlim() == (1.0, 80.0)
+    wide = paint_spectrum(found, "demo/lab", Look(), log=False, up_to_hz=500.0).axes[0]
+    assert wide.get_xlim() == (1.0, 500.0)
 
 
 def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
@@ -169,14 +210,14 @@ def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
         tmp_path / "step.mcap", machine_blocks({"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
     )
     stream = stream_of(path)
-    found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "peak")
+    found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "amplitude")
     assert found.values.max() < 1e-9
     assert found.averages == 7 + 10  # 4.0 s and 5.9 s in halves of a second
     assert np.isnan(found.speed_rad_s) or found.speed_rad_s == 0
     with pytest.raises(RotorwatchError, match=r"needs 10 s without a gap, .* in the last 10 s is 5.9 s"):
-        read_spectrum(stream, stream.channels(["y1"]), 10.0, 0.1, "peak")
+        read_spectrum(stream, stream.channels(["y1"]), 10.0, 0.1, "amplitude")
     with pytest.raises(MachineFileError, match="--window is 1 s, expected at least 2 s"):
-        read_spectrum(stream, stream.channels(["y1"]), 1.0, 0.5, "peak")
+        read_spectrum(stream, stream.channels(["y1"]), 1.0, 0.5, "amplitude")
 
 
 def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> None:
@@ -195,7 +236,7 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
         ),
     )
     stream = stream_of(path)
-    found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "peak")
+    found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "amplitude")
     assert found.values.shape[0] == 15 + 13  # 3 s are missing, and what is left before the end is no segment
     strongest_hz = found.frequencies_hz[found.values.argmax(axis=1)]
     middle_s = ((found.start_ns + found.end_ns) / 2 - START_NS) / S
@@ -211,12 +252,12 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
 
 def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
     stream = stream_of(faulty, seconds=(0, 20))
-    found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "peak")
+    found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
     assert found.values.shape[0] == 5
     with pytest.raises(RotorwatchError, match=r"the speed stays between 1320 and 1320 rpm"):
         found.over_speed()
     with pytest.raises(RotorwatchError, match="1 spectra of demo/lab over 20 s without a gap, expected at least 2"):
-        read_waterfall(stream, stream.displacements[0], 20.0, 0.5, "peak")
+        read_waterfall(stream, stream.displacements[0], 20.0, 0.5, "amplitude")
 
 
 @pytest.mark.parametrize("nth", [-1, 3])
@@ -285,6 +326,16 @@ def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[
                 assert np.isnan(trend.change[number])
     last = {trend.name: trend for trend in found.parameters}["c_bz"]
     assert last.low[-1] < 0.5 < last.high[-1]
+
+
+def test_a_trend_of_a_publisher_that_was_started_again_earlier_shows_the_later_run(
+    lines: list[dict[str, object]],
+) -> None:
+    reports = reports_of(lines)
+    again = [one.model_copy(update={"end_ns": one.end_ns - 22 * S}) for one in reports]
+    before = [one.end_ns for one in reports if one.end_ns < again[0].end_ns]
+    found = trend_of([*reports, *again, again[-1]], (), None, "")
+    assert found.end_ns.tolist() == [*before, *(one.end_ns for one in again)]
 
 
 def test_a_trend_of_recorded_reports_needs_no_samples(
