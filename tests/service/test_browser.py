@@ -27,6 +27,7 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+PATIENCE_MS = 120_000.0
 SCREENSHOTS = os.environ.get("ROTORWATCH_SCREENSHOTS")
 
 
@@ -35,7 +36,10 @@ def browser() -> Iterator[Browser]:
     path = os.environ.get("ROTORWATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
         pytest.skip(f"no browser: ROTORWATCH_CHROMIUM is not set, and none of {', '.join(NAMES)} is there")
-    with sync_playwright() as playwright, playwright.chromium.launch(executable_path=path, args=FLAGS) as found:
+    with (
+        sync_playwright() as playwright,
+        playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=PATIENCE_MS) as found,
+    ):
         yield found
 
 
@@ -60,6 +64,7 @@ def test_a_browser_asks_for_the_token_and_shows_the_machine(browser: Browser, ru
         assert asked == ["Bearer", "Basic"]
     given = HttpCredentials(username="anybody", password=token(runtime, Scope.READ, name="screen"), origin=url)
     with browser.new_context(http_credentials=given) as context:
+        context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
         shown = page.goto(url)
         assert shown is not None
@@ -74,6 +79,7 @@ def test_the_page_of_the_api_works_without_anything_from_elsewhere(browser: Brow
     asked: list[str] = []
     faults: list[str] = []
     with browser.new_context(http_credentials=given) as context:
+        context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
         page.on("request", lambda request: asked.append(request.url))
         page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
