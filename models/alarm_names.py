@@ -16,6 +16,7 @@ __all__ = [
     "PHASE_REFERENCE",
     "SHAPE",
     "STREAM_LOST",
+    "alarm_text",
     "data_alarm",
     "of_the_machine",
 ]
@@ -59,6 +60,11 @@ ALARM_TEXT: Mapping[str, str] = MappingProxyType(
     }
 )
 """Every alarm, by its name, in words."""
+
+
+def alarm_text(name: str) -> str:
+    """An alarm in words; one that has none is told by its name rather than not at all."""
+    return ALARM_TEXT.get(name, name)
 
 
 def data_alarm(kind: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from models.alarm_names import ALARM_TEXT
+from models.alarm_names import alarm_text
 from models.diagnosis.readings import Z95
 from rotorwatch import __version__
 from rotorwatch.records.alarms import Alarm as AlarmJson
@@ -110,7 +110,7 @@ def _alarm(alarm: Alarm) -> AlarmJson:
     shelf = alarm.shelf
     return AlarmJson(
         name=alarm.name,
-        text=ALARM_TEXT[alarm.name],
+        text=alarm_text(alarm.name),
         state=alarm.state,
         pending=alarm.beyond_ns is not None,
         clearing=alarm.small_ns is not None,

@@ -1,11 +1,12 @@
 """What of a monitor goes into the history with every hop, and how a monitor comes back from it."""
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 from models.errors import CheckpointError
 from rotorwatch import __version__
 from service.alarm_conversion import Identity, alarm_cloud_event, finite, rfc3339
-from service.alarms.alarm import AlarmEvent
+from service.alarms.alarm import Alarm, AlarmEvent
 from service.alarms.book import NO_ALARMS
 from service.conversion import report as report_json
 from service.monitor import MachineMonitor
@@ -73,7 +74,9 @@ def stored_event(identity: Identity, event: AlarmEvent, recorded_ns: int) -> Sto
 class StepWriter:
     """Commits what one machine's monitor says, and what it remembers afterwards, in one step.
 
-    What the history refuses is tried again with the next step: the log takes no event that comes after a missing one.
+    Alarm events come first: whatever else cannot be put into words, remembered or written, they go into the log and out
+    to operators. What the log refuses is tried again with the next step: it takes no event that comes after a missing
+    one.
 
     Parameters
     ----------
@@ -82,8 +85,8 @@ class StepWriter:
 
     Attributes
     ----------
-    refused : StoreError or None
-        Why the history has refused the latest step; None if it has not.
+    refused : Exception or None
+        Why the latest step is not in the history as a whole; None if it is, or waits to be.
     """
 
     def __init__(self, history: MachineStore, identity: Identity) -> None:
@@ -91,7 +94,7 @@ class StepWriter:
         self._identity = identity
         self._owed: tuple[AlarmEvent, ...] = ()
         self._kept: tuple[int, ...] = ()
-        self.refused: StoreError | None = None
+        self.refused: Exception | None = None
 
     def keeps(self, hops: tuple[int, ...]) -> None:
         """Take note of the hops that are in the history already."""
@@ -104,30 +107,46 @@ class StepWriter:
     def commit(
         self, monitor: MachineMonitor, windows: tuple[WindowReport, ...], recorded_ns: int
     ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
-        """Commit windows, the events that are owed, and the state of the monitor.
+        """Commit windows, the events that are owed, and the state of the monitor; raises nothing.
 
         Returns
         -------
         tuple
             Reports and events as they are to be published, and whether all of it is in the database now.
         """
-        state = monitor.state(self._kept)
-        reports = tuple(stored_report(self._identity, window) for window in windows)
-        told = tuple(stored_event(self._identity, event, recorded_ns) for event in self._owed)
-        step = Step(
-            reports=reports,
-            readings=stored_readings(windows),
-            events=told,
-            checkpoint=checkpoint_step(self._identity, state, recorded_ns),
-        )
+        self.refused = None
+        reports: tuple[StoredReport, ...] = ()
+        told = tuple(self._told(event, recorded_ns) for event in self._owed)
         try:
-            written = self._history.commit(step)
-        except StoreError as error:  # operators must hear of it all the same
-            self._kept = ()
-            self.refused = error
+            reports = tuple(stored_report(self._identity, window) for window in windows)
+            state = monitor.state(self._kept)
+            checkpoint = checkpoint_step(self._identity, state, recorded_ns)
+            written = self._history.commit(Step(reports, stored_readings(windows), told, checkpoint))
+        except Exception as error:  # whatever it is, no alarm may be lost to it
+            self.refused, self._kept = error, ()
+            self._commit_events(told)
             return reports, told, False
-        self._kept, self._owed, self.refused = state.hops, (), None
+        self._kept, self._owed = state.hops, ()
         return reports, told, written
+
+    def _told(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
+        """An event as it is published; one that cannot be put into words is told without its particulars."""
+        try:
+            return stored_event(self._identity, event, recorded_ns)
+        except Exception as error:
+            self.refused = error
+            was = event.alarm
+            bare = Alarm(was.name, was.state, was.present, was.severity, was.since_ns, was.raised_ns, was.occurrence)
+            return stored_event(self._identity, replace(event, alarm=bare), recorded_ns)
+
+    def _commit_events(self, told: tuple[StoredEvent, ...]) -> None:
+        """Bring the events alone into the log; a restart goes on from an older state, with the log's own numbers."""
+        try:
+            if told:
+                self._history.commit(Step(events=told))
+        except StoreError:
+            return  # said already
+        self._owed = ()
 
 
 def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -> CheckpointStep:

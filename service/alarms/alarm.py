@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from models.alarm_names import ALARM_TEXT, CLOCK, FAULT, GAP, MODEL, OVERLOADED, PHASE_REFERENCE, SHAPE, STREAM_LOST
+from models.alarm_names import CLOCK, FAULT, GAP, MODEL, OVERLOADED, PHASE_REFERENCE, SHAPE, STREAM_LOST, alarm_text
 from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
@@ -179,7 +179,7 @@ class AlarmEvent:
     def text(self) -> str:
         """The event in a sentence."""
         alarm = self.alarm
-        words = ALARM_TEXT[alarm.name]
+        words = alarm_text(alarm.name)
         match self.kind:
             case EventKind.RAISED | EventKind.ESCALATED | EventKind.CLEARED:
                 hidden = "" if alarm.state.annunciated else f" ({alarm.state.value})"
@@ -191,7 +191,7 @@ class AlarmEvent:
 
     def _about_condition(self) -> str:
         alarm = self.alarm
-        words = ALARM_TEXT[alarm.name]
+        words = alarm_text(alarm.name)
         if alarm.name not in PARAMETER_TEXT:
             if self.kind is EventKind.CLEARED:
                 return f"cleared: {_CLEARED.get(alarm.name, f'{words}: nothing of it is seen any more')}"

@@ -5,22 +5,29 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from models.alarm_names import FAULT, GAP, OVERLOADED, STREAM_LOST
 from models.commissioning.installed import install
 from models.machine import Machine
-from models.signals.wire import encode_block
+from models.signals.arrow import write_arrow
+from models.signals.wire import ARROW_ENCODING, encode_block
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState
-from service.alarms.alarm import AlarmEvent
+from service.alarm_conversion import Identity
+from service.alarms.alarm import AlarmEvent, Evidence
+from service.conversion import machine_hash
 from service.inbox import Inbox, RawBlock
 from service.monitor import MachineMonitor
+from service.remembered import checkpoint_step, restored
 from service.residuals import KnownMachineEvaluator
 from service.runtime import running
 from service.store.errors import StoreError
-from service.store.records import Step
+from service.store.records import Checkpoint, Step
 from tests.service.live import (
     LAB,
+    START_NS,
     Feed,
     endpoint,
     machine_file,
@@ -28,8 +35,10 @@ from tests.service.live import (
     scenario_blocks,
     send,
     service,
-    settings,
     until,
+)
+from tests.service.live import (
+    settings as plan_for,
 )
 from tests.service.monitored import client
 from tests.service.test_alarm_trouble import bench, block, named, order, watched
@@ -97,7 +106,7 @@ def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
     quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
     with service(address, machine_file(tmp_path, quiet), when_full="wait") as (runtime, worker):
         send(address, scenario_blocks(74.0), worker.machine)
-        until(lambda: worker.tally.windows == 13, "all windows")
+        until(lambda: worker.tally.windows >= 13, "all windows")
         with client(runtime) as http:
             health = http.get("/api/v1/machines/demo/lab/health").json()
             assert health["state"] == "not-evaluable"
@@ -188,7 +197,7 @@ def test_overload_clears_when_the_monitor_keeps_up(
 def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
     address = endpoint()
     quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
-    plan = settings(address, machine_file(tmp_path, quiet), bound=30)
+    plan = plan_for(address, machine_file(tmp_path, quiet), bound=30)
     with running(plan) as runtime, open_session(address) as session:
         worker = runtime.machines()[0]
         feed = Feed(session, worker.machine)
@@ -217,3 +226,89 @@ def test_a_queue_counts_what_it_drops_for_the_block_that_comes_next() -> None:
     (left,) = (inbox.get(),)
     assert isinstance(left, RawBlock)
     assert (left.payload, left.dropped_before) == (bytes([4]), 4)
+
+
+# What cannot be remembered or put into words
+
+
+def test_a_state_that_cannot_be_built_keeps_no_alarm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        with monkeypatch.context() as patch:
+            patch.setattr(MachineMonitor, "state", defective)
+            at.put(block(30, run=2, sequence=0))
+            assert [(kind, alarm) for _, kind, alarm in at.log()] == [
+                ("raised", STREAM_LOST), ("cleared", STREAM_LOST), ("raised", GAP), ("raised", FAULT)
+            ]  # fmt: skip
+            assert len(at.outlet.events) == 4
+            assert DEFECT in at.worker.trouble
+        at.put(*(block(number, run=2, sequence=number - 30) for number in range(31, 45)))
+        at.worker.operate(order("acknowledge", GAP))
+        assert at.worker.trouble == ""
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+        assert at.log()[-1][1:] == ("acknowledged", GAP)
+
+
+def test_the_last_step_at_a_stop_survives_a_defect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        monkeypatch.setattr(MachineMonitor, "state", defective)
+        at.worker.stop()
+        assert not at.worker.alive
+        assert DEFECT in at.worker.last_error
+
+
+@pytest.mark.parametrize("kind", ["unheard-of", "gap"])
+def test_an_event_without_words_goes_out_and_holds_up_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    told = []
+    with bench(tmp_path) as at:
+        at.put(block(0))
+        book = at.worker._monitor._alarms
+        poison = Evidence(0, 1, "not a number") if kind == "gap" else None  # type: ignore[arg-type]  # a defect
+        at.worker.inbox.call(
+            lambda: told.append(book.update_state(f"data-{kind}", True, START_NS, evidence=poison, at_once=True))
+        )
+        at.settle()
+        at.worker.operate(order("shelve", "k_by"))
+        assert [(kind, alarm) for _, kind, alarm in at.log()][:2] == [("raised", f"data-{kind}"), ("shelved", "k_by")]
+        assert len(at.outlet.events) == len(at.log())
+        assert (kind == "gap") == (FAULT in {alarm for _, _, alarm in at.log()})
+    assert told
+
+
+INTEGER = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([0, 2**16 - 1, 2**63 - 1, 2**64 - 1, 10**4300]))
+
+
+@settings(max_examples=80, deadline=None)
+@given(
+    headers=st.lists(
+        st.tuples(INTEGER, INTEGER, st.sampled_from([LAB.rate_hz, 1e-320, 1e6, 1e308, float("nan")]), INTEGER),
+        min_size=1,
+        max_size=4,
+    ),
+    start_ns=st.one_of(st.just(START_NS), INTEGER),
+)
+def test_whatever_is_accepted_can_be_remembered_and_restored(
+    headers: list[tuple[int, int, float, int]], start_ns: int
+) -> None:
+    installed = install(machine_in_order(), None)
+    monitor = MachineMonitor(installed)
+    good = block(0)
+    for number, (sequence, run, rate_hz, step_ns) in enumerate(headers):
+        whole = {"start_ns": start_ns + number * step_ns, "sequence": sequence, "run": run}
+        metadata = {"rate_hz": repr(rate_hz), **{name: decimal(value) for name, value in whole.items()}}
+        payload = write_arrow(good.samples, metadata)
+        monitor.step_payload(payload, b"", ARROW_ENCODING)
+    identity = Identity("demo", "lab", None, machine_hash(installed.machine))
+    step = checkpoint_step(identity, monitor.state(), 1)
+    again, text = restored(lambda: MachineMonitor(installed), identity, Checkpoint(step.head, step.new_hops), 0)
+    assert again.state().state == monitor.state().state
+    assert text.startswith("went on where it stood")
+
+
+def decimal(value: int) -> str:
+    """A whole number in decimal, however many digits it has."""
+    return str(value) if abs(value) < 10**4000 else "1" + "0" * 4300
