@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from models.errors import MachineFileError
-from models.machine import read_toml, validation_text
+from models.mistakes import checked, read_toml
 from models.signals.link import LinkSettings
 
 __all__ = ["load_link"]
@@ -26,10 +26,7 @@ def load_link(path: Path) -> LinkSettings:
         Naming the file, the field and what was expected. Passwords, certificates and keys are read and checked when a
         session is opened.
     """
-    try:
-        link = _LinkFile.model_validate(read_toml(path)).link
-    except ValidationError as error:
-        raise MachineFileError(validation_text(path, error)) from error
+    link = checked(_LinkFile, read_toml(path), path).link
     if not link.listen and not link.connect:
         raise MachineFileError(f"{path}: link: expected endpoints in listen or connect, found neither")
     return link.beside(path.parent)

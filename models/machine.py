@@ -10,15 +10,15 @@ Every field carries its unit in its name; unknown keys are refused. ``docs/machi
 import hashlib
 import json
 import math
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.alarm_names import ALARM_TEXT
 from models.errors import MachineFileError
+from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.parameters import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
@@ -33,8 +33,6 @@ __all__ = [
     "WindowSettings",
     "load_machine",
     "load_machine_file",
-    "read_toml",
-    "validation_text",
 ]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
@@ -169,7 +167,8 @@ class AlarmLimits(BaseModel):
 def _known_alarms(field: str, names: Iterable[str]) -> None:
     unknown = sorted(set(names) - set(ALARM_TEXT))
     if unknown:
-        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARM_TEXT)}")
+        hint = did_you_mean(unknown[0], ALARM_TEXT)
+        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARM_TEXT)}{hint}")
 
 
 class SuppressRule(BaseModel):
@@ -242,7 +241,8 @@ class AlarmSettings(BaseModel):
     def _known(self) -> Self:
         unknown = sorted(set(self.parameters) - set(PARAMETERS))
         if unknown:
-            raise ValueError(f"parameters {unknown} are not among {', '.join(PARAMETERS)}")
+            hint = did_you_mean(unknown[0], PARAMETERS)
+            raise ValueError(f"parameters: {', '.join(unknown)} is not one of {', '.join(PARAMETERS)}{hint}")
         _known_alarms("latching", self.latching)
         return self
 
@@ -263,7 +263,7 @@ class MachineFile(BaseModel):
     operation: Operation | None = None
     condition: ConditionRange | None = None
     rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
-    dtype: str = Field(default="float32", pattern="^float(32|64)$")
+    dtype: Literal["float32", "float64"] = "float32"
     sensors: tuple[Channel, ...] = Field(min_length=1)
     window: WindowSettings = WindowSettings()
     ingest: IngestSettings = IngestSettings()
@@ -359,10 +359,7 @@ def load_machine(name_or_path: str | Path) -> Machine:
         Naming the file, the field, the value found and what was expected.
     """
     path = _path(name_or_path)
-    try:
-        return Machine.model_validate(read_toml(path))
-    except ValidationError as error:
-        raise MachineFileError(validation_text(path, error)) from error
+    return checked(Machine, read_toml(path), path)
 
 
 def load_machine_file(name_or_path: str | Path) -> MachineFile:
@@ -379,10 +376,7 @@ def load_machine_file(name_or_path: str | Path) -> MachineFile:
         Naming the file, the field, the value found and what was expected.
     """
     path = _path(name_or_path)
-    try:
-        found = MachineFile.model_validate(read_toml(path))
-    except ValidationError as error:
-        raise MachineFileError(validation_text(path, error)) from error
+    found = checked(MachineFile, read_toml(path), path)
     if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
         return found
     return Machine.model_validate(found.model_dump())
@@ -393,32 +387,9 @@ def _path(name_or_path: str | Path) -> Path:
     if path.suffix != ".toml" and (_SHIPPED / f"{name_or_path}.toml").is_file():
         return _SHIPPED / f"{name_or_path}.toml"
     if not path.is_file():
-        shipped = ", ".join(sorted(entry.stem for entry in _SHIPPED.glob("*.toml")))
-        raise MachineFileError(f"{path}: no such machine file; shipped machines: {shipped}")
+        shipped = sorted(entry.stem for entry in _SHIPPED.glob("*.toml"))
+        known = [*shipped, *(entry.name for entry in path.parent.glob("*.toml"))]
+        raise MachineFileError(
+            f"{path}: no such machine file; shipped machines: {', '.join(shipped)}{did_you_mean(path.name, known)}"
+        )
     return path
-
-
-def read_toml(path: Path) -> dict[str, object]:
-    """Read a TOML file.
-
-    Raises
-    ------
-    MachineFileError
-        If it cannot be read or is not TOML; the message names the file and, where known, the line.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise MachineFileError(f"{path}: cannot be read ({error.strerror})") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise MachineFileError(f"{path}: not a TOML file: {error}") from error
-
-
-def validation_text(path: Path, error: ValidationError) -> str:
-    """One line per fault: file, field, what is wrong, and the value found."""
-    lines = []
-    for fault in error.errors():
-        field = ".".join(str(part) for part in fault["loc"]) or "file"
-        found = "" if fault["type"] == "missing" or isinstance(fault["input"], dict) else f" (found {fault['input']!r})"
-        lines.append(f"{path}: {field}: {fault['msg'].removeprefix('Value error, ')}{found}")
-    return "\n".join(lines)

@@ -13,7 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from models.errors import MachineFileError
-from models.machine import MachineFile, load_machine_file, read_toml, validation_text
+from models.machine import MachineFile, load_machine_file
+from models.mistakes import mistakes, read_toml
 from models.signals.link import LinkSettings
 from service.access_settings import AccessSettings, check_access
 from service.store.retention import Retention
@@ -247,9 +248,14 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     try:
         settings = ServiceSettings(**fields)  # type: ignore[arg-type]  # checked by pydantic, that is the point
     except ValidationError as error:
-        raise MachineFileError(_blame(place, error)) from error
+        found = mistakes(error, ServiceSettings, fields)
+        raise MachineFileError("\n".join(f"{_culprit(at, place)}: {text}" for at, text in found)) from error
     except SettingsError as error:
-        raise MachineFileError(f"environment: {error}") from error
+        name = str(error).partition('"')[2].partition('"')[0]
+        raise MachineFileError(
+            f"environment variable {_ENV_PREFIX}{name.upper()}: expected JSON, "
+            f"found {os.environ.get(_ENV_PREFIX + name.upper(), '')!r}"
+        ) from error
     folder = Path() if path is None else path.parent
     entries = tuple(_resolved(entry, folder) for entry in settings.machines)
     history = settings.history
@@ -281,23 +287,12 @@ def _beside(folder: Path, url: str) -> str:
     return f"sqlite:///{folder.absolute() / path}"
 
 
-def _blame(place: Path, error: ValidationError) -> str:
-    """Fault by fault, say whether the file or an environment variable is to be changed."""
-    text, faults = validation_text(place, error), error.errors()
-    for fault in faults:
-        found = f" (found {fault['input']!r})"
-        if "://" in found:  # an address, which may hold a password
-            text = text.replace(found, "")
-    lines = text.splitlines()
-    if len(lines) != len(faults):  # a message of several lines: leave the text as it is
-        return "\n".join(lines)
-    for number, fault in enumerate(faults):
-        parts = [str(part).upper() for part in fault["loc"]]
-        names = (_ENV_PREFIX + "__".join(parts[:depth]) for depth in range(len(parts), 0, -1))
-        culprit = next((name for name in names if name in os.environ), None)
-        if culprit is not None:
-            lines[number] = lines[number].replace(str(place), f"environment variable {culprit}", 1)
-    return "\n".join(lines)
+def _culprit(at: tuple[int | str, ...], place: Path) -> str:
+    """The file, or the environment variable that is to be changed instead."""
+    parts = [str(part).upper() for part in at]
+    names = (_ENV_PREFIX + "__".join(parts[:depth]) for depth in range(len(parts), 0, -1))
+    culprit = next((name for name in names if name in os.environ), None)
+    return str(place) if culprit is None else f"environment variable {culprit}"
 
 
 def _resolved(entry: MachineEntry, folder: Path) -> MachineEntry:

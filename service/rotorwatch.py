@@ -17,6 +17,7 @@ from service.commands import webhook as webhook_commands
 from service.commands.replay import NamespaceOption, in_namespace
 from service.commands.running import (
     ENDPOINT,
+    Commands,
     ConnectOption,
     LinkOption,
     ListenOption,
@@ -32,6 +33,7 @@ __all__ = ["app"]
 
 app = typer.Typer(
     name="rotorwatch",
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
@@ -233,7 +235,8 @@ def _overridden(
 def _checked(file: Path) -> str:
     """Check one file and say what it describes."""
     from models.commissioning.installed import install  # noqa: PLC0415  # keeps --help quick
-    from models.machine import load_machine_file, read_toml  # noqa: PLC0415
+    from models.machine import load_machine_file  # noqa: PLC0415
+    from models.mistakes import read_toml  # noqa: PLC0415
     from service.config import load_settings  # noqa: PLC0415
     from service.store.store import Store  # noqa: PLC0415
 

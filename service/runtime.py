@@ -17,6 +17,7 @@ snapshots, or asks it to do something between two blocks (operators; the passing
 is noticed on the monotonic clock; the time of day is used for what is recorded when, and for how long a restart took.
 """
 
+import errno
 import socket
 import threading
 from collections.abc import Iterator
@@ -319,6 +320,12 @@ def _news(health: Health) -> Health:
     )
 
 
+def _why(error: OSError) -> str:
+    if error.errno == errno.EADDRINUSE:
+        return "the port is in use: does another program listen there? --http-port 0 takes a free one"
+    return (error.strerror or str(error)).partition(" (while")[0]
+
+
 class _HttpServer:
     """The HTTP server in a thread of its own; the address is taken when it is built."""
 
@@ -330,9 +337,7 @@ class _HttpServer:
             # Without it the end of every answer waits for the other side's acknowledgement, 40 ms.
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         except OSError as error:
-            raise HttpError(
-                f"HTTP cannot listen on {settings.host} port {settings.port}: {error.strerror or error}"
-            ) from error
+            raise HttpError(f"HTTP cannot listen on {settings.host} port {settings.port}: {_why(error)}") from error
         host = f"[{settings.host}]" if ":" in settings.host else settings.host
         self.url = f"{'http' if access.tls is None else 'https'}://{host}:{self._socket.getsockname()[1]}"
         self._server: uvicorn.Server | None = None

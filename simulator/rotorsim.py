@@ -19,6 +19,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.link_file import load_link
 from models.machine import Machine, load_machine
 from models.signals.link import LinkSettings
+from simulator.commands import Commands
 from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
 from simulator.version import VersionOption
 
@@ -29,6 +30,7 @@ __all__ = ["app"]
 
 app = typer.Typer(
     name="rotorsim",
+    cls=Commands,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",

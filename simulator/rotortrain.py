@@ -9,18 +9,24 @@ from typing import Annotated
 import typer
 
 from models.errors import RotorwatchError
+from simulator.commands import Commands
 from simulator.version import VersionOption
 
 __all__ = ["app"]
 
 app = typer.Typer(
     name="rotortrain",
+    cls=Commands,
     help="Train the networks of a machine from its machine file, and evaluate them on windows they never saw.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
 )
 
+_EXTRAS = {
+    "train": ("torch", "matplotlib", "jinja2", "markupsafe"),
+    "peers": ("pyoma2", "sklearn"),
+}
 _SEED = 20260101
 _CORES = os.cpu_count() or 1
 _WINDOWS, _DRAWS = 160, 150_000
@@ -421,6 +427,13 @@ def _running() -> Iterator[None]:
         os.environ.setdefault(name, "1")
     try:
         yield
+    except ModuleNotFoundError as error:
+        name = (error.name or "").partition(".")[0]
+        extra = next((extra for extra, names in _EXTRAS.items() if name in names), None)
+        if extra is None:
+            raise
+        typer.echo(f"rotortrain: {name} is not installed: pip install 'rotorwatch[{extra}]'", err=True)
+        raise typer.Exit(2) from error
     except RotorwatchError as error:
         typer.echo(f"rotortrain: {error}", err=True)
         raise typer.Exit(2) from error

@@ -9,10 +9,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.errors import MachineFileError
-from models.machine import Machine, load_machine, read_toml, validation_text
+from models.machine import Machine, load_machine
+from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.excitation import Source
 from models.physics.parameters import PARAMETERS
 from models.signals.channels import Channel, Quantity
@@ -187,7 +188,8 @@ class Event(BaseModel):
         if self.parameter is None:
             return
         if self.parameter not in PARAMETERS:
-            raise ValueError(f"parameter {self.parameter!r} is not one of {', '.join(PARAMETERS)}")
+            hint = did_you_mean(self.parameter, PARAMETERS)
+            raise ValueError(f"parameter {self.parameter!r} is not one of {', '.join(PARAMETERS)}{hint}")
         if self.relative_change is None:
             raise ValueError(f"change of parameter {self.parameter} without relative_change")
 
@@ -205,7 +207,8 @@ class Event(BaseModel):
         if self.anomaly is None:
             return
         if self.anomaly not in ANOMALIES:
-            raise ValueError(f"anomaly {self.anomaly!r} is not one of {', '.join(ANOMALIES)}")
+            hint = did_you_mean(self.anomaly, ANOMALIES)
+            raise ValueError(f"anomaly {self.anomaly!r} is not one of {', '.join(ANOMALIES)}{hint}")
         if self.size is None:
             raise ValueError(f"anomaly {self.anomaly} without size")
         if self.size > ANOMALIES[self.anomaly]:
@@ -260,7 +263,8 @@ class Scenario(BaseModel):
         for number, event in enumerate(self.events):
             if event.source is not None and event.source not in names:
                 known = ", ".join(names) or "none"
-                raise ValueError(f"events.{number}.source: {event.source!r} is not among the sources ({known})")
+                hint = did_you_mean(event.source, names)
+                raise ValueError(f"events.{number}.source: {event.source!r} is not among the sources ({known}){hint}")
             if event.anomaly == "rub" and self.rub is None:
                 raise ValueError(f"events.{number}.anomaly: a rub needs the table [rub] with its clearance_m")
             if event.at_s + event.ramp_s > self.duration_s:
@@ -290,7 +294,7 @@ class Scenario(BaseModel):
             if name not in known:
                 raise MachineFileError(
                     f"scenario {self.name}: {field}: {name!r} is not a channel of machine {machine.name} "
-                    f"({', '.join(known)})"
+                    f"({', '.join(known)}){did_you_mean(name, known)}"
                 )
 
         of = {channel.name: channel for channel in machine.sensors}
@@ -320,10 +324,7 @@ class Scenario(BaseModel):
             fields["seed"] = seed
         if duration_s is not None:
             fields["duration_s"] = duration_s
-        try:
-            return Scenario.model_validate(fields)
-        except ValidationError as error:
-            raise MachineFileError(validation_text(Path(self.name), error)) from error
+        return checked(Scenario, fields, self.name)
 
 
 def shipped_scenarios() -> tuple[str, ...]:
@@ -353,13 +354,10 @@ def load_scenario(name_or_path: str | Path) -> tuple[Scenario, Machine]:
     path = _locate(name_or_path, Path())
     fields = _merged(path, ())
     fields.setdefault("name", path.stem)
-    try:
-        scenario = Scenario.model_validate(fields)
-    except ValidationError as error:
-        raise MachineFileError(validation_text(path, error)) from error
+    scenario = checked(Scenario, fields, path)
     beside = path.parent / scenario.machine
-    machine = load_machine(beside if beside.suffix == ".toml" else scenario.machine)
     try:
+        machine = load_machine(beside if beside.suffix == ".toml" else scenario.machine)
         scenario.check_channels(machine)
     except MachineFileError as error:
         raise MachineFileError(f"{path}: {error}") from error
@@ -383,10 +381,7 @@ def parse_fault(text: str) -> Event:
     if match is None:
         raise MachineFileError(f"fault {text!r}: expected PARAMETER=CHANGE@SECONDS, for example k_by=-0.25@140")
     fields = {"parameter": match["parameter"], "relative_change": match["change"], "at_s": match["at_s"]}
-    try:
-        return Event.model_validate(fields)
-    except ValidationError as error:
-        raise MachineFileError(validation_text(Path(f"fault {text!r}"), error)) from error
+    return checked(Event, fields, f"fault {text!r}")
 
 
 def _locate(name_or_path: str | Path, folder: Path) -> Path:
@@ -395,7 +390,11 @@ def _locate(name_or_path: str | Path, folder: Path) -> Path:
         return shipped
     path = folder / name_or_path
     if not path.is_file():
-        raise MachineFileError(f"{path}: no such scenario file; shipped scenarios: {', '.join(shipped_scenarios())}")
+        known = [*shipped_scenarios(), *(entry.name for entry in path.parent.glob("*.toml"))]
+        raise MachineFileError(
+            f"{path}: no such scenario file; shipped scenarios: {', '.join(shipped_scenarios())}"
+            f"{did_you_mean(path.name, known)}"
+        )
     return path
 
 
@@ -409,7 +408,10 @@ def _merged(path: Path, seen: tuple[Path, ...]) -> dict[str, object]:
         return own
     if not isinstance(base_name, str):
         raise MachineFileError(f"{path}: extends: expected the name or path of a scenario (found {base_name!r})")
-    base = _merged(_locate(base_name, path.parent), (*seen, path.resolve()))
+    try:
+        base = _merged(_locate(base_name, path.parent), (*seen, path.resolve()))
+    except MachineFileError as error:
+        raise MachineFileError(f"{path}: extends: {error}") from error
     base.pop("name", None)
     base.pop("description", None)
     for key, value in own.items():

@@ -26,7 +26,8 @@ from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.fallback.shape import HealthyShape
 from models.diagnosis.sensors.reference import SensorReference
 from models.errors import BundleError
-from models.machine import Machine, MachineFile, validation_text
+from models.machine import Machine, MachineFile
+from models.mistakes import mistakes
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
@@ -163,7 +164,8 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     except OSError as error:
         raise BundleError(f"{path}: not a commissioned bundle: {error.strerror}") from error
     except ValidationError as error:
-        raise BundleError(f"damaged, or of another version: {validation_text(path, error)}") from error
+        told = "; ".join(text for _, text in mistakes(error, Commissioned))
+        raise BundleError(f"{path}: damaged, or of another version: {told}") from error
     if (found.site, found.machine) != (machine.site, machine.name):
         raise BundleError(
             f"{path}: commissioned for {found.site}/{found.machine}, not for {machine.site}/{machine.name}"

@@ -7,7 +7,9 @@ from collections.abc import Iterable
 from enum import StrEnum
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from models.mistakes import did_you_mean
 
 __all__ = [
     "ACCELERATIONS",
@@ -42,6 +44,8 @@ UNIT_TO_SI: dict[Quantity, dict[str, float]] = {
     Quantity.SHAFT_ANGLE: {"rad": 1.0},
 }
 """Accepted units of each quantity and the factor that turns them into SI."""
+
+_SPELLING = str.maketrans({"\N{MICRO SIGN}": "u", "\N{GREEK SMALL LETTER MU}": "u", "²": "2", "^": None})
 
 _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
     (Quantity.DISPLACEMENT, "bearing", "y"): "y1",
@@ -84,18 +88,32 @@ class Channel(BaseModel):
 
     model_config = _STRICT
 
-    name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.:-]+$", description="unique channel name")
+    name: str = Field(
+        min_length=1,
+        max_length=64,
+        pattern=r"^[A-Za-z0-9_.:-]+$",
+        description="unique name of letters, digits and _ . : -",
+    )
     quantity: Quantity
     location: Literal["bearing", "disc", "shaft"]
     direction: Literal["y", "z", "rotation"]
-    unit: str
+    unit: str = Field(
+        description="; ".join(f"{', '.join(units)} for {quantity}" for quantity, units in UNIT_TO_SI.items())
+    )
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _spelled(cls, unit: object) -> object:
+        """As a person writes it: either micro sign, a raised two."""
+        return unit.translate(_SPELLING).strip() if isinstance(unit, str) else unit
 
     @model_validator(mode="after")
     def _known_unit_and_place(self) -> Self:
         units = UNIT_TO_SI[self.quantity]
         if self.unit not in units:
             raise ValueError(
-                f"channel {self.name}: unit {self.unit!r} is not one of {sorted(units)} for {self.quantity}"
+                f"channel {self.name}: unit {self.unit!r} is not one of {', '.join(units)} for {self.quantity}"
+                f"{did_you_mean(self.unit, units)}"
             )
         if (self.quantity, self.location, self.direction) not in _STATE_NAMES:
             raise ValueError(

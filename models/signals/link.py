@@ -13,6 +13,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.errors import MachineFileError
+from models.signals.endpoint import endpoint_fault
 from models.signals.link_access import Grant, access_control
 from models.signals.link_files import check_certificate, check_key, read_password, read_user_names
 
@@ -74,7 +75,9 @@ class LinkSettings(BaseModel):
         "and nobody outside hears the program",
     )
     user: str | None = Field(
-        default=None, pattern=r"^[^\s:]+$", description="name under which this program connects to others"
+        default=None,
+        pattern=r"^[^\s:]+$",
+        description="name under which this program connects to others, without spaces and colons",
     )
     password_file: Path | None = Field(default=None, description="file of mode 600 with the password of user")
     password_variable: str | None = Field(
@@ -183,7 +186,10 @@ class LinkSettings(BaseModel):
         return f"nobody answers there; or {'; or '.join(reasons)}"
 
     def _faults(self) -> Iterator[str]:
-        """What contradicts what."""
+        """What cannot be an endpoint, and what contradicts what."""
+        for role, ends in (("listen", self.listen), ("connect", self.connect)):
+            for fault in filter(None, map(endpoint_fault, ends)):
+                yield f"{role}: {fault}"
         if self.user is None and (self.password_file or self.password_variable):
             yield "a password is given, but no user"
         if self.user is not None and (self.password_file is None) == (self.password_variable is None):

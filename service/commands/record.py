@@ -164,9 +164,8 @@ def _settings(
     config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
 ) -> "tuple[list[MachineFile], RecordingSettings]":
     """Machines and settings: the command line over the settings file."""
-    from pydantic import ValidationError  # noqa: PLC0415  # keeps --help quick
-
-    from models.machine import load_machine_file, validation_text  # noqa: PLC0415
+    from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
+    from models.mistakes import checked  # noqa: PLC0415
     from service.config import RecordingSettings, load_settings  # noqa: PLC0415
 
     settings = None if config is None else load_settings(config)
@@ -175,10 +174,7 @@ def _settings(
     fields = {} if settings is None else settings.recording.model_dump()
     if out is not None:
         fields["directory"] = str(out)
-    try:
-        recording = RecordingSettings.model_validate(fields | changes)
-    except ValidationError as error:
-        raise MachineFileError(validation_text(Path("command line"), error)) from error
+    recording = checked(RecordingSettings, fields | changes, "command line")
     if recording.directory is None:
         raise MachineFileError("nowhere to record to: give --out DIR, or directory in [recording] of the settings")
     files = machines or [entry.file for entry in settings.machines] if settings is not None else machines or []

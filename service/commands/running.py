@@ -4,14 +4,16 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 
 __all__ = [
     "ENDPOINT",
+    "Commands",
     "ConnectOption",
     "FromOption",
     "LinkOption",
@@ -61,6 +63,20 @@ def _say_version(wanted: bool) -> None:
 VersionOption = Annotated[
     bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
 ]
+
+
+class Commands(TyperGroup):
+    """The commands of a program; an argument that is refused is told like a field of a file."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command of the command line."""
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            from models.mistakes import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
+
+            error.message = argument_text(error) or error.message
+            raise
 
 
 def one_blas_thread() -> None:

@@ -13,6 +13,7 @@ import pyarrow as pa
 from pydantic import ValidationError
 
 from models.errors import RecordingError, WireError
+from models.mistakes import mistakes
 from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import SampleBlock
 from models.signals.channels import ChannelDescriptor, Quantity
@@ -201,7 +202,8 @@ def _descriptor(selection: Selection, key: str) -> ChannelDescriptor:
         try:
             descriptor = ChannelDescriptor.model_validate_json(message.payload)
         except ValidationError as error:
-            raise RecordingError(f"{path}: the channel descriptor on {key} cannot be read: {error}") from error
+            told = "; ".join(text for _, text in mistakes(error, ChannelDescriptor))
+            raise RecordingError(f"{path}: the channel descriptor on {key} cannot be read: {told}") from error
         if found is not None and descriptor != found:
             raise RecordingError(
                 f"{path}: the channels on {key} are not those of before; export what belongs together by itself"

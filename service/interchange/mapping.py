@@ -7,10 +7,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from models.errors import MachineFileError
-from models.machine import MachineFile, read_toml, validation_text
+from models.machine import MachineFile
+from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity
 from models.signals.units import time_unit_ns, unit_factor
 
@@ -185,7 +186,10 @@ class Mapping(BaseModel):
         for table, columns in (("channels", self.channels), ("acceleration.channels", self.accelerations)):
             for name in columns:
                 if name not in known:
-                    raise ValueError(f"{table}.{name}: not a channel of the machine, which has {', '.join(known)}")
+                    raise ValueError(
+                        f"{table}.{name}: not a channel of the machine, which has {', '.join(known)}"
+                        f"{did_you_mean(name, known)}"
+                    )
         for name, channel in known.items():
             self._check_channel(name, channel)
         angle = next((name for name, channel in known.items() if channel.quantity is Quantity.SHAFT_ANGLE), None)
@@ -224,10 +228,7 @@ def load_mapping(path: Path, machine: MachineFile) -> Mapping:
     MachineFileError
         Naming the file, the field, the value found and what was expected.
     """
-    try:
-        mapping = Mapping.model_validate(read_toml(path))
-    except ValidationError as error:
-        raise MachineFileError(validation_text(path, error)) from error
+    mapping = checked(Mapping, read_toml(path), path)
     try:
         mapping.check_against(machine)
     except ValueError as error:

@@ -8,7 +8,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from models.errors import RecordingError
-from models.machine import validation_text
+from models.mistakes import mistakes
 
 __all__ = ["read_numbers", "read_to_redraw", "writing"]
 
@@ -43,7 +43,7 @@ def read_numbers(kind: type[_Numbers], path: Path) -> _Numbers:
     try:
         return kind.model_validate_json(path.read_text(encoding="utf-8"))
     except ValidationError as error:
-        raise RecordingError(validation_text(path, error)) from error
+        raise RecordingError("\n".join(f"{path}: {text}" for _, text in mistakes(error, kind))) from error
 
 
 def read_to_redraw(kind: type[_Numbers], path: Path) -> _Numbers:

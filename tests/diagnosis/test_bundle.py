@@ -120,7 +120,7 @@ def flip_a_byte(directory: Path) -> None:
     ("damage", "message"),
     [
         (flip_a_byte, "sha256 is .* the manifest says"),
-        (lambda d: (d / "weights.safetensors").unlink(), "not a bundle: weights.safetensors"),
+        (lambda d: (d / "weights.safetensors").unlink(), "not a bundle, no weights.safetensors"),
         (lambda d: (d / "manifest.json").write_text("{"), "manifest.json: .*Invalid JSON"),
         (edit_manifest(lambda m: m.update(format=3)), "format is 3, this program reads 2"),
         (edit_manifest(lambda m: m.update(code="import os")), "code.*Extra inputs"),

@@ -27,6 +27,7 @@ from models.diagnosis.networks.features import FeatureBasis
 from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy, Network, equation_by_number
 from models.errors import BundleError
 from models.machine import Machine
+from models.mistakes import did_you_mean, mistakes
 
 __all__ = ["Bundle", "Manifest", "Training", "load_bundle", "save_bundle"]
 
@@ -227,9 +228,15 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
         manifest = Manifest.model_validate_json((directory / "manifest.json").read_bytes())
         weights = (directory / "weights.safetensors").read_bytes()
     except OSError as error:
-        raise BundleError(f"{directory}: not a bundle: {Path(error.filename).name}: {error.strerror}") from error
+        shipped = sorted(entry.name for entry in _SHIPPED.iterdir() if entry.is_dir())
+        why = f"no {Path(error.filename).name} in it" if directory.is_dir() else "there is no such folder"
+        raise BundleError(
+            f"{directory}: not a bundle, {why}; shipped bundles: {', '.join(shipped)}"
+            f"{did_you_mean(directory.name, shipped)}"
+        ) from error
     except ValidationError as error:
-        raise BundleError(f"{directory}/manifest.json: {error}") from error
+        told = "; ".join(text for _, text in mistakes(error, Manifest))
+        raise BundleError(f"{directory}/manifest.json: damaged, or of another version: {told}") from error
     if manifest.format != _FORMAT:
         raise BundleError(f"{directory}: format is {manifest.format}, this program reads {_FORMAT}")
     digest = hashlib.sha256(weights).hexdigest()

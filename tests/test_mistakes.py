@@ -1,0 +1,121 @@
+"""What people get wrong in files and arguments, and what they are told: ``mistakes/*.toml`` is the table.
+
+A message names the file or argument, the field, the value and what was expected, in a user's words; nothing of the
+libraries inside is in it. To read all of them: ``pytest tests/test_mistakes.py -rA``.
+"""
+
+import re
+import shlex
+import socket
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from models.machine import load_machine
+from service.rotorwatch import app as rotorwatch
+from simulator.rotorsim import app as rotorsim
+from simulator.rotortrain import app as rotortrain
+from tests.service.live import ROOT, endpoint
+
+TABLES = Path(__file__).parent / "mistakes"
+PROGRAMS = {"rotorwatch": rotorwatch, "rotorsim": rotorsim, "rotortrain": rotortrain}
+OF_THE_INSIDE = re.compile(
+    r"pydantic|Traceback|\.rs\b|validation error|type=|Extra inputs|Field required|Input should|sqlalchemy|zenoh::"
+    r"|json5|click|typer|Errno|tomllib|Value error|greater than|less than|object at 0x|\\n",
+    re.IGNORECASE,
+)
+
+SETTINGS = """
+[link]
+listen = ["tcp/127.0.0.1:7001"]
+
+[http]
+port = 9000
+
+[queue]
+blocks = 10
+when_full = "drop"
+
+[history]
+url = "sqlite:///history.sqlite"
+
+[log]
+level = "info"
+
+[[machines]]
+file = "machine.toml"
+"""
+MAPPING = """
+[time]
+column = "Time"
+unit = "s"
+start = "2026-01-31T12:00:00Z"
+
+[channels]
+y1 = { column = "Brg Y", unit = "um" }
+""" + "".join(f'{one.name} = {{ column = "{one.name}" }}\n' for one in load_machine("lab").sensors[1:])
+
+GOOD = {
+    "machine": ("rotorwatch check-config machine.toml", (ROOT / "models/machines/lab.toml").read_text("utf-8")),
+    "settings": ("rotorwatch check-config service.toml", SETTINGS),
+    "scenario": ("rotorsim record mine.toml run.mcap", (ROOT / "simulator/scenarios/k_by.toml").read_text("utf-8")),
+    "mapping": ("rotorwatch import run.csv --mapping mapping.toml --machine machine.toml --out run.mcap", MAPPING),
+}
+NAMES = {"machine": "machine.toml", "settings": "service.toml", "scenario": "mine.toml", "mapping": "mapping.toml"}
+MISTAKES = [
+    pytest.param(table.stem, one, id=f"{table.stem}-{number}")
+    for table in sorted(TABLES.glob("*.toml"))
+    for number, one in enumerate(tomllib.loads(table.read_text("utf-8"))["mistake"], start=1)
+]
+
+
+@pytest.fixture
+def ports(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[dict[str, str]]:
+    """A folder with good files, and what stands for ports in the table."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    for kind, (_, text) in GOOD.items():
+        (tmp_path / NAMES[kind]).write_text(text, "utf-8")
+    (tmp_path / "run.csv").write_text("Time\n0\n", "utf-8")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        yield {"OCCUPIED": str(taken.getsockname()[1]), "NOBODY": endpoint().rpartition(":")[2]}
+
+
+@pytest.mark.parametrize(("kind", "mistake"), MISTAKES)
+def test_a_mistake_is_told_in_the_words_of_who_made_it(
+    kind: str, mistake: dict[str, Any], ports: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = mistake.get("command") or GOOD[kind][0]
+    if "change" in mistake:
+        before, after = (text.replace("\\n", "\n") for text in mistake["change"])
+        path, text = Path(NAMES[kind]), GOOD[kind][1]
+        assert before in text
+        path.write_text(text.replace(before, after, 1), mistake.get("encoding", "utf-8"))
+    for name, value in mistake.get("environment", {}).items():
+        monkeypatch.setenv(name, value)
+
+    def ported(text: str) -> str:
+        return re.sub("|".join(ports), lambda found: ports[found[0]], text)
+
+    program, *arguments = shlex.split(ported(command))
+    result = CliRunner().invoke(PROGRAMS[program], arguments, prog_name=program)
+    told = result.output
+    sys.stdout.write(f"$ {command}  {mistake.get('change', mistake.get('environment', ''))}\n{told}")
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
+    assert result.exit_code == mistake.get("exit", 2)
+    for fact in mistake["says"]:
+        assert ported(fact) in told
+    if "change" in mistake and result.exit_code:
+        assert NAMES[kind] in told
+    assert not OF_THE_INSIDE.search(told)
+    assert len(told.splitlines()) < 12
+
+
+def test_there_is_nothing_to_say_about_the_files_before_a_mistake_is_made(ports: dict[str, str]) -> None:
+    for kind in ("machine", "settings"):
+        assert CliRunner().invoke(rotorwatch, shlex.split(GOOD[kind][0])[1:]).exit_code == 0
