@@ -151,7 +151,7 @@ def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
     hint = ""
     if kind in {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number"}:
         wanted = between or _range_text(**{name: context[name] for name in ("gt", "ge", "lt", "le") if name in context})
-        wanted = wanted or "a finite number"
+        wanted = ", ".join(filter(None, ("a finite number" if kind == "finite_number" else "", wanted)))
     elif kind == "json_invalid":
         return "expected JSON, but it is cut off or damaged"
     elif kind in {"literal_error", "enum"}:

@@ -55,7 +55,7 @@ def test_a_missing_column_is_named_with_those_that_there_are(tmp_path: Path) -> 
         ('"mm/s"', '"mm/s rms"', "is that of an overall value (rms)"),
         ('"um"', '"furlong"', "unit 'furlong' is not known for displacement; expected one of m, cm"),
         ("y1_dot =", "y1_dots =", "channels.y1_dots: not a channel of the machine, which has y1, y1_dot, theta"),
-        ('column = "x"', 'colum = "x"', "channels.y1.colum: Extra inputs are not permitted"),
+        ('column = "x"', 'colum = "x"', "channels.y1.colum: unknown; did you mean column"),
         ('column = "t"', 'column = "t"\nunit = "fortnight"', "is not a unit of time"),
         ("12:00:00Z", "12:00:00", "has no time zone"),
         ('{ column = "x", unit = "um" }', '{ column = "x", unit = "um", scale = 0 }', "scale is 0"),

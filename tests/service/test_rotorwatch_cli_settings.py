@@ -66,15 +66,15 @@ def test_environment_goes_over_the_file(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        (("port = 9000", "port = 99000"), r"service.toml: http.port: .*less than or equal to 65535 \(found 99000\)"),
-        (("port = 9000", "prot = 9000"), r"service.toml: http.prot: Extra inputs are not permitted \(found 9000\)"),
-        (("[queue]", "[cue]"), r"service.toml: cue: Extra inputs"),
-        (('"wait"', '"hope"'), r"service.toml: queue.when_full: .*'drop' or 'wait' \(found 'hope'\)"),
+        (("port = 9000", "port = 99000"), r"service.toml: http.port: .*65535 \(found 99000\)"),
+        (("port = 9000", "prot = 9000"), r"service.toml: http.prot: unknown; did you mean port"),
+        (("[queue]", "[cue]"), r"service.toml: cue: unknown; did you mean queue"),
+        (('"wait"', '"hope"'), r"service.toml: queue.when_full: .*drop, wait \(found 'hope'\)"),
         (("blocks = 10", "blocks = 0"), r"service.toml: queue.blocks: .*\(found 0\)"),
-        (('file = "machine.toml"', ""), r"service.toml: machines.0.file: Field required"),
+        (('file = "machine.toml"', ""), r"service.toml: machines.0.file: missing"),
         (('"machine.toml"', '"other.toml"'), r"other.toml: "),
         (('listen = ["tcp/127.0.0.1:7001"]', ""), r"service.toml: .*neither listen nor connect"),
-        (("[http]", "[http"), r"service.toml: not a TOML file: .*line 5"),
+        (("[http]", "[http"), r"service.toml: line 5: "),
     ],
 )
 def test_mistake_is_named_with_file_field_and_value(tmp_path: Path, change: tuple[str, str], named: str) -> None:
@@ -146,7 +146,7 @@ def test_check_config_says_what_is_fine_and_what_is_not(tmp_path: Path) -> None:
     mixed = run("check-config", str(good), str(wrong_machine), str(wrong_bundle))
     assert mixed.returncode == 2
     assert f"{good}: ok" in mixed.stdout
-    assert f"{wrong_machine}: rate_hz: Input should be greater than 0 (found -1.0)" in mixed.stderr
+    assert f"{wrong_machine}: rate_hz: expected above 0 and at most 1000000 (found -1.0)" in mixed.stderr
     assert str(wrong_bundle) in mixed.stderr
 
 

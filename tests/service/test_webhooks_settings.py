@@ -1,5 +1,6 @@
 """Settings of webhooks, their secrets, and the commands: what is accepted, and what is said about mistakes."""
 
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -51,7 +52,7 @@ def test_paths_are_beside_the_settings_and_filters_are_kept(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ('name = "here"', 'name = "pager"', "file: webhooks: two are called pager"),
+        ('name = "here"', 'name = "pager"', "webhooks: two are called pager"),
         ('name = "here"', 'name = "a b"', "webhooks.1.name: "),
         ("https://pager", "http://pager", "webhooks.0: url is http and not on this computer"),
         ("https://pager", "ftp://pager", "webhooks.0: url is not a web address"),
@@ -68,7 +69,7 @@ def test_paths_are_beside_the_settings_and_filters_are_kept(tmp_path: Path) -> N
         ('"raised"', '"risen"', "webhooks.0.kinds.0: "),
         ('"danger"', '"warning"', "webhooks.0.severities.0: "),
         ('["danger"]', '["danger"]\ntimeout_s = 0', "webhooks.0.timeout_s: "),
-        ('["danger"]', '["danger"]\nretry = true', "webhooks.0.retry: Extra inputs"),
+        ('["danger"]', '["danger"]\nretry = true', "webhooks.0.retry: unknown"),
     ],
 )
 def test_mistakes_are_named_and_show_no_secret(tmp_path: Path, old: str, new: str, named: str) -> None:
@@ -76,7 +77,8 @@ def test_mistakes_are_named_and_show_no_secret(tmp_path: Path, old: str, new: st
     file = written(tmp_path, GOOD.replace(old, new))
     with pytest.raises(MachineFileError) as caught:
         load_settings(file)
-    assert f"plant.toml: {named}" in str(caught.value)
+    without_names = re.sub(r" \((pager|here|a b)\):", ":", str(caught.value))
+    assert f"plant.toml: {named}" in without_names
     assert "hush" not in str(caught.value)
 
 

@@ -297,11 +297,11 @@ def test_a_link_file_is_read_with_files_beside_it(tmp_path: Path) -> None:
     path.write_text('[link]\nconnect = ["tcp/127.0.0.1:1"]\nuser = "lab"\npassword_file = "p"\n', encoding="utf-8")
     assert load_link(path).password_file == tmp_path / "p"
     for text, said in (
-        ("", "link.toml: link: Field required"),
+        ("", "link.toml: link: missing"),
         ("[link]\n", "link.toml: link: expected endpoints in listen or connect"),
         ('[link]\nlisten = "x"\n', "link.toml: link.listen: .*found 'x'"),
-        ("[link]\n[http]\nport = 1\n", "link.toml: http: Extra inputs"),
-        ("link = ", "not a TOML file"),
+        ("[link]\n[http]\nport = 1\n", "link.toml: http: unknown"),
+        ("link = ", "link.toml: .*TOML|link.toml: line 1"),
     ):
         path.write_text(text, encoding="utf-8")
         with pytest.raises(MachineFileError, match=said):

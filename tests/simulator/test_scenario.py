@@ -107,16 +107,16 @@ def test_a_machine_file_lies_beside_the_scenario(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("machine = 3 =", "not a TOML file"),
-        (MINIMAL.replace("seed = 1\n", ""), r"mine\.toml: seed: Field required"),
+        ("machine = 3 =", "line 1: .*machine = 3 ="),
+        (MINIMAL.replace("seed = 1\n", ""), r"mine\.toml: seed: missing"),
         (MINIMAL.replace("seed = 1", "seed = -1"), r"seed: .* \(found -1\)"),
-        (MINIMAL.replace("duration_s", "duration"), "duration: Extra inputs are not permitted"),
+        (MINIMAL.replace("duration_s", "duration"), r"duration: unknown; did you mean duration_s\?"),
         (MINIMAL.replace("duration_s = 10.0", "duration_s = inf"), "duration_s: .* finite"),
         (MINIMAL.replace('"lab"', '"nowhere"'), "nowhere: no such machine file"),
-        (MINIMAL.replace("cutoff_hz = 90.0", "cutoff_hz = 0.0"), r"sources\.0\.cutoff_hz: .* \(found 0\.0\)"),
+        (MINIMAL.replace("cutoff_hz = 90.0", "cutoff_hz = 0.0"), r"sources\.0\.cutoff_hz.*: .* \(found 0\.0\)"),
         (MINIMAL.replace("[0, 1, 0, 0, 0, 0]", "[0, 1]"), r"sources\.0\.direction"),
         (MINIMAL + MINIMAL[MINIMAL.index("[[") :], "source name occurs twice: disc y"),
-        (MINIMAL + "[sensors]\nnoise = 0.1", r"sensors\.noise: Extra inputs"),
+        (MINIMAL + "[sensors]\nnoise = 0.1", r"sensors\.noise: unknown"),
         (MINIMAL + "[sensors.channels.y9]\ngain = 2.0", r"mine\.toml: .*'y9' is not a channel of machine lab \(y1, z1"),
         ('extends = "nothing"', "nothing: no such scenario file; shipped scenarios: c_by"),
         ('extends = "mine.toml"', "extends itself"),
@@ -131,7 +131,7 @@ def test_unusable_files_are_refused_with_file_field_and_value(tmp_path: Path, te
 @pytest.mark.parametrize(
     ("event", "message"),
     [
-        ("speed_rpm = 900.0", r"events\.0\.at_s: Field required"),
+        ("speed_rpm = 900.0", r"events\.0\.at_s: missing"),
         (
             "at_s = 1.0",
             "one of parameter, speed_rpm, source, sensor, excitation_level, anomaly; found none",
@@ -141,7 +141,7 @@ def test_unusable_files_are_refused_with_file_field_and_value(tmp_path: Path, te
         ('at_s = 1.0\nanomaly = "crack"\nsize = 0.9', "size of anomaly crack is 0.9, expected 0 to 0.8"),
         ('at_s = 1.0\nanomaly = "rub"\nsize = 0.2', r"events\.0\.anomaly: a rub needs the table \[rub\]"),
         ("at_s = 1.0\nexcitation_level = 2.0\nsize = 0.2", "size belongs to an event with anomaly"),
-        ("at_s = 1.0\nexcitation_level = -2.0", "excitation_level: .*greater than or equal to 0"),
+        ("at_s = 1.0\nexcitation_level = -2.0", "excitation_level: expected 0 to 1000"),
         ('at_s = 1.0\nspeed_rpm = 900.0\nparameter = "e"\nrelative_change = 0.1', "found parameter and speed_rpm"),
         ('at_s = 1.0\nparameter = "k_xx"\nrelative_change = 0.1', "parameter 'k_xx' is not one of k_by, c_by"),
         ('at_s = 1.0\nparameter = "e"', "change of parameter e without relative_change"),
@@ -164,7 +164,7 @@ def test_unusable_files_are_refused_with_file_field_and_value(tmp_path: Path, te
             r"events\.0\.sensor: 'y9' is not a channel of machine lab",
         ),
         ('at_s = 1.0\nsensor = "y1"', "sensor 'y1' without sensor_fault"),
-        ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "dead"', "sensor_fault: Input should be"),
+        ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "dead"', "sensor_fault: expected one of"),
         ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "gain"', "sensor_fault 'gain' needs value_SI"),
         ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "stuck"\nvalue_SI = 1.0', "sensor_fault 'stuck' has no value_SI"),
         ('at_s = 1.0\nsensor = "y1"\nsensor_fault = "clip"\nvalue_SI = -1.0', "'clip' is -1.0, expected 0 or more"),
