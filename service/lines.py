@@ -1,13 +1,26 @@
 """Reports and alarms as single lines of text for a terminal."""
 
+import re
 from datetime import UTC, datetime
 
 from models.diagnosis.readings import Z95
+from models.physics.parameters import PARAMETERS
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
-__all__ = ["alarm_event_line", "alarm_state_lines", "health_line", "report_line"]
+__all__ = [
+    "alarm_event_line",
+    "alarm_state_lines",
+    "health_line",
+    "report_heading",
+    "report_line",
+    "report_row",
+    "with_minus_signs",
+]
+
+_NUMBER = 11
+_TOO_LITTLE = "too little data since the change"
 
 
 def report_line(report: Report) -> str:
@@ -22,16 +35,53 @@ def report_line(report: Report) -> str:
     >>> report_line(Report.model_validate(example(Report)))
     '00:03:25  demo/lab  alert          k_by −24.7±1.4 %  |  changed: k_by  |  relation agrees'
     """
+    verdict = report.verdict
     if report.parameters:
-        verdict = report.verdict
-        shown = report.parameters if verdict is None or verdict.settled else verdict.current
-        parts = ["  ".join(_parameter(parameter) for parameter in shown) or "too little data since the change"]
+        parts = ["  ".join(_parameter(parameter) for parameter in _shown(report)) or _TOO_LITTLE]
         parts += [] if verdict is None else [_verdict(verdict)]
         parts += [_opinion(opinion) for opinion in report.opinions]
         tail = "  |  ".join(parts)
     else:
         tail = report.reason or f"window {report.filled:.0%} full"
-    return f"{_clock(report.end_ns)}  {report.site}/{report.machine}  {report.state:<13}  {tail}"
+    # No alarm yet, or none at all if the change stays below its limit; but healthy is what nothing is found on.
+    state = "no alarm" if report.state == "healthy" and _found(verdict) else report.state
+    return f"{_clock(report.end_ns)}  {report.site}/{report.machine}  {state:<13}  {tail}"
+
+
+def report_heading() -> str:
+    """Heading of a table of `report_row`."""
+    return "time      " + "".join(f"{name:<{_NUMBER}}" for name in PARAMETERS) + "found"
+
+
+def report_row(report: Report) -> str:
+    """One window in a row of a table: the time, each parameter in percent, what was found; 100 columns at most.
+
+    Examples
+    --------
+    >>> from rotorwatch.records.example import example
+    >>> from rotorwatch.records.health import Report
+    >>> report_row(Report.model_validate(example(Report)))
+    '00:03:25  −24.7±1.4                                                         changed: k_by'
+    """
+    if not report.parameters:
+        return f"{_clock(report.end_ns)}  {report.state}: {report.reason or f'window {report.filled:.0%} full'}"
+    shown = {one.name: _percent(one.relative_change, one.standard_error) for one in _shown(report)}
+    numbers = "".join(f"{shown.get(name, ''):<{_NUMBER}}" for name in PARAMETERS)
+    if not shown:
+        numbers = f"{_TOO_LITTLE:<{_NUMBER * len(PARAMETERS)}}"
+    found = _verdict(report.verdict) if report.verdict is not None and _found(report.verdict) else report.state
+    return f"{_clock(report.end_ns)}  {numbers}{found}"
+
+
+def with_minus_signs(text: str) -> str:
+    """The text with true minus signs before its numbers, which are as wide as the plus sign.
+
+    Examples
+    --------
+    >>> with_minus_signs("k_by -24.7 %, since 2026-01-01")
+    'k_by −24.7 %, since 2026-01-01'
+    """
+    return re.sub(r"(?<![\w-])-(?=\d)", "−", text)
 
 
 def alarm_event_line(event: AlarmCloudEvent) -> str:
@@ -42,12 +92,12 @@ def alarm_event_line(event: AlarmCloudEvent) -> str:
     >>> from rotorwatch.records.alarms import AlarmCloudEvent
     >>> from rotorwatch.records.example import example
     >>> alarm_event_line(AlarmCloudEvent.model_validate(example(AlarmCloudEvent)))
-    '00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by) changed by -24.7% ± 1.4%'
+    '00:03:25  demo/lab  ALERT: bearing stiffness, horizontal (k_by) changed by −24.7% ± 1.4%'
     """
     data = event.data
     # Where the text has no name, as that of some that cleared, it must be seen which alarm it is about.
     name = "" if f"({data.name})" in data.text else f" ({data.name})"
-    return f"{_clock(data.time_ns)}  {data.site}/{data.machine}  {data.text}{name}"
+    return f"{_clock(data.time_ns)}  {data.site}/{data.machine}  {with_minus_signs(data.text)}{name}"
 
 
 def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
@@ -55,7 +105,7 @@ def alarm_state_lines(states: AlarmStates) -> tuple[str, ...]:
     place = f"{states.site}/{states.machine}"
     return tuple(
         f"{_clock(alarm.raised_ns or alarm.since_ns)}  {place}  {alarm.severity.upper()} ({alarm.state}): "
-        f"{alarm.text}{_known(alarm)}"
+        f"{alarm.text}{with_minus_signs(_known(alarm))}"
         for alarm in states.alarms
         if alarm.raised
     )
@@ -83,9 +133,19 @@ def _known(alarm: Alarm) -> str:
     return f": {alarm.note}" if alarm.note else ""
 
 
+def _shown(report: Report) -> tuple[Parameter, ...]:
+    """Parameters of the window, or of the data since a change within it."""
+    verdict = report.verdict
+    return report.parameters if verdict is None or verdict.settled else verdict.current
+
+
+def _found(verdict: Verdict | None) -> bool:
+    return verdict is not None and bool(verdict.detected or verdict.changed)
+
+
 def _verdict(verdict: Verdict) -> str:
     names = ", ".join(finding.name for finding in verdict.changed)
-    text = f"changed: {names or '?'}" if verdict.detected or names else "no change"
+    text = f"changed: {names or '?'}" if _found(verdict) else "no change"
     return f"{text}, outside the model" if verdict.outside_model else text
 
 
@@ -108,5 +168,10 @@ def _parameter(parameter: Parameter) -> str:
 def _change(name: str, change: float | None, standard_error: float | None) -> str:
     if change is None or standard_error is None:
         return f"{name} n/a"
-    # A true minus sign is as wide as the plus sign, so that columns stay put.
-    return f"{name} {100 * change:+5.1f}±{100 * Z95 * standard_error:.1f} %".replace("-", "−")
+    return f"{name} {_percent(change, standard_error)} %"
+
+
+def _percent(change: float | None, standard_error: float | None) -> str:
+    if change is None or standard_error is None:
+        return "n/a"
+    return with_minus_signs(f"{100 * change:+.1f}±{100 * Z95 * standard_error:.1f}".rjust(9))

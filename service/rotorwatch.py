@@ -167,18 +167,28 @@ def router(listen: ListenOption = None, connect: ConnectOption = None, link: Lin
 @app.command()
 def demo(
     fault: Annotated[
-        str, typer.Option("--fault", metavar="NAME", help="What breaks: k_by, c_by, k_bz, c_bz, e; or healthy.")
+        Literal["k_by", "c_by", "k_bz", "c_bz", "e", "none"],
+        typer.Option("--fault", help="What breaks first; with none, the machine stays healthy."),
     ] = "k_by",
     seed: Annotated[int, typer.Option("--seed", min=0, help="Another realisation of all random forces and noise.")] = 1,
     pace: Annotated[float, typer.Option("--pace", min=0.1, max=100, help="Data seconds per second.")] = 10.0,
     once: Annotated[
-        bool, typer.Option("--once", help="End by itself; exit 0 only if exactly the injected parameter was named.")
+        bool,
+        typer.Option("--once", help="End after the first fault; exit 0 only if exactly what was injected was named."),
     ] = False,
     http_port: Annotated[
-        int, typer.Option("--http-port", min=0, max=65535, help="Port of the HTTP API; 0 takes a free one.")
-    ] = 0,
+        int | None,
+        typer.Option(
+            "--http-port",
+            min=0,
+            max=65535,
+            help="Port of the HTTP API. If left out 8080, and 7447 for Zenoh, where they are free; 0 takes free ones.",
+        ),
+    ] = None,
 ) -> None:
     """Show how a fault is found: start a simulated machine and a monitor, break the machine, and watch.
+
+    Then the machine is repaired and something else breaks, until Ctrl-C.
 
     [bold]Example[/bold]
 
@@ -186,9 +196,11 @@ def demo(
     """
     with exit_codes():
         one_blas_thread()
+        typer.echo("starting a simulated machine and a monitor (some seconds) ...")
+        sys.stdout.flush()
         from service.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
 
-        code = run_demo(DemoOptions(scenario=fault, seed=seed, pace=pace, once=once, http_port=http_port))
+        code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
     raise typer.Exit(code)
 
 
