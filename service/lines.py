@@ -140,7 +140,8 @@ def _shown(report: Report) -> tuple[Parameter, ...]:
 
 
 def _found(verdict: Verdict | None) -> bool:
-    return verdict is not None and bool(verdict.detected or verdict.changed)
+    """Whether the machine is said to have changed; that it had, before the data of this window, is no such finding."""
+    return verdict is not None and bool(verdict.changed or (verdict.detected and not verdict.settled))
 
 
 def _verdict(verdict: Verdict) -> str:

@@ -1,5 +1,7 @@
 """``rotorwatch watch`` and ``rotorwatch status``: look at what monitors say."""
 
+import json
+import re
 import ssl
 import sys
 from pathlib import Path
@@ -19,6 +21,8 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
 
 __all__ = ["register"]
 
+_ALARM, _NO_DATA, _NO_ANSWER = 1, 3, 4
+_SUMMARY = {0: "well", _ALARM: "alarm", _NO_DATA: "no-data", _NO_ANSWER: "no-answer"}
 _BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")
 _SILENT = ("shelved", "suppressed", "out-of-service")
 _STYLES = {
@@ -98,20 +102,43 @@ def status(
     ca: Annotated[
         Path | None, typer.Option("--ca", metavar="FILE", help="Authority (PEM) of the API's certificate.")
     ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON document, for another program.")] = False,
 ) -> None:
     """Table of all machines of a running monitor.
 
-    Exit code 0 if every machine is healthy, warming or not evaluable; 1 if
-    any is in alert, danger, outside the model, without data or with a sensor
-    at fault, or if the monitor does not answer. Beneath the table stand the
-    reasons, and alarms kept from operators.
+    Exit code 0: no alarm stands on any machine (healthy, warming, not
+    evaluable). 1: an alarm stands on one. 3: none stands, but the data of one
+    have stopped. 4: the monitor does not answer, or does not let us in. 2: an
+    argument that cannot be used. Beneath the table stand the reasons, and
+    alarms kept from operators.
 
-    [bold]Example[/bold]
+    [bold]Examples[/bold]
 
     [cyan]rotorwatch status || echo "look at the machines"[/cyan]
+
+    [cyan]rotorwatch status --json | jq -r '.machines[] | .machine + " " + .state'[/cyan]
     """
     with exit_codes():
-        healths = _fetch_healths(url.rstrip("/"), token, ca)
+        if not url.startswith(("http://", "https://")):
+            raise MachineFileError(
+                f"--url is {url!r}, expected http:// or https:// before it; did you mean http://{url}?"
+            )
+        healths, code, why = [], _NO_ANSWER, ""
+        try:
+            healths = _fetch_healths(url.rstrip("/"), token, ca)
+            code = max((_exit_code(health) for health in healths), key=(0, _NO_DATA, _ALARM).index, default=0)
+        except MachineFileError:
+            raise
+        except RotorwatchError as error:
+            why = str(error)
+        if as_json:
+            machines = [health.model_dump(mode="json") for health in healths]
+            answer = {"url": url, "summary": _SUMMARY[code], "reason": why, "machines": machines}
+            typer.echo(json.dumps(answer, ensure_ascii=False))
+        if code == _NO_ANSWER:
+            typer.echo(why, err=True)
+        if as_json or code == _NO_ANSWER:
+            raise typer.Exit(code)
         columns = ("state", "window", "raised alarms", "data age", "refused", "gaps")
         table = Table(Column("machine", overflow="fold"), *(Column(name, no_wrap=True) for name in columns))
         remarks: list[str] = []
@@ -132,8 +159,17 @@ def status(
         Console(soft_wrap=True).print(table)
         for remark in remarks:
             typer.echo(remark)
-        if any(health.state in _BAD_STATES or any(one.raised for one in health.alarms) for health in healths):
-            raise typer.Exit(1)
+        raise typer.Exit(code)
+
+
+def _exit_code(health: "Health") -> int:
+    """What a machine alone would make `status` end with: an alarm hides missing data, and never the other way round."""
+    from models.alarm_names import STREAM_LOST  # noqa: PLC0415  # keeps --help quick
+
+    raised = {alarm.name for alarm in health.alarms if alarm.raised}
+    if raised - {STREAM_LOST} or (health.state in _BAD_STATES and health.state != "no-data"):
+        return _ALARM
+    return _NO_DATA if raised or health.stream.silent or health.state == "no-data" else 0
 
 
 class _Lines:
@@ -175,8 +211,6 @@ class _JsonLines:
     """Writes messages as JSON lines."""
 
     def __call__(self, message: "TopicMessage") -> None:
-        import json  # noqa: PLC0415  # only here
-
         sys.stdout.write(f'{{"topic": {json.dumps(message.key)}, "message": {message.text}}}\n')
         sys.stdout.flush()
 
@@ -204,13 +238,15 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
                 f"{url}: {refusal(error.response)}; set ROTORWATCH_TOKEN to a token with the scope read "
                 "(rotorwatch token create)"
             ) from error
-        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
+        answer = f"{error.response.status_code} {error.response.reason_phrase}"
+        raise RotorwatchError(f"{url}: the monitor's HTTP API answers {answer}") from error
     except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
         if "CERTIFICATE_VERIFY_FAILED" in str(error):
             raise RotorwatchError(
                 f"{url}: its certificate is not trusted under this name: {error}; --ca takes the authority (PEM) of a "
                 "certificate of your own, --url the name in it"
             ) from error
-        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {error}") from error
+        why = re.sub(r"\[Errno -?\d+\] ", "", str(error)) or type(error).__name__
+        raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {why}") from error
     except (ValidationError, ValueError, KeyError, TypeError) as error:
         raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor") from error

@@ -12,8 +12,9 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.demo import Outcome
-from tests.service.live import endpoint
+from service.demo import FAULTS, Outcome
+from simulator.scenario import load_scenario
+from tests.service.live import endpoint, until
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,44 +38,135 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
+def demo(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    """A demo whose temporary files would all be in a folder."""
+    folder.mkdir()
+    command = [sys.executable, "-m", "service.rotorwatch", "demo", "--http-port", "0", "--pace", "20", *arguments]
+    environment = os.environ | {"TMPDIR": str(folder), "COLUMNS": "100"}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=environment
+    )
+
+
+def read_until(process: subprocess.Popen[str], *texts: str) -> list[str]:
+    """Lines up to the first that has one of the texts."""
+    lines: list[str] = []
+    assert process.stdout is not None
+    for line in process.stdout:
+        lines.append(line)
+        if any(text in line for text in texts):
+            return lines
+    raise AssertionError(f"{texts} never came:\n{''.join(lines)}")
+
+
+def check_lines(output: str) -> None:
+    """What holds for every line of a demo."""
+    for line in output.splitlines():
+        assert len(line.rstrip()) <= 100
+        assert not ("healthy" in line and "changed" in line)
+        assert not re.search(r"(?<!\S)-\d", line)  # the true minus sign is another one
+        assert "stream lost" not in line
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("fault", "seed"), [("k_by", 101), ("c_by", 102), ("k_bz", 103), ("c_bz", 104), ("e", 105)])
-def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int) -> None:
-    process = start("service.rotorwatch", "demo", "--fault", fault, "--seed", str(seed), "--pace", "20", "--once")
-    output, _ = process.communicate(timeout=600)
+def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int, tmp_path: Path) -> None:
+    process = demo(tmp_path / "tmp", "--fault", fault, "--seed", str(seed), "--once")
+    output, _ = process.communicate(timeout=280)
     assert process.returncode == 0, output
     assert re.search(rf"ALERT: .*\({fault}\) changed by", output)
     assert f"/alarms: {fault} raised" in output
     assert "demo passed" in output
-    assert output.count(" healthy ") >= 10  # one line per window, the healthy stretch among them
+    assert output.count("  healthy\n") >= 10  # one line per window, the healthy stretch among them
+    check_lines(output)
+    assert list((tmp_path / "tmp").iterdir()) == []
 
 
 @pytest.mark.slow
-def test_interrupting_the_demo_leaves_no_process_behind() -> None:
-    process = start("service.rotorwatch", "demo", "--pace", "5")
-    assert process.stdout is not None
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if "warming" in line:
-            break
-    children = children_of(process.pid)
-    assert len(children) == 2, lines  # simulator and monitor
+def test_nothing_is_raised_where_nothing_breaks(tmp_path: Path) -> None:
+    process = demo(tmp_path / "tmp", "--fault", "none", "--once")
+    output, _ = process.communicate(timeout=280)
+    assert process.returncode == 0, output
+    assert "injected nothing; named nothing" in output
+    assert "ALERT" not in output
+    check_lines(output)
+
+
+@pytest.mark.slow
+def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path: Path) -> None:
+    process = demo(tmp_path / "tmp", "--fault", "c_bz")
+    lines = read_until(process, "found")
+    printed = [line.split()[1:] for line in lines if re.match(r"  \S*rotorwatch.* (watch|status) --", line)]
+    assert [command[0] for command in printed] == ["watch", "status"]
+    watch = start("service.rotorwatch", *printed[0])
+    lines += read_until(process, "demo passed", "demo failed")
+    status = start("service.rotorwatch", *printed[1], "--json")
+    shown, _ = status.communicate(timeout=60)
+    assert status.returncode == 1, shown
+    assert [one["name"] for one in json.loads(shown)["machines"][0]["alarms"]] == ["c_bz"]
+    lines += read_until(process, "(e) changed by", "failed")
+    watch.send_signal(signal.SIGINT)
+    watched, _ = watch.communicate(timeout=30)
+    assert "(c_bz) changed by" in watched
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=300)
+    rest, _ = process.communicate(timeout=60)
     assert process.returncode == 130
-    for child in children:
-        with pytest.raises(ProcessLookupError):
-            os.kill(child, 0)
+    output = "".join(lines) + rest
+    check_lines(output)
+    assert output.index("c_bz by −30%") < output.index("demo passed") < output.index("repaired") < output.index("e by")
+    assert list((tmp_path / "tmp").iterdir()) == []
 
 
-def test_an_unknown_fault_is_an_error_with_the_reason() -> None:
-    process = start("service.rotorwatch", "demo", "--fault", "k11", "--once")
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 1
-    assert "the simulator ended with exit code 2" in output
-    assert "k11" in output
-    assert "Traceback" not in output
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "whose", "code"),
+    [
+        (signal.SIGINT, "demo", 130),
+        (signal.SIGTERM, "demo", 130),
+        (signal.SIGKILL, "demo", -signal.SIGKILL),
+        (signal.SIGKILL, "monitor", 1),
+    ],
+)
+def test_however_the_demo_ends_it_leaves_nothing_behind(
+    number: signal.Signals, whose: str, code: int, tmp_path: Path
+) -> None:
+    process = demo(tmp_path / "tmp")
+    read_until(process, "healthy")
+    children = children_of(process.pid)
+    assert len(children) == 2  # simulator and monitor
+    os.kill(process.pid if whose == "demo" else min(children), number)
+    output, _ = process.communicate(timeout=60)
+    assert process.returncode == code, output
+    if whose == "monitor":
+        assert "the monitor was killed (SIGKILL)" in output
+    until(lambda: not [child for child in children if Path(f"/proc/{child}").exists()], "the end of both", 60)
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:
+    code = (
+        "import sys\nfrom service.rotorwatch import app\n"
+        "class Told:\n"
+        "    def write(self, text):\n"
+        "        heavy = {'numpy', 'zenoh', 'pydantic_core'} & set(sys.modules)\n"
+        "        sys.__stdout__.write(f'{text.strip()} {sorted(heavy)}')\n"
+        "        sys.__stdout__.flush()\n"
+        "        sys.exit(0)\n"
+        "    def flush(self): pass\n"
+        "sys.stdout = Told()\napp(['demo'])"
+    )
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, timeout=60, check=True
+    )
+    assert found.stdout.startswith("starting ")
+    assert "numpy" not in found.stdout
+    assert "zenoh" not in found.stdout
+
+
+def test_the_demo_breaks_what_the_shipped_scenarios_break() -> None:
+    for name, change in FAULTS.items():
+        events = load_scenario(name)[0].events
+        assert [(event.parameter, event.relative_change) for event in events] == [(name, change)]
 
 
 @pytest.mark.slow

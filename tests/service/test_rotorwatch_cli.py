@@ -149,8 +149,11 @@ def test_watch_and_status_without_a_monitor_say_so() -> None:
     assert f"connect {address}" in found.stderr
     assert "nobody answers" in found.stderr
     url = f"http://{address.removeprefix('tcp/')}"
-    found = run("status", "--url", url)
-    assert found.returncode == 1
+    found = run("status", "--url", url, "--json")
+    assert found.returncode == 4
+    said = json.loads(found.stdout)
+    assert (said["summary"], said["machines"]) == ("no-answer", [])
+    assert f"{url}: the monitor's HTTP API does not answer" in said["reason"]
     assert f"{url}: the monitor's HTTP API does not answer" in found.stderr
 
 
@@ -183,10 +186,11 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
         assert "warming" in calm.stdout
         until(lambda: "state is warming" in text.output() and "/health" in lines.output(), "watchers at work")
         send(address, scenario_blocks(77.0, parse_fault("k_bz=-0.3@0")), worker.machine)
-        text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by -")
+        text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by −")
         until(lambda: "org.rotorwatch.alarm.raised" in lines.output(), "alarm event as JSON")
         until(lambda: "00:01:12  demo/lab  alert" in text.output(), "line of the last window")
-        assert "00:01:02  demo/lab  healthy        k_by " in text.output()
+        assert "00:01:02  demo/lab  " in text.output()
+        assert not [line for line in text.output().splitlines() if "healthy" in line and "changed: " in line]
 
         late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)
         with late as joined:
@@ -195,6 +199,9 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
         found = run("status", "--url", runtime.http_url)
         assert found.returncode == 1
         assert "k_bz alert" in found.stdout
+        machine = json.loads(run("status", "--url", runtime.http_url, "--json").stdout)["machines"][0]
+        Health.model_validate(machine)
+        assert [(one["name"], one["raised"]) for one in machine["alarms"]] == [("k_bz", True)]
         assert text.stop(signal.SIGINT) == 0
         assert lines.stop() == 0
         records = [json.loads(line) for line in lines.output().splitlines()]
