@@ -32,12 +32,15 @@ class RunSummary:
         Seconds since the first block.
     truth : TruthRecord or None
         The latest one.
+    heard : bool or None
+        Whether somebody subscribes to the stream; None as long as it is not known, and for a recording.
     """
 
     blocks: int = 0
     data_s: float = 0.0
     elapsed_s: float = 0.0
     truth: TruthRecord | None = None
+    heard: bool | None = None
 
     @property
     def pace(self) -> float:

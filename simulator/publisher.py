@@ -42,6 +42,7 @@ _CACHE_BLOCKS = 300
 _CACHE_TRUTH = 100
 _HEARTBEAT_S = 0.5
 _POLL_S = 0.02
+_HEARD_S = 1.0
 _BLOCKED_US = 20_000_000
 
 
@@ -115,7 +116,10 @@ def publish(
         if settings.wait_for_subscriber_s is not None:
             _wait_for_subscriber(session, machine.keys, settings, stop)
         outlets.descriptor.put(descriptor_payload(machine))
-        summary = _send(outlets, machine, stream, settings, stop, on_block)
+        # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
+        probe = session.declare_publisher(machine.keys.stream)
+        summary = _send(outlets, probe, machine, stream, settings, stop, on_block)
+        probe.undeclare()  # type: ignore[no-untyped-call]
         if not stop.is_set():
             if settings.pace is None:
                 _drain(session, machine.keys, settings.drain_s)
@@ -221,6 +225,7 @@ def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, settings: Pu
 
 def _send(
     outlets: _Outlets,
+    probe: zenoh.Publisher,
     machine: MachineFile,
     stream: BlockStream,
     settings: PublishSettings,
@@ -231,6 +236,7 @@ def _send(
     summary = RunSummary()
     first_ns: int | None = None
     begin = time.monotonic()
+    look_s, heard = _HEARD_S, None
     for block, truth in stream:
         first_ns = block.start_ns if first_ns is None else first_ns
         data_s = (block.end_ns - first_ns) / 1e9
@@ -242,11 +248,15 @@ def _send(
         for entry in truth:
             outlets.truth.put(entry.model_dump_json())
         outlets.stream.put(payload, attachment=attachment or None, encoding=encoding)
+        elapsed_s = time.monotonic() - begin
+        if elapsed_s >= look_s:
+            look_s, heard = elapsed_s + _HEARD_S, bool(probe.matching_status.matching)  # type: ignore[attr-defined]  # the stub says bool
         summary = RunSummary(
             blocks=summary.blocks + 1,
             data_s=data_s,
-            elapsed_s=time.monotonic() - begin,
+            elapsed_s=elapsed_s,
             truth=truth[-1] if truth else summary.truth,
+            heard=heard,
         )
         if on_block is not None:
             on_block(summary)

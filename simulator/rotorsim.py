@@ -28,6 +28,9 @@ if TYPE_CHECKING:  # the stream imports scipy, which --help must not wait for
 
 __all__ = ["app"]
 
+_FIRST_LINE_S = 2.0
+_LINE_S = 10.0
+
 app = typer.Typer(
     name="rotorsim",
     cls=Commands,
@@ -151,7 +154,7 @@ def publish(
             linger_s=linger_s,
         )
         number = int(time.time()) % 65535 + 1 if run is None else run
-        with _stop_on_signal() as stop, _progress(loaded.duration_s) as on_block:
+        with _stop_on_signal() as stop, _progress(loaded.duration_s, rig.keys.stream) as on_block:
             stream = _stream(loaded, rig, block_s, start_ns, number)
             summary = publish_stream(rig, stream, settings, stop=stop, on_block=on_block)
         typer.echo(f"published {summary.blocks} blocks, {summary.data_s:.1f} s of data, on {rig.keys.stream}")
@@ -193,7 +196,7 @@ def record(
                 raise MachineFileError(f"{existing}: exists already; --overwrite replaces it")
         from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
 
-        with _stop_on_signal() as stop, _progress(loaded.duration_s) as on_block:
+        with _stop_on_signal() as stop, _progress(loaded.duration_s, "") as on_block:
             stream = _stream(loaded, rig, block_s, start_ns, run)
             summary = record_stream(
                 rig, stream, output, encoding=encoding.value, overwrite=overwrite, stop=stop, on_block=on_block
@@ -283,28 +286,48 @@ def _stop_on_signal() -> Iterator[threading.Event]:
 
 
 class _ProgressLine:
-    """Data time, pace and current truth, on a terminal only."""
+    """Data time, pace and current truth, as a bar on a terminal and as lines elsewhere; and whether anybody listens."""
 
-    def __init__(self, progress: Progress, duration_s: float) -> None:
-        self._progress = progress
+    def __init__(self, progress: Progress, duration_s: float, key: str) -> None:
+        self._progress, self._duration_s, self._key = progress, duration_s, key
         self._task = progress.add_task("", total=duration_s, pace=0.0, truth="")
+        self._heard: bool | None = True
+        self._next_s = _FIRST_LINE_S
 
     def __call__(self, summary: "RunSummary") -> None:
-        truth = "" if summary.truth is None else escape(summary.truth.text)
-        self._progress.update(self._task, completed=summary.data_s, pace=summary.pace, truth=truth)
+        truth = "" if summary.truth is None else summary.truth.text
+        self._progress.update(self._task, completed=summary.data_s, pace=summary.pace, truth=escape(truth))
+        if summary.heard is not None and summary.heard != self._heard:
+            self._heard = summary.heard
+            self._say(
+                f"somebody listens to {self._key} now"
+                if summary.heard
+                else f"nobody listens to {self._key}: is a monitor running (rotorwatch run), and is it at the address "
+                "given by --connect?"
+            )
+        if self._progress.disable and summary.elapsed_s >= self._next_s:
+            self._next_s = summary.elapsed_s + _LINE_S
+            done = f"{summary.data_s:.1f} of {self._duration_s:.1f} s of data"
+            self._say(f"{done}, {summary.pace:.1f} x real time, {truth}")
+
+    def _say(self, text: str) -> None:
+        if self._progress.disable:
+            typer.echo(text, err=True)
+        else:
+            self._progress.console.print(text, style="yellow", markup=False, highlight=False)
 
 
 @contextmanager
-def _progress(duration_s: float) -> Iterator[_ProgressLine]:
+def _progress(duration_s: float, key: str) -> Iterator[_ProgressLine]:
     console = Console(stderr=True)
     columns = (
-        BarColumn(),
+        BarColumn(bar_width=20),
         TextColumn("{task.completed:.1f} / {task.total:.1f} s"),
         TextColumn("{task.fields[pace]:.1f} x real time"),
         TextColumn("{task.fields[truth]}"),
     )
     with Progress(*columns, console=console, disable=not console.is_terminal, refresh_per_second=5) as progress:
-        yield _ProgressLine(progress, duration_s)
+        yield _ProgressLine(progress, duration_s, key)
 
 
 if __name__ == "__main__":

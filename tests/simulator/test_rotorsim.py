@@ -167,3 +167,20 @@ def test_a_signal_ends_publishing_cleanly(number: signal.Signals) -> None:
     assert out.startswith("published ")
     assert out.endswith("s of data, on rotorwatch/demo/lab/stream\n")
     assert len(out.splitlines()) == 1
+
+
+@pytest.mark.parametrize("listened", [True, False])
+def test_publishing_shows_how_far_it_is_and_whether_anybody_listens(listened: bool) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        where = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    config = zenoh.Config()
+    for name, value in (("listen/endpoints", f'["{where}"]'), ("scouting/multicast/enabled", "false")):
+        config.insert_json5(name, value)
+    with zenoh.open(config) as session:
+        if listened:
+            session.declare_subscriber("rotorwatch/demo/lab/stream", lambda _: None)
+        result = _run("publish", "healthy", "--duration", 4, "--connect", where, "--linger", 0)
+    assert result.exit_code == 0, result.output
+    assert "of 4.0 s of data" in result.stderr
+    assert ("nobody listens to rotorwatch/demo/lab/stream" in result.stderr) is not listened

@@ -1,5 +1,6 @@
 """`rotortrain` as a program: training, evaluation, messages, and what start-up imports."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,8 @@ from models.machine import load_machine
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluate_command import read_summaries
 from simulator.campaigns.evaluation_cells import Topic
+
+ROOT = Path(__file__).parents[2]
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -70,3 +73,27 @@ def test_help_needs_neither_torch_nor_scipy_nor_numpy(command: str) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("train", "--machine", "lab", "--out", "bundle"),
+        ("commission", "--machine", "lab", "--healthy", "healthy.mcap", "--out", "bundle"),
+    ],
+)
+def test_what_needs_training_says_what_to_install(command: tuple[str, ...], tmp_path: Path) -> None:
+    """As after an installation without extras, where there is no torch."""
+    (tmp_path / "healthy.mcap").touch()
+    code = (
+        "import sys\n"
+        "for name in ('torch', 'matplotlib', 'jinja2'):\n    sys.modules[name] = None\n"
+        "from simulator.rotortrain import app\napp(sys.argv[1:])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *command],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "pip install 'rotorwatch[train]'" in done.stderr
+    assert len(done.stderr.splitlines()) < 4
