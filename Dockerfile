@@ -1,4 +1,4 @@
-# One image for all programs. Training needs torch, which is not in it.
+# One image for all programs. rotortrain (training, commissioning) needs the extra "train", which is not in it.
 FROM python:3.11.13-slim-bookworm AS build
 ENV PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
 WORKDIR /src

@@ -1,4 +1,4 @@
-# make demo    set everything up and run the demo (FAULT=c_by ONCE=1 SEED=7 PACE=20)
+# make demo    set everything up and run the demo (FAULT=c_by, or none; ONCE=1 SEED=7 PACE=20)
 # make test    set everything up and run all checks
 # make format  let ruff put the code in order
 # make wheels  build both wheels into dist/, and run the demo out of the wheel under every Python there is here

@@ -20,6 +20,7 @@ app = typer.Typer(
     help="Train the networks of a machine from its machine file, and evaluate them on windows they never saw.",
     no_args_is_help=True,
     add_completion=False,
+    pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
 

@@ -87,7 +87,11 @@ def test_what_needs_training_says_what_to_install(command: tuple[str, ...], tmp_
     (tmp_path / "healthy.mcap").touch()
     code = (
         "import sys\n"
-        "for name in ('torch', 'matplotlib', 'jinja2'):\n    sys.modules[name] = None\n"
+        "class Absent:\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if name.partition('.')[0] in {'torch', 'matplotlib', 'jinja2'}:\n"
+        "            raise ModuleNotFoundError(name, name=name)\n"
+        "sys.meta_path.insert(0, Absent())\n"
         "from simulator.rotortrain import app\napp(sys.argv[1:])"
     )
     done = subprocess.run(
