@@ -362,14 +362,8 @@ class Linked:
         self._link.close()
 
 
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        (LinkSettings(listen=("tcp/nowhere",)), "listen tcp/nowhere"),
-        (LinkSettings(listen=("pigeon/127.0.0.1:1",)), "listen pigeon/127.0.0.1:1"),
-    ],
-)
-def test_unusable_endpoint_is_named(settings: LinkSettings, named: str) -> None:
+def test_unusable_endpoint_is_named() -> None:
+    settings, named = LinkSettings(listen=("tcp/192.0.2.1:1",)), "listen tcp/192.0.2.1:1"  # not of this computer
     with pytest.raises(LinkError) as caught:
         Link(settings)
     assert named in str(caught.value)

@@ -234,7 +234,7 @@ def test_pace_follows_the_data_time(loaded: tuple[Scenario, Machine], endpoint: 
 
 def test_a_malformed_endpoint_is_named(loaded: tuple[Scenario, Machine]) -> None:
     scenario, machine = loaded
-    settings = PublishSettings(LinkSettings(connect=("nowhere",)))
+    settings = PublishSettings(LinkSettings().model_copy(update={"connect": ("nowhere",)}))
     with pytest.raises(MachineFileError, match="connect: 'nowhere'"):
         publish(machine, blocks(scenario, machine), settings)
 
