@@ -5,7 +5,15 @@ from pydantic import ValidationError
 from models.machine import MachineFile
 from models.signals.channels import ChannelDescriptor
 
-__all__ = ["descriptor_mismatch"]
+__all__ = ["MOST_BYTES", "MOST_DIFFERENCES", "descriptor_mismatch"]
+
+MOST_BYTES = 65_536
+"""Of an announced descriptor that is read at all; one of 64 channels takes a tenth of it."""
+
+MOST_DIFFERENCES = 20
+"""That are stated one by one."""
+
+_LONGEST = 80
 
 
 def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ...]:
@@ -21,16 +29,26 @@ def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ..
     Returns
     -------
     tuple of str
-        Empty if they agree; else each names the field, the value found and the value expected.
+        Empty if they agree; else each names the field, the value found and the value expected, the first
+        `MOST_DIFFERENCES` of them.
     """
+    if len(announced) > MOST_BYTES:
+        return (f"descriptor has {len(announced)} bytes, expected at most {MOST_BYTES}",)
+    differences = _differences(announced, machine)
+    more = len(differences) - MOST_DIFFERENCES
+    return (*differences[:MOST_DIFFERENCES], *([f"and {more} more differences"] if more > 0 else ()))
+
+
+def _differences(announced: bytes, machine: MachineFile) -> list[str]:
     try:
         found = ChannelDescriptor.model_validate_json(announced)
     except ValidationError as error:
-        faults = (f"{'.'.join(str(part) for part in f['loc']) or 'descriptor'}: {f['msg']}" for f in error.errors())
-        return tuple(f"descriptor cannot be read: {fault}" for fault in faults)
+        faults = error.errors(include_url=False, include_context=False, include_input=False)
+        said = (f"{'.'.join(map(str, fault['loc'])) or 'descriptor'}: {fault['msg']}" for fault in faults)
+        return [f"descriptor cannot be read: {one[: 2 * _LONGEST]}" for one in said]
     expected = machine.descriptor
     differences = [
-        f"{field} is {getattr(found, field)!r}, expected {getattr(expected, field)!r}"
+        f"{field} is {_shown(getattr(found, field))}, expected {getattr(expected, field)!r}"
         for field in ("site", "machine", "rate_hz", "dtype")
         if getattr(found, field) != getattr(expected, field)
     ]
@@ -40,5 +58,10 @@ def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ..
         for field in ("name", "quantity", "location", "direction", "unit"):
             is_, should = str(getattr(theirs, field)), str(getattr(ours, field))
             if is_ != should:
-                differences.append(f"channels.{number}.{field} ({ours.name}) is {is_!r}, expected {should!r}")
-    return tuple(differences)
+                differences.append(f"channels.{number}.{field} ({ours.name}) is {_shown(is_)}, expected {should!r}")
+    return differences
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"

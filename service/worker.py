@@ -37,6 +37,7 @@ _OPERATION_S = 10.0
 _HELD_UP_S = 2.0
 """Time passes in steps of a fraction of this; if not, the program itself stood still."""
 _LATEST = 100
+_LONGEST_ERROR = 500
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +224,7 @@ class MachineWorker:
         """Compare an announced channel descriptor with the machine file."""
         mismatch = descriptor_mismatch(announced, self.machine)
         if mismatch and mismatch != self._mismatch:
-            self._log.warning("the publisher's channel descriptor differs from the machine file", differences=mismatch)
+            self._warn("descriptor", "the publisher's channel descriptor differs from the file", differences=mismatch)
         self._mismatch = mismatch
 
     def health(self) -> Health:
@@ -370,7 +371,7 @@ class MachineWorker:
 
     def _failed(self, error: Exception) -> None:
         self.errors += 1
-        self.last_error = f"{type(error).__name__}: {error}"
+        self.last_error = f"{type(error).__name__}: {error}"[:_LONGEST_ERROR]
         if (withheld := self._limiter.admit("error")) is not None:
             self._log.error("something was lost to an error in the monitor", withheld=withheld, exc_info=error)
 

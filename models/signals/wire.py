@@ -25,7 +25,7 @@ _DTYPES: dict[int, np.dtype[np.float32] | np.dtype[np.float64]] = {1: np.dtype("
 _DTYPE_CODES = {"f4": 1, "f8": 2}
 _MAX_SAMPLES, _MAX_CHANNELS = 1_000_000, 255
 _SLOWEST_HZ, _FASTEST_HZ = 1e-3, 1e6
-_LONGEST_NUMBER = 32
+_LONGEST_TEXT = 32
 _ARROW_FIELDS = ("start_ns", "sequence", "rate_hz", "run")
 
 
@@ -76,11 +76,12 @@ def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[Samp
         If the bytes do not make a block; the message names the field.
     """
     kind, _, schema_hash = encoding.partition(";")
+    schema_hash = schema_hash[:_LONGEST_TEXT]
     if kind == BLOCK_ENCODING:
         return _decode_raw(payload, attachment), schema_hash
     if kind == ARROW_ENCODING:
         return _decode_arrow(payload), schema_hash
-    raise WireError(f"encoding {encoding!r} is not {BLOCK_ENCODING!r} or {ARROW_ENCODING!r}")
+    raise WireError(f"encoding {encoding[:_LONGEST_TEXT]!r} is not {BLOCK_ENCODING!r} or {ARROW_ENCODING!r}")
 
 
 def _decode_raw(payload: bytes, attachment: bytes) -> SampleBlock:
@@ -106,7 +107,7 @@ def _decode_arrow(payload: bytes) -> SampleBlock:
 
 
 def _metadata_number(metadata: Mapping[str, bytes], field: str) -> Any:
-    text = metadata.get(field, b"")[:_LONGEST_NUMBER].decode("ascii", "replace")
+    text = metadata.get(field, b"")[:_LONGEST_TEXT].decode("ascii", "replace")
     try:
         return float(text) if field == "rate_hz" else int(text)
     except ValueError as error:
