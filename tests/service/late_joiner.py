@@ -28,7 +28,7 @@ def say(what: object) -> None:
 
 
 def followers(connect: str, path: str) -> None:
-    """Start followers on request; forked, because a hundred fresh interpreters would take minutes."""
+    """Start followers on request; forked, because so many fresh interpreters would take minutes."""
     children: list[int] = []
     for line in sys.stdin:
         if line.strip() == "start":

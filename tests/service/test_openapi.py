@@ -305,7 +305,7 @@ def test_requests_made_up_out_of_the_description(runtime: Runtime, description: 
         assert isinstance(found, Ok)
         operation = found.ok()
         known = {one.name: VALUES[one.name] for one in operation.path_parameters if one.name in VALUES} or None
-        for mode, share in ((POSITIVE, 24), (NEGATIVE, 12)):
+        for mode, share in ((POSITIVE, 12), (NEGATIVE, 6)):
             for fixed in [known, None] if known else [None]:
                 cases = CASES or (share if fixed == known else share // 6)
                 for label, status in made_up(operation, mode, fixed, cases, runtime.http_url, text):

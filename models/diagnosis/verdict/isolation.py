@@ -16,6 +16,7 @@ from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import ndtr
 
 from models.diagnosis.readings import Diagnosis, ParameterReading
@@ -138,6 +139,12 @@ def _sets(n: int) -> tuple[tuple[int, ...], ...]:
     return tuple(A for size in range(n + 1) for A in combinations(range(n), size))
 
 
+@lru_cache
+def _of_size(sets: tuple[tuple[int, ...], ...], size: int) -> npt.NDArray[np.intp]:
+    """Sets of one size, shape (n_sets, size)."""
+    return np.array([A for A in sets if len(A) == size])
+
+
 def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) -> FloatArray:
     """What each set explains, b_A' J_AA⁻¹ b_A; sets of one size are solved in one go."""
     explained = np.zeros(len(sets))
@@ -145,7 +152,7 @@ def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) 
     J, b = J * np.outer(scale, scale), b * scale
     at = 1
     for size in range(1, J.shape[0] + 1):
-        index = np.array([A for A in sets if len(A) == size])
+        index = _of_size(sets, size)
         own = b[index]
         solved = np.linalg.solve(J[index[:, :, None], index[:, None, :]], own[:, :, None])[:, :, 0]
         explained[at : at + len(index)] = np.sum(own * solved, axis=1)

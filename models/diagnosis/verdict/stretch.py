@@ -11,6 +11,7 @@ the information and comes in when a stretch is looked at (`Stretch.complete`).
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -42,7 +43,7 @@ def slope(name: str, value: float) -> float:
     return 1.0 if name in _LINEAR else math.exp(value)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # without slots: what is worked out is kept
 class Stretch:
     """What a stretch of data says.
 
@@ -67,10 +68,10 @@ class Stretch:
     misfit_z: float | None = None
     common: FloatArray | None = None
 
-    @property
+    @cached_property
     def known(self) -> tuple[int, ...]:
         """Indices into `PARAMETERS` of what was evaluable."""
-        return tuple(int(i) for i in np.flatnonzero(np.diag(self.information) > 0))
+        return tuple(int(i) for i in np.flatnonzero(self.information.diagonal() > 0))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -84,6 +85,10 @@ class Stretch:
 
     def estimate(self) -> tuple[FloatArray, FloatArray]:
         """Values of `names` in the scale of their errors, shape (m,), and their covariance, shape (m, m)."""
+        return self._estimate
+
+    @cached_property
+    def _estimate(self) -> tuple[FloatArray, FloatArray]:
         known = list(self.known)
         covariance = np.linalg.inv(self.information[np.ix_(known, known)])
         covariance = (covariance + covariance.T) / 2
