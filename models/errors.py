@@ -9,6 +9,7 @@
     ├── CheckpointError       what a monitor remembered cannot be restored
     ├── RecordingError        a recording cannot be read or written
     └── EstimationError       a window cannot be evaluated (never raised for "nothing found")
+        └── UnexplainedError  because nothing within the model comes near it
 
 Expected trouble in a live stream (a gap, a duplicate, a NaN) is a value, not an exception: see ``models.ingest``.
 """
@@ -20,6 +21,7 @@ __all__ = [
     "MachineFileError",
     "RecordingError",
     "RotorwatchError",
+    "UnexplainedError",
     "WireError",
 ]
 
@@ -50,3 +52,7 @@ class RecordingError(RotorwatchError):
 
 class EstimationError(RotorwatchError):
     """A window's statistics do not allow an estimate."""
+
+
+class UnexplainedError(EstimationError):
+    """Nothing within the model comes near a window: a fault of a sensor, or something that no parameter describes."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from models.alarm_names import alarm_text
-from models.diagnosis.readings import Z95
+from models.diagnosis.readings import interval_95
 from rotorwatch import __version__
 from rotorwatch.records.alarms import Alarm as AlarmJson
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
@@ -138,7 +138,7 @@ def _alarm(alarm: Alarm) -> AlarmJson:
 
 def _interval(alarm: Alarm) -> tuple[float, float] | None:
     change, error = finite(alarm.change), finite(alarm.standard_error)
-    return None if change is None or error is None else (change - Z95 * error, change + Z95 * error)
+    return None if change is None or error is None else interval_95(change, error, least=-1.0)
 
 
 def _evidence(evidence: Evidence | None) -> EvidenceJson | None:

@@ -5,8 +5,9 @@ import json
 from collections.abc import Iterable
 
 from models.diagnosis.fallback.shape import ChannelShape
-from models.diagnosis.readings import EquationReading, ParameterReading
+from models.diagnosis.readings import EquationReading, ParameterReading, interval_95
 from models.diagnosis.sensors.finding import SensorFinding
+from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.diagnosis.verdict.detectable import DetectableChange, length_to_find
 from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.machine import MachineFile
@@ -18,6 +19,7 @@ from rotorwatch.records.windows import Detectable, Finding, SensorFault, Shape, 
 from rotorwatch.records.windows import Equation as EquationJson
 from rotorwatch.records.windows import Opinion as OpinionJson
 from rotorwatch.records.windows import Parameter as ParameterJson
+from rotorwatch.records.windows import UnbalanceVector as VectorJson
 from service.alarm_conversion import Identity, alarm_entries, finite, rfc3339
 from service.reports import DataQuality, MachineHealth, WindowReport
 from service.residuals import Opinion
@@ -171,6 +173,21 @@ def _parameter(reading: ParameterReading) -> ParameterJson:
         interval_95=reading.interval if known else None,
         z=finite(reading.z) if known and error else None,
         reason=reading.reason,
+        vector=None if reading.vector is None else _vector(reading.vector),
+    )
+
+
+def _vector(vector: UnbalanceVector) -> VectorJson:
+    turned, turned_error = vector.turned_deg, vector.turned_error_deg
+    return VectorJson(
+        magnitude_change=vector.magnitude_change,
+        magnitude_interval_95=interval_95(vector.magnitude_change, vector.magnitude_error, least=-1.0),
+        turned_deg=turned,
+        turned_interval_95_deg=None if turned is None or turned_error is None else interval_95(turned, turned_error),
+        change=vector.change,
+        change_interval_95=interval_95(vector.change, vector.change_error, least=0.0),
+        change_angle_deg=vector.change_angle_deg,
+        text=vector.sentence,
     )
 
 

@@ -21,7 +21,7 @@ from models.arrivals import Arrivals, Arrived
 from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
 from models.commissioning.installed import Installed
 from models.diagnosis.moments import HopMoments, plan_for
-from models.diagnosis.readings import Diagnosis
+from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.verdict.detectable import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
@@ -417,6 +417,10 @@ class MachineMonitor:
         verdict = self._test.update(looks)
         changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
         self._alarm(verdict, evaluation.deciding.suspect, end_ns)
+        parameters = evaluation.deciding.parameters
+        unexplained = evaluation.deciding.unexplained
+        if unexplained:
+            parameters = tuple(ParameterReading(one.name, one.by, reason=unexplained) for one in parameters)
         if evaluation.shapes:
             evidence = Evidence(statistics.start_ns, end_ns)
             self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
@@ -427,16 +431,18 @@ class MachineMonitor:
             state=self._state(_calm_state(evaluation, outside=outside)),
             filled=filled,
             speed_rad_s=evaluation.speed_rad_s,
-            parameters=evaluation.deciding.parameters,
+            parameters=parameters,
             equations=evaluation.equations,
             opinions=evaluation.opinions,
             misfit_z=evaluation.deciding.misfit_z,
-            suspect=evaluation.deciding.suspect if outside else "",
+            suspect=evaluation.deciding.suspect if outside and not unexplained else "",
             verdict=verdict,
-            detectable=detectable_changes(
+            detectable=()
+            if unexplained
+            else detectable_changes(
                 looks[whole].complete(), self._test.thresholds(whole), self.machine.window.length_s
             ),
-            reason="" if evaluation.deciding.evaluable else _why_nothing(evaluation.deciding),
+            reason=unexplained or ("" if evaluation.deciding.evaluable else _why_nothing(evaluation.deciding)),
             shapes=evaluation.shapes,
         )
 
@@ -454,9 +460,10 @@ class MachineMonitor:
                     named=reading.name in named,
                     low_confidence=verdict.isolation.outside,
                     evidence=evidence,
+                    note="" if reading.vector is None else reading.vector.sentence,
                 )
-        if verdict.current:
-            note = f"best explained by: {suspect}" if suspect else ""
+        if verdict.current or verdict.unexplained:
+            note = verdict.unexplained or (f"best explained by: {suspect}" if suspect else "")
             outside = verdict.isolation.outside
             self._alarms.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
@@ -474,8 +481,10 @@ class MachineMonitor:
 
 def _calm_state(evaluation: Evaluation, *, outside: bool) -> HealthState:
     """What a machine without raised alarms is: healthy only if something was read that could have said otherwise."""
+    if outside:
+        return HealthState.OUTSIDE_MODEL
     if evaluation.deciding.evaluable:
-        return HealthState.OUTSIDE_MODEL if outside else HealthState.HEALTHY
+        return HealthState.HEALTHY
     states = {shape.state for shape in evaluation.shapes}
     if "not changed" in states and "changed" not in states:
         return HealthState.UNCHANGED

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from scipy.special import ndtr
 
-from models.checkpoint import prefixed, unprefixed
+from models.checkpoint import checked, prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, IdentifiedRecord
 from models.commissioning.installed import Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
@@ -29,14 +29,14 @@ from models.diagnosis.verdict.calibration import month_thresholds
 from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.window import WindowStatistics
-from models.errors import BundleError, CheckpointError, EstimationError
+from models.errors import BundleError, CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine, MachineFile
 from models.physics.parameters import PARAMETERS
 from models.signals.channels import Channel, with_channel_names
 
 __all__ = ["Evaluation", "Opinion", "WindowEvaluator", "evaluator_for"]
 
-_LIKELIHOOD, _SHAPE = "likelihood", "shape"
+_LIKELIHOOD, _SHAPE, _EXPLAINED = "likelihood", "shape", "explained_ns"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))
 _STEADY = 0.15
@@ -176,6 +176,7 @@ class KnownMachineEvaluator:
         self._likelihood = LengthFits(machine)
         self._shared = None if identified is None else identified.matrix()
         self._has_networks = bundle is not None
+        self._explained_ns: int | None = None
         others: list[Diagnostician] = []
         if bundle is not None and bundle.amortised is not None:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
@@ -200,7 +201,18 @@ class KnownMachineEvaluator:
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`."""
         speed = self._speed(window)
-        deciding = self._decide(window, self._likelihood.window)
+        try:
+            deciding = self._decide(window, self._likelihood.window)
+        except UnexplainedError as error:
+            reason = str(error)
+            nothing = tuple(ParameterReading(name, self.by, reason=reason) for name in PARAMETERS)
+            deciding = Diagnosis(self.by, nothing, covariance=_EMPTY, unexplained=reason)
+        if deciding.unexplained:
+            # One machine or two in this window? If some of its data were explained, the shortest stretch says.
+            straddles = self._explained_ns is not None and window.start_ns < self._explained_ns
+            short = dict(sorted(short.items())[: int(straddles)])
+        else:
+            self._explained_ns = window.end_ns
         evaluated = {}
         for hops, statistics in short.items():
             try:
@@ -220,12 +232,15 @@ class KnownMachineEvaluator:
         return Evaluation(deciding, evaluated, equations, tuple(opinions), speed)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Where the likelihood's maximum is followed from; networks remember nothing."""
-        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint())
+        """Where the likelihood's maximum is followed from, and what was explained; networks remember nothing."""
+        explained = np.array([] if self._explained_ns is None else [self._explained_ns], dtype=np.int64)
+        return prefixed(_LIKELIHOOD, self._likelihood.checkpoint()) | {_EXPLAINED: explained}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        explained = checked(arrays, _EXPLAINED, np.int64, (None,)).tolist()
         self._likelihood.restore(unprefixed(_LIKELIHOOD, arrays))
+        self._explained_ns = next(iter(explained), None)
 
     def _speed(self, window: WindowStatistics) -> float | None:
         """Mean speed, if it is one that is evaluated."""

@@ -1,17 +1,27 @@
 """What a diagnostician says about a window: readings of parameters and of equations, or why there are none."""
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
+from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.diagnosis.window import WindowStatistics
+from models.physics.parameters import QUANTITY
+from models.physics.possible import impossible
 from models.signals.block import FloatArray
 
-__all__ = ["Z95", "Diagnosis", "Diagnostician", "EquationReading", "ParameterReading"]
+__all__ = ["Z95", "Diagnosis", "Diagnostician", "EquationReading", "ParameterReading", "interval_95"]
 
 Z95 = 1.959964
 """Standard errors on either side of a 95 % interval."""
+
+
+def interval_95(value: float, standard_error: float, least: float = -math.inf) -> tuple[float, float]:
+    """95 % interval of a value that cannot be less than `least`."""
+    half = Z95 * standard_error
+    return max(least, value - half), value + half
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +38,9 @@ class ParameterReading:
         Relative change from nominal and its standard error; None if not evaluable.
     reason : str
         Why it could not be evaluated; empty if it was.
+    vector : UnbalanceVector or None
+        Of e, where there is a phase reference: size and direction. `change` is then that of the size as long as the
+        heavy spot stays where it is, and the size of the vector of change once it has turned.
     """
 
     name: str
@@ -35,13 +48,22 @@ class ParameterReading:
     change: float | None = None
     standard_error: float | None = None
     reason: str = ""
+    vector: UnbalanceVector | None = None
+
+    @classmethod
+    def of(
+        cls, name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
+    ) -> "ParameterReading":
+        """A reading, or the reason why the number is none: physics does not allow it."""
+        reason = impossible(change, QUANTITY[name])
+        return cls(name, by, reason=reason) if reason else cls(name, by, change, standard_error, vector=vector)
 
     @property
     def interval(self) -> tuple[float, float] | None:
         """95 % interval of the change."""
         if self.change is None or self.standard_error is None:
             return None
-        return self.change - Z95 * self.standard_error, self.change + Z95 * self.standard_error
+        return interval_95(self.change, self.standard_error, least=-1.0)
 
     @property
     def z(self) -> float | None:
@@ -109,6 +131,9 @@ class Diagnosis:
     suspect : str
         What explains the misfit best, if one thing does: a sensor's gain, a mass, a shaft unequal in y and z; empty if
         nothing stands out or there is no such test.
+    unexplained : str
+        Why nothing that is read here should be believed: the window is so far from all the model can explain that
+        parameters fitted to it mean nothing. Empty where the model explains it, however significant a misfit is.
     steps : int
         Search steps it took (0 where there is no search).
     """
@@ -120,6 +145,7 @@ class Diagnosis:
     common: FloatArray | None = None
     misfit_z: float | None = None
     suspect: str = ""
+    unexplained: str = ""
     steps: int = 0
 
     @property

@@ -6,7 +6,7 @@ from types import MappingProxyType
 
 from pydantic import BaseModel, ConfigDict, Field
 
-__all__ = ["FAULT_FIELDS", "PARAMETERS", "PARAMETER_TEXT", "KnownRotor", "RotorParameters", "changed"]
+__all__ = ["FAULT_FIELDS", "PARAMETERS", "PARAMETER_TEXT", "QUANTITY", "KnownRotor", "RotorParameters", "changed"]
 
 
 class KnownRotor(BaseModel):
@@ -85,6 +85,18 @@ PARAMETER_TEXT: Mapping[str, str] = MappingProxyType(
     }
 )
 """Each parameter in a vibration engineer's words."""
+
+QUANTITY: Mapping[str, str] = MappingProxyType(
+    {
+        "k_by": "stiffness",
+        "c_by": "damping",
+        "k_bz": "stiffness",
+        "c_bz": "damping",
+        "e": "distance",
+        "EI": "stiffness",
+    }
+)
+"""What kind of quantity each parameter is."""
 
 
 def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> RotorParameters:

@@ -98,7 +98,12 @@ _LowConfidence = Annotated[
 ]
 
 
-_Note = Annotated[str, Field(description="what is known of it, in a sentence; empty for a parameter", examples=[""])]
+_Note = Annotated[
+    str,
+    Field(
+        description="what is known of it, in words; of a parameter only where its change has a direction", examples=[""]
+    ),
+]
 
 
 class Evidence(BaseModel):

@@ -6,9 +6,45 @@ from pydantic import BaseModel, Field
 
 from rotorwatch.records.fields import EXAMPLE_NS, JSON, Reason
 
-__all__ = ["Agreement", "Detectable", "Equation", "Finding", "Opinion", "Parameter", "SensorFault", "Shape", "Verdict"]
+__all__ = [
+    "Agreement",
+    "Detectable",
+    "Equation",
+    "Finding",
+    "Opinion",
+    "Parameter",
+    "SensorFault",
+    "Shape",
+    "UnbalanceVector",
+    "Verdict",
+]
 
 Interval = tuple[float, float]
+
+
+class UnbalanceVector(BaseModel):
+    """The unbalance over the nominal one; angles count from the nominal heavy spot in the direction of rotation."""
+
+    model_config = JSON
+
+    magnitude_change: float = Field(description="relative change of its size, never below -1", examples=[-0.02])
+    magnitude_interval_95: Interval = Field(description="95 % interval of that", examples=[(-0.05, 0.01)])
+    turned_deg: float | None = Field(
+        description="angle by which the heavy spot has turned; null where so little is left that it has none",
+        examples=[90.4],
+    )
+    turned_interval_95_deg: Interval | None = Field(description="95 % interval of that", examples=[(88.9, 91.9)])
+    change: float = Field(
+        description="size of the vector by which it changed, over the nominal unbalance", examples=[1.41]
+    )
+    change_interval_95: Interval = Field(description="95 % interval of that", examples=[(1.37, 1.45)])
+    change_angle_deg: float | None = Field(
+        description="direction of that vector; null where it is within its errors", examples=[135.2]
+    )
+    text: str = Field(
+        description="the change in words",
+        examples=["a vector of 141 % of the nominal unbalance at 135° from the heavy spot (size −2 %, turned by 90°)"],
+    )
 
 
 class Parameter(BaseModel):
@@ -28,6 +64,12 @@ class Parameter(BaseModel):
     )
     z: float | None = Field(description="relative change in standard errors", examples=[-34.8])
     reason: Reason
+    vector: UnbalanceVector | None = Field(
+        default=None,
+        description="of e where there is a phase reference: size and direction. Once the heavy spot has turned, "
+        "relative_change is the size of the vector of change",
+        examples=[None],
+    )
 
 
 class Equation(BaseModel):

@@ -95,7 +95,7 @@ class Alarm:
     low_confidence : bool
         The data were outside the model too: that this parameter is the one that changed is to be taken with reserve.
     note : str
-        What is known of it, in a sentence; empty for a parameter.
+        What is known of it, in words; for a parameter only where its change has a direction.
     evidence : Evidence or None
         Latest data that decided.
     shelf : Shelf or None
@@ -199,7 +199,7 @@ class AlarmEvent:
             return f"{alarm.severity.upper()}: {words}" + (f": {said}" if said else "")
         what = f"{words} ({alarm.name})"
         half = Z95 * (alarm.standard_error or 0.0)
-        size = f"{alarm.change or 0.0:+.1%} ± {half:.1%}"
+        size = f"{alarm.change or 0.0:+.1%} ± {half:.1%}" + (f": {alarm.note}" if alarm.note else "")
         reserve = " (low confidence: outside the model)" if alarm.low_confidence else ""
         match self.kind:
             case EventKind.RAISED:

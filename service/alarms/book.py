@@ -96,6 +96,7 @@ class AlarmBook:
         named: bool,
         low_confidence: bool = False,
         evidence: Evidence | None = None,
+        note: str = "",
     ) -> tuple[AlarmEvent, ...]:
         """Judge one evaluated parameter at the end of a hop.
 
@@ -113,6 +114,8 @@ class AlarmBook:
             Whether the data are outside the model.
         evidence : Evidence, optional
             The data that decided.
+        note : str
+            The change in words, where a number does not say all.
 
         Returns
         -------
@@ -128,6 +131,7 @@ class AlarmBook:
             standard_error=standard_error,
             low_confidence=low_confidence,
             evidence=evidence,
+            note=note,
         )
         beyond, small = named and size > limits.raise_above, size < limits.clear_below
         danger = beyond and size > limits.danger_above

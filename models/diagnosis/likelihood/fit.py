@@ -23,12 +23,14 @@ from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights,
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
+from models.diagnosis.limits import beyond
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
-from models.errors import CheckpointError, EstimationError
+from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.matrices import STATE_INDEX
+from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import FloatArray
 
 __all__ = ["LikelihoodFit"]
@@ -43,7 +45,14 @@ _GROUPS = 150
 _MOST_LOG_RATIO = float(np.log(5))
 """No stiffness or damping is believed to have changed by more than a factor of five within the model."""
 _MOST_EXCESS = 100.0
-"""Mean squared excess over its expectation, beyond which a window is not evaluated: a dead or clipped channel."""
+"""Mean squared excess over its expectation, beyond which there is nothing to follow: the next search starts cold."""
+_MOST_DEVIATION = 0.2
+"""Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
+Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17."""
+_MOST_NOISE = 0.5
+"""Share of the sensors' noise in what they show, by the theory, up to which a rotor can be seen behind it. A rotor's
+spectrum has resonances; one without any is taken for coloured noise, and what is left of it fits any rotor."""
+_OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12
 """Windows in a row that may start from one window's units and slopes before a search takes its own."""
@@ -164,14 +173,15 @@ class LikelihoodFit:
         Raises
         ------
         EstimationError
-            If a channel has no power in the band (a dead sensor), two carry the same signal, the search finds no
-            maximum, or nothing within the model comes near the window.
+            If a channel has no power in the band (a dead sensor), or two carry the same signal.
+        UnexplainedError
+            If the search finds no maximum, or nothing within the model comes near the window.
         """
         window = integrated(window)
         speed = self._speed(window)
         excluded = _near_rotation(window.frequencies_hz, speed)
         power = self._checked_power(window, ~excluded)
-        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window"
+        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
             # Trial points may lie far out; what comes of them is checked, not warned of.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -179,19 +189,25 @@ class LikelihoodFit:
             covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
-            raise EstimationError(nowhere) from error
+            raise UnexplainedError(nowhere) from error
         if not (np.all(np.isfinite(found.theta)) and np.all(np.diag(covariance) > 0)):
             self.reset()
-            raise EstimationError(nowhere)
+            raise UnexplainedError(nowhere)
         self._last, self._strength = found.theta, weights.strength
-        self._check_explained(model, weights, found)
+        unexplained = self._check_explained(model, weights, found)
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
         states = model.groups.average(window.spectrum)
         goodness = goodness_of_fit(self._machine, model, weights, found, states)
         read = self._read(window, model, found.whitened.point, structural, speed)
-        return replace(read, misfit_z=goodness.misfit_z, suspect=goodness.suspect, steps=found.steps)
+        return replace(
+            read,
+            misfit_z=goodness.misfit_z,
+            suspect=goodness.suspect,
+            unexplained=unexplained,
+            steps=found.steps,
+        )
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
         """Read a short stretch of the latest window by one step from the window's maximum.
@@ -231,17 +247,21 @@ class LikelihoodFit:
         """Readings of the structural parameters at a point, and of e from the window's synchronous part."""
         ratio = np.exp(point.theta[: len(STRUCTURAL)])
         change, spread = ratio - 1, structural * np.outer(ratio, ratio)
-        names: tuple[str, ...] = STRUCTURAL
-        if window.synchronous is not None:
-            e = self._unbalance(window, model, point, structural, speed)
-            names, change = (*names, "e"), np.append(change, e.change)
-            cross = (e.covariance * ratio)[:, None]
-            spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
-        readings = tuple(
+        errors = np.sqrt(np.diag(spread))
+        readings = [
             ParameterReading(name, self.by, float(value), float(error))
-            for name, value, error in zip(names, change, np.sqrt(np.diag(spread)), strict=True)
-        )
-        return Diagnosis(self.by, readings, covariance=np.asarray(spread, dtype=np.float64))
+            for name, value, error in zip(STRUCTURAL, change, errors, strict=True)
+        ]
+        if window.synchronous is not None:
+            try:
+                e = self._unbalance(window, model, point, structural, speed)
+            except EstimationError as error:
+                readings.append(ParameterReading("e", self.by, reason=str(error)))
+            else:
+                cross = (e.covariance * ratio)[:, None]
+                spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
+                readings.append(ParameterReading("e", self.by, e.change, math.sqrt(e.variance), vector=e.vector))
+        return Diagnosis(self.by, tuple(readings), covariance=np.asarray(spread, dtype=np.float64))
 
     def _unbalance(
         self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float
@@ -356,17 +376,47 @@ class LikelihoodFit:
         explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
         return float(explained**-0.5)
 
-    def _check_explained(self, model: SpectralModel, weights: Weights, found: Maximum) -> None:
-        """Raise EstimationError for windows that nothing within the model comes near."""
-        excess = np.einsum("fij,fij->f", found.whitened.excess, found.whitened.excess.conj()).real
-        times = float(weights.averages @ excess) / (model.n**2 * weights.averages.size)
-        if times > _MOST_EXCESS or np.any(np.abs(found.theta[: len(STRUCTURAL)]) > _MOST_LOG_RATIO):
+    def _check_explained(self, model: SpectralModel, weights: Weights, found: Maximum) -> str:
+        """Say why nothing at this maximum means anything; empty if it does.
+
+        Raises
+        ------
+        UnexplainedError
+            If nothing within the model comes near the window, so that there is no maximum to speak of.
+        """
+        why, far = _deviation(model, weights, found)
+        structural = found.theta[: len(STRUCTURAL)]
+        worst = int(np.argmax(np.abs(structural)))
+        if not why and abs(structural[worst]) > _MOST_LOG_RATIO:
+            ratio = math.exp(min(structural[worst], math.log(1e6)))
+            most = math.exp(math.copysign(_MOST_LOG_RATIO, structural[worst]))
+            text, limit = beyond(max(ratio, 1e-6), most)
+            side = "at least" if most < 1 else "at most"
+            name = PARAMETER_TEXT[STRUCTURAL[worst]]
+            why = f"{name} would be {text} times nominal, evaluated is {side} {limit} times"
+        if not why:
+            return ""
+        reason = f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
+        if far or abs(structural[worst]) > _MOST_LOG_RATIO:
             self.reset()
-            raise EstimationError(
-                f"{self._machine.name}: the theory does not explain this window (it deviates {times:.3g} times as much "
-                f"as sampling does, at most {_MOST_EXCESS:g} is evaluated): a sensor is at fault, or something outside "
-                "the model has changed"
-            )
+            raise UnexplainedError(reason)
+        return reason
+
+
+def _deviation(model: SpectralModel, weights: Weights, found: Maximum) -> tuple[str, bool]:
+    """What a maximum leaves unexplained, or explains by noise, if that is too much; and whether it is far too much."""
+    excess, point, bins = found.whitened.excess, found.whitened.point, model.groups.bins
+    squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2
+    deviation = max(0.0, float(np.mean(squared - 1 / weights.averages))) ** 0.5
+    far = bool(np.mean(weights.averages * squared) > _MOST_EXCESS)
+    if far or deviation > _MOST_DEVIATION:
+        text, limit = beyond(100 * deviation, 100 * _MOST_DEVIATION)
+        return f"its spectra deviate from it by {text} % (rms, sampling aside), evaluated is at most {limit} %", far
+    noise = float(np.mean(bins @ model.noise(point.theta) / (bins @ np.einsum("fii->fi", point.S).real)))
+    if noise > _MOST_NOISE:
+        text, limit = beyond(100 * noise, 100 * _MOST_NOISE)
+        return f"{text} % of what the sensors show would be their own noise, evaluated is at most {limit} %", False
+    return "", False
 
 
 def _searched(search: FisherScoring, line: Linearised) -> Maximum | None:

@@ -17,13 +17,18 @@ from models.diagnosis.likelihood.spectral_model import STRUCTURAL, SpectralModel
 from models.diagnosis.moments import ComplexArray
 from models.machine import Machine
 from models.physics.matrices import Q_shaft
+from models.physics.possible import impossible
 from models.signals.block import FloatArray
 
 __all__ = ["Alternative", "Goodness", "goodness_of_fit"]
 
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 """Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z."""
+_UNEQUAL = "shaft stiffer in y than in z"
 _MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
+_LEAST_SUSPECT_Z = 5.0
+_LINEAR = 0.5
+"""Largest one-step estimate that is worth telling: farther out it only says that the thing is not small."""
 _LEAST_INFORMATION = 1e-4
 """An alternative of which less than this is left beside the model's own parameters cannot be told from them."""
 
@@ -44,6 +49,11 @@ class Alternative:
     name: str
     z: float
     change: float
+
+    @property
+    def quantity(self) -> str:
+        """What kind of quantity it is."""
+        return self.name.split()[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +84,19 @@ class Goodness:
 
     @property
     def suspect(self) -> str:
-        """The alternative with the largest score, if it alone is beyond 5 standard errors; else empty."""
+        """The alternative with the largest score, if that is beyond 5 standard errors and possible; else empty.
+
+        A one-step estimate that physics does not allow says that this is not what happened: no suspect is named then,
+        for a score that is only second best explains less still.
+        """
         if not self.alternatives:
             return ""
         best = max(self.alternatives, key=lambda one: abs(one.z))
-        return f"{best.name} ({best.change:+.1%})" if abs(best.z) > 5 else ""
+        if abs(best.z) <= _LEAST_SUSPECT_Z or impossible(best.change, best.quantity):
+            return ""
+        if best.name == _UNEQUAL and impossible(-best.change, best.quantity):
+            return ""  # what y gains z loses
+        return f"{best.name} ({best.change:+.1%})" if abs(best.change) <= _LINEAR else best.name
 
 
 def _two_sided(z: float) -> float:
@@ -161,6 +179,6 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
         names.append(name)
         slopes.append(model.dynamic_slope(point, whitened, response, held, w2))
     shaft = Q_shaft(rotor) * np.exp(found.theta[STRUCTURAL.index("EI")])
-    names.append("shaft stiffer in y than in z")
+    names.append(_UNEQUAL)
     slopes.append(model.dynamic_slope(point, whitened, response, shaft * _SIGNS, -np.ones_like(w2)))
     return names, np.stack(slopes)

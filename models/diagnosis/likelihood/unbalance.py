@@ -1,17 +1,35 @@
-"""Unbalance from the rotation-synchronous vector: generalised least squares with known phase."""
+"""Unbalance from the rotation-synchronous vector: generalised least squares, as a number and as a vector.
 
+While the heavy spot is where it was, the unbalance is one real number times the nominal one, and is read as that. Once
+it has turned, that number would be the projection on the old direction: half a turn would read as -200 %. Then what is
+read is the complex ratio: how large the unbalance has become, or, where most of the change is the turn, the size of the
+vector by which it changed.
+"""
+
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2 as chi2_distribution
 
 from models.diagnosis.likelihood.bins import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
+from models.diagnosis.limits import beyond
 from models.diagnosis.moments import ComplexArray
+from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
 __all__ = ["Unbalance", "estimate_unbalance", "estimate_unbalance_by_hop"]
+
+_TURNED, _LEAST_TURN = 6.0, 0.05
+"""Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
+and probes are not mounted better than to a few degrees."""
+_GAIN = 0.15
+"""Relative error of every motion: what sensors, and a rotor that is not quite that of the model, make."""
+_RATE = 1e-6
+"""Probability that vectors of an unbalance are taken for those of something else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,11 +41,51 @@ class Unbalance:
     change, variance : float
     covariance : ndarray, shape (5,)
         With the logarithmic ratios of the structural parameters.
+    vector : UnbalanceVector
     """
 
     change: float
     variance: float
     covariance: FloatArray
+    vector: UnbalanceVector
+
+
+@dataclass(frozen=True, slots=True)
+class _Ratios:
+    """The unbalance over the nominal one: real with the phase as known, and as real and imaginary part without.
+
+    Attributes
+    ----------
+    values, variances : ndarray, shape (3,)
+        The real number; real and imaginary part.
+    between : float
+        Covariance of the two parts.
+    covariance : ndarray, shape (3, 5)
+        Of the three with the logarithmic ratios of the structural parameters.
+    """
+
+    values: FloatArray
+    variances: FloatArray
+    between: float
+    covariance: FloatArray
+
+    def decided(self) -> Unbalance:
+        """Take that of the descriptions which holds, see this module."""
+        known, real, imaginary = self.values.tolist()
+        vector = UnbalanceVector(real, imaginary, float(self.variances[1]), self.between, float(self.variances[2]))
+        size = math.hypot(real, imaginary)
+        turn = math.hypot(real - size, imaginary)
+        if vector.turned_error_deg is None:  # so little is left that it has no direction
+            turned = False
+        else:
+            turned = turn > max(_TURNED * size * math.radians(vector.turned_error_deg), _LEAST_TURN)
+        if not turned and known > 0:
+            return Unbalance(known - 1, float(self.variances[0]), self.covariance[0], vector)
+        if turned and turn > abs(size - 1):
+            along = np.array([real - 1, imaginary]) / vector.change
+            return Unbalance(vector.change, vector.change_error**2, along @ self.covariance[1:], vector)
+        along = np.array([real, imaginary]) / size
+        return Unbalance(size - 1, vector.magnitude_error**2, along @ self.covariance[1:], vector)
 
 
 def estimate_unbalance(
@@ -59,8 +117,20 @@ def estimate_unbalance(
     Raises
     ------
     EstimationError
-        If the vector says nothing about e.
+        If the vector says nothing about e, or is not what an unbalance makes.
     """
+    return _ratios(machine, model, point, covariance, synchronous, speed_rad_s, duration_s).decided()
+
+
+def _ratios(
+    machine: Machine,
+    model: SpectralModel,
+    point: ModelPoint,
+    covariance: FloatArray,
+    synchronous: ComplexArray,
+    speed_rad_s: float,
+    duration_s: float,
+) -> _Ratios:
     rotor = machine.rotor
     w = np.array([speed_rad_s])
     phase = np.exp(1j * machine.operation.unbalance_phase_rad)
@@ -78,17 +148,46 @@ def estimate_unbalance(
     ) / (2 * step)
     noise = 4 * _around_rotation(machine, model, point, speed_rad_s, duration_s) / duration_s
     q = (model.motions.combine(w) @ synchronous)[0]
-    e_ratio = float(np.real(np.vdot(g, np.linalg.solve(noise, q))) / np.real(np.vdot(g, np.linalg.solve(noise, g))))
+    weighted = np.linalg.solve(noise, g)
+    ratio = complex(np.vdot(weighted, q)) / float(np.real(np.vdot(weighted, g)))
     # Real representation: the structural uncertainty moves real and imaginary parts together.
-    total = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
-    J = np.concatenate([slopes.real, slopes.imag], axis=1).T * e_ratio
-    total = total + J @ covariance @ J.T
-    g2, q2 = np.concatenate([g.real, g.imag]), np.concatenate([q.real, q.imag])
-    weight = np.linalg.solve(total, g2)
-    precision = float(weight @ g2)
-    if not precision > 0:
-        raise EstimationError(f"{machine.name}: the spectrum at the speed of rotation is not determined")
-    return Unbalance(float(weight @ q2) / precision - 1, 1 / precision, -(weight @ J) / precision @ covariance)
+    own = np.block([[noise.real, -noise.imag], [noise.imag, noise.real]]) / 2
+    turned = 1j * g
+    g2, turned2, q2 = (np.concatenate([part.real, part.imag]) for part in (g, turned, q))
+    values, variances, with_structural = np.empty(3), np.empty(3), np.empty((3, len(STRUCTURAL)))
+    between = 0.0
+    for design, at, expected in ((g2[:, None], [0], ratio.real), (np.stack([g2, turned2], axis=1), [1, 2], ratio)):
+        moved = slopes * expected
+        J = np.concatenate([moved.real, moved.imag], axis=1).T
+        total = own + J @ covariance @ J.T
+        weight = np.linalg.solve(total, design).T
+        precision = weight @ design
+        if not precision[0, 0] > 0:
+            raise EstimationError(f"{machine.name}: the spectrum at the speed of rotation is not determined")
+        spread = np.linalg.inv(precision)
+        values[at] = spread @ (weight @ q2)
+        variances[at] = np.diag(spread)
+        with_structural[at] = -spread @ (weight @ J) @ covariance
+        between = float(spread[0, -1])
+    _check_unbalance(machine.name, q2, design @ values[1:], total)
+    return _Ratios(values, variances, between, with_structural)
+
+
+def _check_unbalance(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray) -> None:
+    """Raise EstimationError where what turns with the shaft is not what an unbalance makes on this rotor."""
+    n = q2.size // 2
+    if n < 2:
+        return
+    amplitude = np.maximum(np.hypot(q2[:n], q2[n:]), np.hypot(explained[:n], explained[n:]))
+    allowed = total + np.diag(np.tile((_GAIN * amplitude) ** 2 / 2, 2))
+    left = q2 - explained
+    chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chi2_distribution.isf(_RATE, 2 * n - 2))
+    if chi2 > most:
+        text, limit = beyond(chi2, round(most, 1))
+        raise EstimationError(
+            f"{name}: what turns with the shaft is not what an unbalance makes on this rotor: its misfit χ² is {text} "
+            f"with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
+        )
 
 
 def estimate_unbalance_by_hop(
@@ -119,20 +218,25 @@ def estimate_unbalance_by_hop(
         If a vector says nothing about e.
     """
     hops = [
-        estimate_unbalance(machine, model, point, covariance, vectors, float(speed), hop_s)
+        _ratios(machine, model, point, covariance, vectors, float(speed), hop_s)
         for vectors, speed in zip(hop_synchronous, hop_speed_rad_s, strict=True)
     ]
     precision = np.linalg.inv(covariance)
     shared = np.array([hop.covariance for hop in hops])
-    own = np.array([hop.variance for hop in hops]) - np.einsum("hi,ij,hj->h", shared, precision, shared)
+    common = np.einsum("hai,ij,hbj->hab", shared, precision, shared)
+    own = np.array([hop.variances for hop in hops]) - np.einsum("haa->ha", common)
     weight = 1 / np.maximum(own, np.finfo(float).tiny)
-    weight /= weight.sum()
-    together = weight @ shared
-    return Unbalance(
-        float(weight @ np.array([hop.change for hop in hops])),
-        float(weight**2 @ own + together @ precision @ together),
+    weight[:, 1:] = weight[:, 1:].sum(axis=1, keepdims=True)  # one for both parts of a vector
+    weight /= weight.sum(axis=0)
+    together = np.einsum("ha,hai->ai", weight, shared)
+    left = together @ precision @ together.T
+    between = np.array([hop.between for hop in hops]) - common[:, 1, 2]
+    return _Ratios(
+        np.einsum("ha,ha->a", weight, np.array([hop.values for hop in hops])),
+        np.einsum("ha,ha->a", weight**2, own) + np.diag(left),
+        float(weight[:, 1] ** 2 @ between + left[1, 2]),
         together,
-    )
+    ).decided()
 
 
 def _around_rotation(

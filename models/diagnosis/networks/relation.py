@@ -147,7 +147,7 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     if healthy is not None:
         error = error * np.array(healthy.z_scale)
     readings = tuple(
-        ParameterReading(name, "relation", float(value), float(spread))
+        ParameterReading.of(name, "relation", float(value), float(spread))
         for name, value, spread in zip(equation.parameters, change, error, strict=True)
     )
     return EquationReading(

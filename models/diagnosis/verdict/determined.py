@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from models.diagnosis.limits import beyond
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.verdict.stretch import slope, to_scale
 from models.diagnosis.window import WindowStatistics
@@ -59,10 +60,15 @@ def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis
     total = diagnosis.full_covariance + shared
     errors = dict(zip((reading.name for reading in readings), np.sqrt(np.diag(total)).tolist(), strict=True))
     parameters = tuple(
-        replace(reading, standard_error=errors[reading.name]) if reading.name in errors else reading
-        for reading in diagnosis.parameters
+        _wider(reading, errors[reading.name]) if reading.name in errors else reading for reading in diagnosis.parameters
     )
     return replace(diagnosis, parameters=parameters, covariance=total, common=shared)
+
+
+def _wider(reading: ParameterReading, error: float) -> ParameterReading:
+    added = error**2 - (reading.standard_error or 0.0) ** 2
+    vector = None if reading.vector is None else reading.vector.widened(added)
+    return replace(reading, standard_error=error, vector=vector)
 
 
 def _stated(
@@ -77,9 +83,8 @@ def _stated(
     if reading.change is None or reading.standard_error is None:
         return reading
     if not reading.standard_error < vague:
+        error, limit = beyond(100 * reading.standard_error, 100 * vague)
         return ParameterReading(
-            name,
-            by,
-            reason=f"not determined in this window (standard error {reading.standard_error:.0%})",
+            name, by, reason=f"not determined in this window (standard error {error} %, at most {limit} % is a reading)"
         )
-    return reading
+    return ParameterReading.of(name, by, reading.change, reading.standard_error, reading.vector)

@@ -25,7 +25,7 @@ from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = ["Isolation", "isolate", "isolate_window", "outside_confidence", "restricted"]
+__all__ = ["Isolation", "isolate", "isolate_window", "outside_confidence", "reading_of", "restricted"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,9 +177,23 @@ def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Param
         return ()
     covariance = np.linalg.inv(stretch.information[np.ix_(chosen, chosen)])
     values = covariance @ stretch.vector[chosen]
-    readings = []
-    for i, value, variance in zip(chosen, values.tolist(), np.diag(covariance).tolist(), strict=True):
-        name = PARAMETERS[i]
-        error = math.sqrt(variance) * slope(name, value)
-        readings.append(ParameterReading(name, by, from_scale(name, value), error))
-    return tuple(readings)
+    return tuple(
+        reading_of(stretch, PARAMETERS[i], by, value, math.sqrt(variance))
+        for i, value, variance in zip(chosen, values.tolist(), np.diag(covariance).tolist(), strict=True)
+    )
+
+
+def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float) -> ParameterReading:
+    """A parameter's reading from its value and standard error in the scale of the errors.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What it was read in.
+    name, by : str
+    value, error : float
+    """
+    if name != "e":
+        return ParameterReading.of(name, by, from_scale(name, value), error * slope(name, value))
+    # Where errors put an unbalance that is all but gone below none, it is as much of one on the other side.
+    return ParameterReading.of(name, by, abs(1 + value) - 1, error, stretch.unbalance)

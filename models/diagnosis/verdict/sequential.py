@@ -23,8 +23,8 @@ import numpy as np
 from models.checkpoint import checked
 from models.diagnosis.readings import ParameterReading
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
-from models.diagnosis.verdict.isolation import Isolation, isolate, restricted
-from models.diagnosis.verdict.stretch import Stretch, added, from_scale, slope
+from models.diagnosis.verdict.isolation import Isolation, isolate, reading_of, restricted
+from models.diagnosis.verdict.stretch import Stretch, added
 from models.errors import CheckpointError
 from models.machine import MachineFile
 from models.physics.parameters import PARAMETERS
@@ -143,6 +143,8 @@ class SequentialVerdict:
     current : tuple of ParameterReading
         Readings of the longest clean stretch up to the window, with the changed parameters' others held at nominal;
         empty for the moment in which there is no clean stretch.
+    unexplained : str
+        Why nothing can be said of parameters, see `Diagnosis`: then none is named, and none is read. Empty otherwise.
     """
 
     detected: bool
@@ -151,6 +153,7 @@ class SequentialVerdict:
     decided_s: float
     settled: bool
     current: tuple[ParameterReading, ...]
+    unexplained: str = ""
 
 
 @dataclass(slots=True)
@@ -317,26 +320,32 @@ class SequentialTest:
         self._watch_for_contradiction(own)  # an error that all stretches share makes none contradict another
         every = {hops: look.complete() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
+        deciding = [hops for hops in clean if hops <= window_hops]
+        # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.
+        tested = self._isolate(deciding[-1], clean[deciding[-1]]) if deciding else None
+        unexplained = clean[deciding[-1]].unexplained if deciding else ""
         loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
         decided, isolation = self._decide(every, clean, verdicts)
-        self._note(isolation.changed, every, clean, verdicts)
-        deciding = [hops for hops in clean if hops <= window_hops]
-        current = self._current(clean[deciding[-1]], isolation.changed) if deciding else ()
-        # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.
-        tested = self._isolate(deciding[-1], clean[deciding[-1]]) if deciding else None
+        if unexplained:
+            # What was found before may hold on; it is neither confirmed nor taken back by data that say nothing.
+            isolation = replace(isolation, changed=(), readings=())
+        else:
+            self._note(isolation.changed, every, clean, verdicts)
+        current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
         isolation = replace(
             isolation,
-            outside=tested is not None and tested.outside,
+            outside=bool(unexplained) or (tested is not None and tested.outside),
             outside_confidence=None if tested is None else tested.outside_confidence,
         )
         return SequentialVerdict(
-            detected=bool(verdicts),
-            findings=self.state.findings,
+            detected=bool(verdicts) and not unexplained,
+            findings=() if unexplained else self.state.findings,
             isolation=isolation,
             decided_s=decided.duration_s,
             settled=window_hops in clean,
             current=current,
+            unexplained=unexplained,
         )
 
     def _is_loud(self, hops: int, look: Stretch) -> bool:
@@ -372,16 +381,21 @@ class SequentialTest:
         return change_ns is None or look.start_ns >= change_ns - self._slack_ns
 
     def _watch_for_contradiction(self, every: Mapping[int, Stretch]) -> None:
-        """Date a change if a stretch contradicts a longer clean one that contains it."""
+        """Date a change if a stretch contradicts a longer clean one that contains it.
+
+        So does one that the model explains, one that it does not: the longer one is of two machines.
+        """
         clean = [(hops, look, _values(look)) for hops, look in every.items() if self._is_clean(look)]
         for at, (hops, short, part) in enumerate(clean):
             if hops > self.settings.window_hops:
                 return
-            for _, _, whole in reversed(clean[at + 1 :]):
-                if _worst(part, whole) > self._contradiction:
+            explained = short.known and not short.unexplained and not self._isolate(hops, short).outside
+            for _, longer, whole in reversed(clean[at + 1 :]):
+                if _worst(part, whole) > self._contradiction or (explained and longer.unexplained):
                     inside = hops < self.settings.window_hops
                     self.state.change_ns = short.end_ns if inside else short.start_ns
-                    self.state.before = tuple(whole[0].tolist())
+                    if not longer.unexplained:
+                        self.state.before = tuple(whole[0].tolist())
                     return
 
     def _decide(
@@ -453,7 +467,7 @@ class SequentialTest:
         values, covariance = look.estimate()
         errors = np.sqrt(np.diag(covariance)).tolist()
         return tuple(
-            sharp.get(name) or ParameterReading(name, self._by, from_scale(name, value), error * slope(name, value))
+            sharp.get(name) or reading_of(look, name, self._by, value, error)
             for name, value, error in zip(look.names, values.tolist(), errors, strict=True)
         )
 

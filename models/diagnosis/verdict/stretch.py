@@ -16,6 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from models.diagnosis.readings import Diagnosis
+from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
@@ -59,6 +60,10 @@ class Stretch:
         Over-identification, standard normal where the model holds.
     common : ndarray, shape (6, 6), or None
         Covariance shared with every other stretch, not contained in `information`.
+    unexplained : str
+        Why nothing of it should be believed, see `Diagnosis`; of one window at most, sums do not say.
+    unbalance : UnbalanceVector or None
+        Its unbalance with its direction; of one window at most, too.
     """
 
     start_ns: int
@@ -67,6 +72,8 @@ class Stretch:
     information: FloatArray
     misfit_z: float | None = None
     common: FloatArray | None = None
+    unexplained: str = ""
+    unbalance: UnbalanceVector | None = None
 
     @cached_property
     def known(self) -> tuple[int, ...]:
@@ -116,7 +123,7 @@ class Stretch:
         wider = _stretch(
             self.start_ns, self.end_ns, list(self.known), values, covariance + added_covariance, self.misfit_z
         )
-        return replace(wider, common=common)
+        return replace(wider, common=common, unexplained=self.unexplained, unbalance=self.unbalance)
 
 
 def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
@@ -131,17 +138,19 @@ def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
     """
     readings = diagnosis.evaluable
     known = [PARAMETERS.index(reading.name) for reading in readings]
+    unbalance = next((reading.vector for reading in readings if reading.vector is not None), None)
     values = np.array([to_scale(reading.name, reading.change or 0.0) for reading in readings], dtype=np.float64)
     slopes = np.array([slope(reading.name, value) for reading, value in zip(readings, values, strict=True)])
     scale = np.outer(slopes, slopes)
     covariance = diagnosis.full_covariance / scale
     if diagnosis.common is None:
-        return _stretch(start_ns, end_ns, known, values, covariance, diagnosis.misfit_z)
+        own = _stretch(start_ns, end_ns, known, values, covariance, diagnosis.misfit_z)
+        return replace(own, unexplained=diagnosis.unexplained, unbalance=unbalance)
     shared = diagnosis.common / scale
     own = _stretch(start_ns, end_ns, known, values, _at_least(covariance - shared, covariance), diagnosis.misfit_z)
     common = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     common[np.ix_(known, known)] = shared
-    return replace(own, common=common)
+    return replace(own, common=common, unexplained=diagnosis.unexplained, unbalance=unbalance)
 
 
 def _at_least(own: FloatArray, total: FloatArray) -> FloatArray:
