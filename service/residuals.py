@@ -20,6 +20,7 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.limits import beyond
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
@@ -247,16 +248,20 @@ class KnownMachineEvaluator:
         if not np.isfinite(window.speed_rad_s):
             return None
         operation, speed = self._machine.operation, float(window.speed_rad_s)
-        if abs(speed / operation.speed_rad_s - 1) > operation.speed_tolerance:
+        off = abs(speed / operation.speed_rad_s - 1)
+        if off > operation.speed_tolerance:
+            text, limit = beyond(100 * off, 100 * operation.speed_tolerance)
             raise EstimationError(
-                f"{self._place}: speed is {speed * 30 / np.pi:.0f} rpm, evaluated are "
-                f"{operation.speed_rpm:.0f} rpm ± {operation.speed_tolerance:.0%}"
+                f"{self._place}: speed is {speed * 30 / np.pi:.0f} rpm, off {operation.speed_rpm:g} rpm by {text} %, "
+                f"evaluated is at most {limit} %"
             )
         slowest, fastest = window.speed_range
-        if fastest - slowest > _STEADY * operation.speed_rad_s:
+        varied = (fastest - slowest) / operation.speed_rad_s
+        if varied > _STEADY:
+            text, limit = beyond(100 * varied, 100 * _STEADY)
             raise EstimationError(
-                f"{self._place}: speed went from {slowest * 30 / np.pi:.0f} to "
-                f"{fastest * 30 / np.pi:.0f} rpm within the window, evaluated is a steady speed (± {_STEADY / 2:.1%})"
+                f"{self._place}: speed went from {slowest * 30 / np.pi:.0f} to {fastest * 30 / np.pi:.0f} rpm within "
+                f"the window, by {text} % of nominal, evaluated is at most {limit} %"
             )
         return speed
 

@@ -172,7 +172,7 @@ def test_what_the_networks_cannot_judge_is_said_to_be_so() -> None:
     dead = healthy.spectrum.copy()
     dead[:, 0, :] = dead[:, :, 0] = 0.0
     assert all(
-        one.reason.startswith("displacement and rate disagree: y1 by 100%")
+        one.reason.startswith("displacement and rate disagree: y1 by 100 %")
         for one in reader.diagnose(replace(healthy, spectrum=dead)).parameters
     )
 

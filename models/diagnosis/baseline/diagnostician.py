@@ -30,6 +30,7 @@ from models.diagnosis.baseline.unbalance import (
     rotation_of,
     slopes,
 )
+from models.diagnosis.limits import beyond
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -238,8 +239,12 @@ class BaselineDiagnostician:
         size = math.hypot(1 + vector[0], vector[1])
         along = np.array([1 + vector[0], vector[1]]) / max(size, 1e-9) @ combine
         variance = float(along @ spread @ along)
-        if variance > (_WORST_ERROR * max(1.0, size)) ** 2:
-            raise EstimationError(f"unbalance not seen well enough: standard error {100 * math.sqrt(variance):.0f} %")
+        error, most = math.sqrt(variance), _WORST_ERROR * max(1.0, size)
+        if error > most:
+            text, limit = beyond(100 * error, round(100 * most, 1))
+            raise EstimationError(
+                f"unbalance not seen well enough: standard error {text} %, at most {limit} % is a reading"
+            )
         return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, float(along @ shared @ along))
 
     def _rotations(self, coordinates: tuple[str, ...], window: WindowStatistics) -> tuple[Rotation, Rotation]:

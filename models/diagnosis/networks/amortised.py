@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.limits import beyond
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
@@ -174,9 +175,9 @@ class NetworkDiagnostician:
             return self._refused(f"displacement and rate disagree: {apart}; at most {_MOST_APART:.0%} is evaluated")
         novelty = float(amortised.basis.novelty(inputs)[0]) if np.all(np.isfinite(inputs)) else np.inf
         if not novelty <= amortised.novelty_limit:
+            text, limit = beyond(novelty, float(f"{amortised.novelty_limit:.3g}"))
             return self._refused(
-                f"the window is unlike what the networks were trained on (distance {novelty:.3g}, at most "
-                f"{amortised.novelty_limit:.3g} is evaluated)"
+                f"the window is unlike what the networks were trained on ({text} apart, evaluated is at most {limit})"
             )
         readings: list[ParameterReading] = []
         blocks: list[FloatArray] = []
@@ -199,7 +200,11 @@ class NetworkDiagnostician:
         own = slice(basis.n_common - n, basis.n_common)
         raw = inputs[:, own] * basis.scale[own] + basis.centre[own]
         apart = {name: float(value[0]) for name, value in self._features.disagreement(raw).items()}
-        return ", ".join(f"{name} by {value:.0%}" for name, value in apart.items() if value > _MOST_APART)
+        return ", ".join(
+            f"{name} by {beyond(100 * value, 100 * _MOST_APART)[0]} %"
+            for name, value in apart.items()
+            if value > _MOST_APART
+        )
 
     def _read(self, equation: str, mean: FloatArray, factor: FloatArray) -> tuple[list[ParameterReading], FloatArray]:
         """Readings of one equation and the covariance of those that could be made."""
@@ -220,7 +225,8 @@ class NetworkDiagnostician:
                 reason = f"beyond the changes trained for ({low:+.0%} to {high:+.0%})"
                 readings.append(ParameterReading(name, self.by, reason=reason))
             elif not error < _VAGUE:
-                reason = f"not determined in this window (standard error {error:.0%})"
+                text, limit = beyond(100 * error, 100 * _VAGUE)
+                reason = f"not determined in this window (standard error {text} %, at most {limit} % is a reading)"
                 readings.append(ParameterReading(name, self.by, reason=reason))
             else:
                 readings.append(ParameterReading(name, self.by, ratio - 1, error))

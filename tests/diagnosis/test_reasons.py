@@ -1,0 +1,138 @@
+"""Sentences that say why something is not evaluated: what was measured is beyond the limit that stands beside it."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.likelihood.goodness import Alternative, Goodness
+from models.diagnosis.limits import beyond
+from models.diagnosis.networks.amortised import NetworkDiagnostician
+from models.diagnosis.networks.bundle import load_bundle
+from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.verdict.determined import determined
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError, UnexplainedError
+from models.machine import load_machine
+from models.physics.possible import impossible
+from service.residuals import KnownMachineEvaluator
+from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
+
+MACHINE = load_machine("lab")
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+
+
+@pytest.fixture(scope="module")
+def window() -> WindowStatistics:
+    return simulate_window(Draw(MACHINE, 7_700_041, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), 0)
+
+
+def assert_beyond(sentence: str) -> None:
+    """The last number before "at most" (or "at least") is more (or less) than the one after it, as printed."""
+    found = re.search(rf"({_NUMBER})\D*?(at most|at least) ({_NUMBER})", sentence)
+    assert found, sentence
+    value, side, limit = float(found[1]), found[2], float(found[3])
+    assert value > limit if side == "at most" else value < limit, sentence
+
+
+def reason_of(window: WindowStatistics) -> str:
+    try:
+        return LikelihoodFit(MACHINE).diagnose(window).unexplained
+    except UnexplainedError as error:
+        return str(error)
+
+
+def mixed(window: WindowStatistics, share: float) -> WindowStatistics:
+    """One spectrum of the window is partly another one's."""
+    spectrum = window.spectrum.copy()
+    spectrum[:, 0, 0] *= 1 + share * np.cos(0.3 * np.arange(len(spectrum)))
+    return replace(window, spectrum=spectrum)
+
+
+def test_numbers_are_printed_beyond_their_limits() -> None:
+    rng = np.random.default_rng(1)
+    for limit in (0.2, 5.0, 20.0, 34.5, 100.0):
+        for excess in 10.0 ** rng.uniform(-9, 3, 50):
+            for value in (limit * (1 + excess), limit / (1 + excess)):
+                text, printed = beyond(value, limit)
+                assert float(printed) == limit
+                assert (float(text) > limit) == (value > limit)
+                assert float(text) != limit
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_a_window_that_is_far_from_theory_says_by_how_much(window: WindowStatistics, share: float) -> None:
+    assert_beyond(reason_of(mixed(window, share)))
+
+
+def test_a_parameter_far_from_nominal_says_how_far(window: WindowStatistics) -> None:
+    softer = MACHINE.rotor.model_copy(update={"c_by_N_s_per_m": MACHINE.rotor.c_by_N_s_per_m * 8})
+    with pytest.raises(UnexplainedError) as caught:
+        LikelihoodFit(MACHINE.model_copy(update={"rotor": softer})).diagnose(window)
+    assert_beyond(str(caught.value))
+
+
+def test_what_would_be_noise_says_how_much() -> None:
+    quiet = simulate_window(Draw(MACHINE, 7_700_041, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), 0)
+    noise = np.einsum("fii->i", quiet.spectrum).real / len(quiet.spectrum)
+    drowned = replace(quiet, spectrum=0.02 * quiet.spectrum + np.diag(noise))
+    assert_beyond(reason_of(drowned))
+
+
+def test_a_vague_reading_says_how_vague(window: WindowStatistics) -> None:
+    for error in (0.2001, 0.204, 0.5, 3.0):
+        vague = Diagnosis("likelihood", (ParameterReading("k_by", "likelihood", 0.1, error),))
+        assert_beyond(determined(vague, window, 60.0).parameters[0].reason)
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.948, 1.052, 2.0])
+def test_a_speed_out_of_range_says_so_in_numbers(window: WindowStatistics, factor: float) -> None:
+    tolerance = MACHINE.operation.speed_tolerance
+    off = replace(window, speed_rad_s=MACHINE.operation.speed_rad_s * (1 + (factor - 1) * max(1.0, tolerance / 0.05)))
+    with pytest.raises(EstimationError) as caught:
+        KnownMachineEvaluator(MACHINE, None).evaluate(off, {})
+    assert_beyond(str(caught.value))
+
+
+def test_an_unsteady_speed_says_so_in_numbers(window: WindowStatistics) -> None:
+    nominal = MACHINE.operation.speed_rad_s
+    for part in (0.1501, 0.2, 0.6):
+        swept = replace(window, speed_range=(nominal * (1 - part / 2), nominal * (1 + part / 2)))
+        with pytest.raises(EstimationError) as caught:
+            KnownMachineEvaluator(MACHINE, None).evaluate(swept, {})
+        assert_beyond(str(caught.value))
+
+
+def test_networks_say_what_they_do_not_know(window: WindowStatistics) -> None:
+    networks = load_bundle("lab", MACHINE).amortised
+    assert networks is not None
+    diagnostician = NetworkDiagnostician(MACHINE, networks)
+    spectrum = window.spectrum.copy()
+    spectrum[:, :2, :2] *= np.exp(2 * np.sin(0.1 * np.arange(len(spectrum))))[:, None, None]
+    reasons = {one.reason for one in diagnostician.diagnose(replace(window, spectrum=spectrum)).parameters}
+    assert len(reasons) == 1
+    assert_beyond(reasons.pop())
+
+
+@pytest.mark.parametrize("change", [-1.0, -1.004, -4.7])
+def test_what_physics_does_not_allow_is_no_reading(change: float) -> None:
+    for name in ("k_by", "e"):
+        reading = ParameterReading.of(name, "relation", change, 0.1)
+        assert reading.change is None
+        assert reading.reason == impossible(change, "distance" if name == "e" else "stiffness")
+
+
+def test_a_suspect_that_cannot_be_is_none() -> None:
+    """Nor is one named whose one-step size only says that it is not small; the name may stand then."""
+
+    def suspect(name: str, change: float, z: float = 20.0) -> str:
+        return Goodness(9.0, (Alternative(name, z, change), Alternative("gain of y1", 6.0, 0.1)), 2).suspect
+
+    assert suspect("mass of the disc", -4.7) == ""
+    assert suspect("gain of z2", -1.372) == ""
+    assert suspect("inertia of the disc", 4.96) == "inertia of the disc"
+    assert suspect("mass of the disc", 0.07) == "mass of the disc (+7.0%)"
+    assert suspect("shaft stiffer in y than in z", 1.2) == ""
+    assert suspect("mass of the disc", 0.07, z=4.0) == "gain of y1 (+10.0%)"
