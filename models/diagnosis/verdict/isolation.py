@@ -11,7 +11,7 @@ parameter, the spread of possible sizes included. The confidence is the posterio
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
 
@@ -87,7 +87,8 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
         Probability that a healthy window is called changed; the test of the model has the same rate to itself.
     """
     stretch = stretch_of(diagnosis, 0, 0).complete()
-    return isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
+    isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
+    return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
 
 
 def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:
