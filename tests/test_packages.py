@@ -144,3 +144,8 @@ def test_a_checkout_that_is_not_installed_can_be_imported(others: Path, tmp_path
         "print([d.name for d in m.distributions() if d.name.startswith('rotorwatch')])"
     )
     assert in_new_process(code, ROOT, others, cwd=tmp_path) == "[]"
+
+
+def test_commissioning_without_networks_needs_no_torch(others: Path, tmp_path: Path) -> None:
+    code = "import simulator.commission.command; print('torch' in sys.modules)"
+    assert in_new_process(code, ROOT, others, cwd=tmp_path) == "False"
