@@ -68,7 +68,7 @@ wheels:
 	done
 
 FLOORS := $(CURDIR)/build/floors
-FLOOR_TESTS := tests/signals tests/interchange $(patsubst %,tests/service/test_%.py,access_http api api_events client metrics \
+FLOOR_TESTS := tests/signals/test_recording.py tests/interchange/test_formats.py $(patsubst %,tests/service/test_%.py,access_http api api_events client metrics \
   plots replay_http rotorwatch_cli snapshots store transport webhooks)
 
 floors:
