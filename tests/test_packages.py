@@ -50,6 +50,15 @@ def others(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The packages as they are here, without what an installation leaves beside them."""
+    folder = tmp_path_factory.mktemp("checkout")
+    for package in PACKAGES:
+        (folder / package).symlink_to(ROOT / package)
+    return folder
+
+
 def in_new_process(code: str, *paths: Path, cwd: Path, arguments: tuple[str, ...] = ()) -> str:
     """Run code that finds the standard library and these folders, and no installed package; what it printed."""
     begin = f"import sys; sys.path[:0] = {[str(path) for path in paths]}; "
@@ -131,21 +140,21 @@ def test_the_installed_client_loads_neither_server_nor_database_nor_numbers(
 
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_programs_run_from_a_checkout_that_is_not_installed_and_say_their_version(
-    others: Path, tmp_path: Path, program: str
+    checkout: Path, others: Path, tmp_path: Path, program: str
 ) -> None:
     code = f"from {PROGRAMS[program]} import app; app(prog_name='{program}')"
-    said = in_new_process(code, ROOT, others, cwd=tmp_path, arguments=("--version",))
+    said = in_new_process(code, checkout, others, cwd=tmp_path, arguments=("--version",))
     assert said == f"{program} {rotorwatch.__version__}"
 
 
-def test_a_checkout_that_is_not_installed_can_be_imported(others: Path, tmp_path: Path) -> None:
+def test_a_checkout_that_is_not_installed_can_be_imported(checkout: Path, others: Path, tmp_path: Path) -> None:
     code = (
         "import importlib.metadata as m, service.runtime, service.asyncapi, simulator.campaigns.train_command; "
         "print([d.name for d in m.distributions() if d.name.startswith('rotorwatch')])"
     )
-    assert in_new_process(code, ROOT, others, cwd=tmp_path) == "[]"
+    assert in_new_process(code, checkout, others, cwd=tmp_path) == "[]"
 
 
-def test_commissioning_without_networks_needs_no_torch(others: Path, tmp_path: Path) -> None:
+def test_commissioning_without_networks_needs_no_torch(checkout: Path, others: Path, tmp_path: Path) -> None:
     code = "import simulator.commission.command; print('torch' in sys.modules)"
-    assert in_new_process(code, ROOT, others, cwd=tmp_path) == "False"
+    assert in_new_process(code, checkout, others, cwd=tmp_path) == "False"
