@@ -1,5 +1,6 @@
 # make demo    set everything up and run the demo (FAULT=c_by, or none; ONCE=1 SEED=7 PACE=20)
 # make test    set everything up and run all checks
+# make quick   tests of the models and the monitor alone, a minute
 # make format  let ruff put the code in order
 # make wheels  build both wheels into dist/, and run the demo out of the wheel under every Python there is here
 # make floors  run the demo and the tests below with the lowest versions that pyproject.toml admits
@@ -11,13 +12,14 @@ BIN := $(VENV)/bin
 RUN := $(VENV)/.run
 READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
+MODELS_AND_MONITOR := models tests/physics tests/signals tests/diagnosis tests/commissioning $(wildcard tests/service/test_monitor*.py)
 FAULT ?= k_by
 SEED ?= 1
 PACE ?= 10
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: setup demo test lint types contracts tests format wheels floors train clean
+.PHONY: setup demo test quick lint types contracts tests format wheels floors train clean
 
 setup: $(READY)
 
@@ -37,7 +39,9 @@ $(READY): $(RUN)
 demo: $(RUN)
 	@$(BIN)/rotorwatch demo --fault $(FAULT) --seed $(SEED) --pace $(PACE) $(if $(ONCE),--once)
 
-test: lint types contracts tests
+# Side by side: many tests wait more than they compute.
+test: $(READY)
+	@$(MAKE) --no-print-directory --jobs=2 lint types contracts tests
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -49,9 +53,11 @@ types: $(READY)
 contracts: $(READY)
 	$(BIN)/lint-imports
 
-# Two at a time; tests that open ports and start programs stay together in one of the two (tests/conftest.py).
 tests: $(READY)
 	$(BIN)/pytest -n 2
+
+quick: $(READY)
+	$(BIN)/pytest -n 2 -m "not slow" $(MODELS_AND_MONITOR)
 
 format: $(READY)
 	$(BIN)/ruff format .

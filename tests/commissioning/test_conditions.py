@@ -1,5 +1,7 @@
 """Several healthy recordings: one baseline where they agree, one for each speed where the bearing depends on it."""
 
+import pytest
+
 from models.commissioning.commission import Commissioning
 from models.commissioning.installed import Installed
 from models.diagnosis.readings import ParameterReading
@@ -36,6 +38,7 @@ def verdict_of(made: Commissioning) -> tuple[str, str]:
     return next((one.verdict, one.text) for one in made.report.checks if one.name == "recordings agree")
 
 
+@pytest.mark.slow
 def test_two_speeds_of_one_machine_make_one_baseline() -> None:
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST),)))
     assert verdict_of(made)[0] == "passed"
@@ -51,6 +54,7 @@ def test_two_speeds_of_one_machine_make_one_baseline() -> None:
     assert abs(reading(evaluated(made, 94, at(FAST)), "e").z or 99.0) < 4
 
 
+@pytest.mark.slow
 def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
     stiffer = Event(at_s=0.0, parameter="k_by", relative_change=0.3)
     made = made_of(("slow.mcap", 91, (at(SLOW),)), ("fast.mcap", 92, (at(FAST), stiffer)))
@@ -67,6 +71,7 @@ def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
     assert abs(lost.change - (1 / 1.3 - 1)) < 0.05
 
 
+@pytest.mark.slow
 def test_recordings_that_differ_at_one_speed_are_refused() -> None:
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
     made = made_of(("monday.mcap", 91, ()), ("friday.mcap", 92, (softer,)))

@@ -72,6 +72,7 @@ def test_what_was_commissioned_comes_back_from_its_file(machine: MachineFile, le
         assert first.parameters == second.parameters
 
 
+@pytest.mark.slow
 def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path) -> None:
     made = commissioned(NOTHING, healthy(NOTHING, HEALTHY_S, 41)).commissioned
     assert made is not None
@@ -107,6 +108,7 @@ def test_outside_the_commissioned_conditions_is_said_so() -> None:
     assert conditions.outside(window).startswith("random vibration of")
 
 
+@pytest.mark.slow
 def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> None:
     little = commissioned(NOTHING, healthy(NOTHING, 66.0, 46))
     much = commissioned(NOTHING, healthy(NOTHING, HEALTHY_S, 41))
@@ -120,6 +122,7 @@ def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> 
     assert isinstance(much.commissioned, Commissioned)
 
 
+@pytest.mark.slow
 def test_the_valid_band_of_what_is_derived_is_stated() -> None:
     (note,) = commissioned(NOTHING, healthy(NOTHING, HEALTHY_S, 41)).report.notes
     found = re.search(r"up to (\d) derivatives .* valid from 0 to (\d+) Hz", note)

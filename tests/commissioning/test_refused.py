@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from models.commissioning.commission import Commissioning
 from models.machine import MachineFile
@@ -54,6 +55,7 @@ def test_full_of_gaps() -> None:
     assert advice.startswith("find out why 3")
 
 
+@pytest.mark.slow
 def test_a_few_gaps_are_told_and_cost_their_hops() -> None:
     kept = [block for number, block in enumerate(stream(HEALTHY_S, 52)) if number != 700]
     made = made_of(kept)
@@ -83,6 +85,7 @@ def test_a_stuck_channel() -> None:
     assert verdict_of(made, "sensors")[0] == "refused"
 
 
+@pytest.mark.slow
 def test_speed_that_runs_away() -> None:
     made = made_of(stream(HEALTHY_S, 53, Event(at_s=0.0, ramp_s=HEALTHY_S, speed_rpm=2 * LAB.operation.speed_rpm)))
     assert refused(made)
@@ -97,6 +100,7 @@ def test_vibration_that_grows() -> None:
     assert "in the second half is" in verdict_of(made, "stationary")[1]
 
 
+@pytest.mark.slow
 def test_a_machine_that_changed_meanwhile() -> None:
     made = made_of(stream(2 * HEALTHY_S, 55, Event(at_s=130.0, parameter="k_by", relative_change=-0.3)))
     assert refused(made)
@@ -119,6 +123,7 @@ def test_another_machine_that_hums() -> None:
     assert "neighbouring machine" in advice
 
 
+@pytest.mark.slow
 def test_a_healthy_recording_has_no_foreign_line() -> None:
     for seed in (57, 58, 59):
         assert verdict_of(made_of(stream(HEALTHY_S, seed)), "second excitation")[0] == "passed"

@@ -82,6 +82,7 @@ def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
     np.testing.assert_allclose(louder, series, atol=1e-4)  # levels drop out
 
 
+@pytest.mark.slow
 def test_a_batch_depends_on_seed_and_number_alone() -> None:
     draws = FeatureDraws.for_machine(LAB, SEED, 24)
     several = list(batches(draws, 2, processes=1))
@@ -120,6 +121,7 @@ def test_training_is_reproducible_and_learns() -> None:
     assert np.all(factor[:, [0, 1], [0, 1]] > 0)
 
 
+@pytest.mark.slow
 def test_too_few_windows_are_refused() -> None:
     draws = FeatureDraws.for_machine(LAB, SEED, 24)
     with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
@@ -204,6 +206,7 @@ def test_tilt_sensors_beside_the_trained_ones_do_no_harm() -> None:
     assert len(diagnosis.evaluable) == len(PARAMETERS)
 
 
+@pytest.mark.slow
 def test_calibration_finds_the_true_size_of_the_errors() -> None:
     held_out = [[(window("", number, layout), dict[str, float]()) for number in range(8)] for layout in Layout]
     calibrated = calibrate_networks(LAB, replace(shipped(), calibration={}), held_out)

@@ -44,6 +44,7 @@ def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
         assert abs(z.mean()) < 2, (name, z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "rotor", "low", "high"),
     [
@@ -63,6 +64,7 @@ def test_what_changed_is_named_and_nothing_else(name: str, rotor: Rotor, low: fl
     assert low < reading.change < high
 
 
+@pytest.mark.slow
 def test_little_healthy_data_widens_every_interval_and_they_still_hold() -> None:
     sizes = plan(hops=6)
     short = BaselineDiagnostician(learn_baseline(windows(simulate(ROTOR, Excitation(), 33, 5), sizes)))
@@ -74,6 +76,7 @@ def test_little_healthy_data_widens_every_interval_and_they_still_hold() -> None
         assert np.all(np.diag(little.common)[:4] > np.diag(much.common)[:4])
 
 
+@pytest.mark.slow
 def test_sensor_noise_does_not_bias() -> None:
     clean = BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 3, noise=1e-4)))
     noisy = recorded(ROTOR, OTHER, 2, 3, noise=0.05, noise_memory_s=0.002)

@@ -71,6 +71,7 @@ def test_a_condition_with_another_bearing_is_found_and_widens_later_intervals() 
     assert vertical.allowance < 3
 
 
+@pytest.mark.slow
 def test_an_unphysical_relation_is_not_determined() -> None:
     first, second = baseline().relations
     assert first is not None

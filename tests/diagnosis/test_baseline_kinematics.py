@@ -104,6 +104,7 @@ def test_kernels_differentiate_within_their_passband(deepest: int) -> None:
             assert np.max(np.abs(over.values[order] @ wave - expected)) < 0.02 * np.abs(expected[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "states", [DISPLACEMENTS, VELOCITIES, ACCELERATIONS, ("y1", "z1", "y2_dot", "z2_dot")], ids=lambda x: x[-1]
 )

@@ -49,6 +49,7 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(trained: Equati
     assert abs(np.median([reading[1].z or 0.0 for reading in readings])) < 2  # c_by did not change
 
 
+@pytest.mark.slow
 def test_training_is_reproducible_and_progress_is_told() -> None:
     equation, told = EQUATIONS[1], list[float]()
     material = windows(LAB, Purpose.TRAINING, 6, equation.kept_nominal)
@@ -84,6 +85,7 @@ def test_amortised_networks_survive_the_round_trip(tmp_path: Path) -> None:
         save_bundle(tmp_path / "other", LAB, shipped.networks, MADE, uncalibrated)
 
 
+@pytest.mark.slow
 def test_an_uncalibrated_network_is_not_saved(trained: EquationNetwork, tmp_path: Path) -> None:
     with pytest.raises(BundleError, match="equation 28 has no healthy spread"):
         save_bundle(tmp_path, LAB, (EquationNetwork(trained.equation, trained.network, None),), MADE)

@@ -62,6 +62,7 @@ def renewed(running: MachineMonitor, kept: dict[int, bytes], build: Callable[[],
     return again
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("machine", MACHINES)
 def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str) -> None:
     """Statistics, readings, verdicts and alarms; stopped in warming, at hops, between them, around gap and fault."""

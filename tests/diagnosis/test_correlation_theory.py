@@ -39,6 +39,7 @@ def windows(condition: Scenario) -> list[WindowStatistics]:
     return [simulated(condition, SEED + number) for number in range(16)]
 
 
+@pytest.mark.slow
 def test_correlation_functions_agree_with_theory(condition: Scenario, windows: list[WindowStatistics]) -> None:
     """Sixteen independent windows: every correlation at every lag within 5.5 standard errors of their mean.
 

@@ -32,6 +32,7 @@ def recorded(seed: int, count: int, change: float = 0.0, condition: int = 1) -> 
     return tuple(windows_of(samples, plan(rotor, WindowSizes(length_s=LENGTH_S), PROBES)))
 
 
+@pytest.mark.slow
 def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_windows() -> None:
     rate = 0.05
     for healthy in (4, 12):
@@ -64,6 +65,7 @@ def test_a_lost_fifth_of_stiffness_is_seen_and_never_named() -> None:
     assert [one.channel for one in shape.judge(recorded(1, 6)[0])] == ["y1", "z1", "y2_ddot"]
 
 
+@pytest.mark.slow
 def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
     one_colour = learn_shape(recorded(1, 6))
     other_colours = [recorded(7, 1, condition=number)[0] for number in range(2, 26)]

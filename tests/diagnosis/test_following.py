@@ -3,6 +3,7 @@
 from functools import lru_cache
 
 import numpy as np
+import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.lengths import LengthFits
@@ -39,6 +40,7 @@ def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
     return np.array([one.change or 0.0 for one in read]), np.array([one.standard_error or 0.0 for one in read])
 
 
+@pytest.mark.slow
 def test_a_followed_window_reads_what_a_search_reads() -> None:
     for layout in Layout:
         _, windows = slid(layout)

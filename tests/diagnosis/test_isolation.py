@@ -42,6 +42,7 @@ def draw(rng: np.random.Generator, changed: int, rate: float, smallest: float) -
     return {PARAMETERS[i] for i in at}, isolate_window(window(values, cov), rate)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "windows"), [(0.05, 6_000), (0.01, 20_000)])
 def test_a_healthy_window_is_called_changed_at_the_declared_rate(rate: float, windows: int) -> None:
     rng = np.random.default_rng(SEED)
@@ -51,6 +52,7 @@ def test_a_healthy_window_is_called_changed_at_the_declared_rate(rate: float, wi
     assert 0.75 * expected - 3 * expected**0.5 < called < expected + 3 * expected**0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", [1, 2])
 def test_one_or_two_faults_are_named_exactly(changed: int) -> None:
     """Faults of 6 to 12 of their free standard errors, at 1 % false alarms per window."""
@@ -74,6 +76,7 @@ def test_more_than_two_are_nameable(changed: int) -> None:
     assert np.mean(hits) > 0.98
 
 
+@pytest.mark.slow
 def test_the_confidence_is_calibrated_near_the_limit() -> None:
     """Single faults of 2 to 4 standard errors: verdicts given with 60 to 90 % are right about as often or more."""
     rng = np.random.default_rng(SEED + 50)

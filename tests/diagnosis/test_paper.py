@@ -99,6 +99,7 @@ def test_rows_are_the_papers_from_lag_zero(rig: Machine, training: list[WindowSt
         assert target.shape == (training[0].lags_s.size,)
 
 
+@pytest.mark.slow
 def test_training_fits_its_own_windows_and_is_repeatable(rig: Machine, training: list[WindowStatistics]) -> None:
     first = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
     again = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
@@ -106,6 +107,7 @@ def test_training_fits_its_own_windows_and_is_repeatable(rig: Machine, training:
     assert np.mean([mean_squared_deviation(first, window, rig) for window in training]) < 0.05
 
 
+@pytest.mark.slow
 def test_diagnostician_names_equations_and_no_sizes(
     rig: Machine, training: list[WindowStatistics], healthy: list[WindowStatistics]
 ) -> None:
@@ -124,6 +126,7 @@ def test_diagnostician_names_equations_and_no_sizes(
     assert {"k_by", "c_by"} <= set(paper.flagged_parameters(diagnosis))
 
 
+@pytest.mark.slow
 def test_an_equation_without_its_channels_is_not_evaluated(
     rig: Machine, training: list[WindowStatistics], healthy: list[WindowStatistics]
 ) -> None:

@@ -55,6 +55,7 @@ def fixed_length_s(name: str, change: float) -> float:
     return length_s
 
 
+@pytest.mark.slow
 def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
     """A commissioning that was one of its standard errors off: 64 windows must not make a finding of it."""
     shared = np.zeros((6, 6))
@@ -111,6 +112,7 @@ def test_a_small_change_accumulates_over_windows() -> None:
     assert {f.name for _, verdict in verdicts for f in verdict.findings} == {"c_by"}
 
 
+@pytest.mark.slow
 def test_large_changes_are_named_within_two_hops_and_nothing_else_ever() -> None:
     study = detection_delays(
         SETTINGS, COVARIANCE, {"k_by": -0.25}, trials=40, seed=SEED + 3, before_hops=20, after_hops=40
@@ -129,6 +131,7 @@ def straddling(looks: dict[int, Stretch], since: int, bias: FloatArray) -> dict[
     }
 
 
+@pytest.mark.slow
 def test_what_a_straddling_window_reads_wrong_is_not_named() -> None:
     """k_by drops by 25 %; stretches across the change read c_by up to 7 % too large, five standard errors."""
     for seed in range(20):

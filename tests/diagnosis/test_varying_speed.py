@@ -32,6 +32,7 @@ def test_a_healthy_machine_reads_healthy(ramp: float) -> None:
     assert (diagnosis.misfit_z or 0.0) < 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "change"), [("e", 0.2), ("c_by", -0.2)])
 def test_a_change_is_named_alone(name: str, change: float) -> None:
     diagnosis = read(SEED + 1, 0.1, Event(at_s=0.0, parameter=name, relative_change=change))

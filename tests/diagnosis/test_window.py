@@ -123,6 +123,7 @@ def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[i
         assert_identical(a, b)
 
 
+@pytest.mark.slow
 def test_ten_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
     """After every block of 100 000 samples the sliding estimate is the batch estimate of the same window."""
     plan = Plan(
@@ -297,6 +298,7 @@ def without_angle(plan: Plan) -> Plan:
     return replace(plan, angle_column=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured", [True, False], ids=["phase reference", "estimated speed"])
 def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank(measured: bool) -> None:
     """15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""

@@ -95,6 +95,7 @@ def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tup
     assert accepted(ordered(arriving)) == accepted(stream)
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(
     lateness(3 * N),
