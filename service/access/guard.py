@@ -14,7 +14,9 @@ A route that declares no scope is refused by the gate. How an application is gua
     guard.protect(app)                      # after all of them
 """
 
+import hmac
 import math
+import secrets
 import time
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Callable
@@ -32,7 +34,7 @@ from service.access.origin import SAFE_METHODS, check_origin
 from service.access.presented import address_of, key_of, network_of, presented_text, unauthenticated
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import Requirement, requires
-from service.access.routes import PUBLIC_PATHS, declared_scopes, unguarded_routes
+from service.access.routes import PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, TokenStore, parse_token, token_is_valid
 from service.access_settings import AccessSettings
@@ -113,6 +115,7 @@ class Guard:
         self._host = host.lower()
         self._requests = MovingWindow(limits.requests_per_minute, clock=monotonic)
         self._failures = MovingWindow(limits.failures_per_minute, clock=monotonic)
+        self._secret = secrets.token_bytes(32)
         self._monotonic = monotonic
         self._limiter = Limiter(monotonic)
         self._known: OrderedDict[bytes, _Known] = OrderedDict()
@@ -159,8 +162,8 @@ class Guard:
             caller = Caller(ANONYMOUS, frozenset(Scope), address)
         else:
             caller = await self._authenticated(request, address)
-        wait_s = self._requests.hit(network_of(address) if caller is None else key_of(caller))
-        if wait_s:
+        key = network_of(address) if caller is None else key_of(caller)
+        if not _is_probe(request) and (wait_s := self._requests.hit(key)):
             raise _too_many(f"more than {self.access.limits.requests_per_minute} requests in a minute", wait_s)
         if caller is None:
             raise HTTPException(401, unauthenticated(request))
@@ -216,17 +219,20 @@ class Guard:
             return None
         text = presented_text(request.headers, request.method)
         presented = None if text is None else parse_token(text)
-        network = network_of(address)
-        wait_s = self._failures.wait(network)
-        # Who shares an address with somebody who tries tokens out is not locked out with them.
-        if wait_s and (presented is None or presented.secret_hash not in self._known):
-            raise _too_many("too many attempts with a wrong token from this address", wait_s)
+        # Of what was presented only this is kept, and nobody can tell from it what it was.
+        given = "\n".join(request.headers.getlist("authorization"))
+        identity = hmac.digest(self._secret, given.encode(), "sha256").hex()
+        if wait_s := self._failures.wait(identity):
+            raise _too_many("too many attempts with this wrong token", wait_s)
         record = None if presented is None else await self._looked_up(presented, request.method)
         valid = token_is_valid(record, presented, self._clock_ns())
         if record is None or presented is None or not valid:
             if presented is not None:
                 self._known.pop(presented.secret_hash, None)
-            self._failures.hit(network)
+            self._failures.hit(identity)
+            # Only after the look-up: who shares an address with somebody who tries tokens out is not locked out.
+            if wait_s := self._failures.hit(network_of(address)):
+                raise _too_many("too many attempts with a wrong token from this address", wait_s)
             return None
         granted = frozenset(scope for scope in Scope if scope.value in record.scopes)
         return Caller(record.name, granted, address, record.token_id)
@@ -257,6 +263,10 @@ class Guard:
 
 def _is_public(request: Request) -> bool:
     return request.scope["path"] in PUBLIC_PATHS and request.method in SAFE_METHODS
+
+
+def _is_probe(request: Request) -> bool:
+    return request.scope["path"] in PROBE_PATHS and request.method in SAFE_METHODS
 
 
 def _too_many(detail: str, wait_s: float) -> HTTPException:

@@ -10,10 +10,13 @@ from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from service.access.requirement import Requirement
 from service.access.scopes import Scope
 
-__all__ = ["PUBLIC_PATHS", "declared_scopes", "undeclared_routes", "unguarded_routes"]
+__all__ = ["PROBE_PATHS", "PUBLIC_PATHS", "declared_scopes", "undeclared_routes", "unguarded_routes"]
 
 PUBLIC_PATHS = frozenset(("/healthz",))
 """Paths that anybody may GET."""
+
+PROBE_PATHS = frozenset(("/healthz", "/readyz"))
+"""Paths by which others decide whether to restart the service; however many ask, they are answered."""
 
 
 def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozenset[Scope]:

@@ -86,6 +86,10 @@ def application(guard: Guard, done: list[str]) -> FastAPI:
     def healthz() -> bool:
         return True
 
+    @app.get("/readyz", dependencies=[guard.read])
+    def readyz() -> bool:
+        return True
+
     @app.get("/", dependencies=[guard.read], response_class=HTMLResponse)
     def page() -> str:
         return "<!doctype html><title>t</title>"

@@ -18,6 +18,7 @@ from service.access.audit import STARTED
 from service.access.guard import Guard
 from service.access.scopes import Caller, Scope
 from service.access_settings import AccessSettings, LimitSettings
+from service.store.records import TokenRecord
 from tests.service.guarded import JSON, Guarded, application, basic, guarded, problem
 from tests.service.live import until
 
@@ -101,24 +102,67 @@ def test_so_many_requests_a_minute_of_a_caller(tmp_path: Path) -> None:
             assert refused.headers["retry-after"] == "40"
             assert other.get("/health").status_code == 200
             assert [nobody.get("/health").status_code for _ in range(6)] == [401] * 5 + [429]
-            assert nobody.get("/healthz").status_code == 429
             monitor.clock.now_s += 40.0
             assert one.get("/health").status_code == 200
 
 
 def test_tokens_cannot_be_tried_out(tmp_path: Path) -> None:
     with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
-        in_use, fresh, wrong = monitor.token(READ), monitor.token(READ), monitor.token(READ)[:-3] + "000"
-        with monitor.client(in_use) as client, monitor.client(wrong) as stranger, monitor.client(fresh) as late:
-            assert client.get("/health").status_code == 200
+        wrong = monitor.token(READ)[:-3] + "000"
+        with monitor.client(wrong) as stranger:
             assert [stranger.get("/health").status_code for _ in range(5)] == [401] * 3 + [429] * 2
             assert stranger.get("/health").headers["retry-after"] == "60"
-            # Not even the right one tells anything, unless it was in use before.
-            assert late.get("/health").status_code == 429
-            assert client.get("/health").status_code == 200
             monitor.clock.now_s += 60.0
-            assert late.get("/health").status_code == 200
             assert stranger.get("/health").status_code == 401
+        # Nor by taking another one each time.
+        assert [_asked(monitor, f"{wrong[:-3]}{number:03}") for number in range(1, 5)] == [401] * 2 + [429] * 2
+
+
+def test_wrong_tokens_of_others_lock_nobody_out(tmp_path: Path) -> None:
+    """Behind a proxy that is not named in the settings, everybody has the same address."""
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
+        in_use, fresh, old = monitor.token(READ), monitor.token(READ), monitor.token(READ)
+        assert _asked(monitor, in_use) == 200
+        tried = [_asked(monitor, f"{old[:-3]}{number:03}") for number in range(20)]
+        assert tried == [401] * 3 + [429] * 17
+        assert [_asked(monitor, token) for token in (in_use, fresh, old)] == [200] * 3
+
+
+def test_a_wrong_token_is_looked_up_a_few_times_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with guarded(tmp_path, AccessSettings(limits=LimitSettings(failures_per_minute=3))) as monitor:
+        looked_up: list[str] = []
+        find = monitor.store.tokens.find
+
+        def counted(token_id: str) -> TokenRecord | None:
+            looked_up.append(token_id)
+            return find(token_id)
+
+        monkeypatch.setattr(monitor.store.tokens, "find", counted)
+        wrong = monitor.token(READ)[:-3] + "000"
+        for _ in range(20):
+            _asked(monitor, wrong)
+        assert len(looked_up) == 3
+
+
+def test_probes_are_never_limited_away(tmp_path: Path) -> None:
+    limits = LimitSettings(requests_per_minute=3, failures_per_minute=3)
+    with (
+        guarded(tmp_path, AccessSettings(limits=limits)) as monitor,
+        monitor.client(monitor.token(READ)) as client,
+        monitor.client() as nobody,
+    ):
+        for _ in range(5):
+            client.get("/health")
+            nobody.get("/health")
+        assert [client.get("/health").status_code, nobody.get("/health").status_code] == [429, 429]
+        assert {nobody.get("/healthz").status_code for _ in range(10)} == {200}
+        assert {client.get("/readyz").status_code for _ in range(10)} == {200}
+        assert {nobody.get("/readyz").status_code for _ in range(10)} == {401}
+
+
+def _asked(monitor: Guarded, token: str) -> int:
+    with monitor.client(token) as client:
+        return client.get("/health").status_code
 
 
 def test_so_many_streams(tmp_path: Path) -> None:
