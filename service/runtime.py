@@ -48,6 +48,7 @@ from service.readiness import readiness_of
 from service.recording.catalogue import Catalogue
 from service.recording.recorder import MachineRecorder, RecorderStatus
 from service.store.audit import AuditLog
+from service.store.errors import StoreError
 from service.store.store import Store
 from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.webhooks.desk import WebhookDesk
@@ -242,8 +243,21 @@ class Runtime:
         return machine_link
 
     def stop(self) -> None:
-        """Stop in the reverse order of starting."""
-        self._undo.close()
+        """Stop in the reverse order of starting.
+
+        Raises
+        ------
+        StoreError
+            Saying what is lost, if the history does not take the last of it; everything has stopped all the same.
+        """
+        try:
+            self._undo.close()
+            refused = [f"{worker.history.title}: {worker.refused}" for worker in self._workers if worker.refused]
+            if refused:
+                raise StoreError(f"the history refused the latest step, which is lost: {'; '.join(refused)}")
+        except StoreError as error:
+            _log.error("stopped; not everything is in the history", why=str(error))
+            raise
         _log.info("stopped")
 
 

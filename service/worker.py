@@ -181,10 +181,14 @@ class MachineWorker:
         return self._thread.is_alive()
 
     @property
+    def refused(self) -> Exception | None:
+        """Why the latest step is not in the history as a whole; None if it is, or waits to be."""
+        return self._steps.refused
+
+    @property
     def trouble(self) -> str:
         """Why the machine is not monitored as it should be although data come in; empty if it is."""
-        refused = self._steps.refused
-        reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
+        reasons = [] if self.refused is None else [f"the history refuses what happens: {self.refused}"]
         if self.history.trouble:
             reasons.append(f"the history does not take what happens: {self.history.trouble}")
         if self._unevaluated_s > 2 * self.machine.window.hop_s and not self._silent:

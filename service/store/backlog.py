@@ -79,6 +79,15 @@ class Backlog:
         """Steps that are not in the database yet."""
         return self.waiting.steps + (0 if self.attempt is None else self.attempt.steps)
 
+    def contents(self) -> str:
+        """What is not in the database, in words; with what was dropped to make room."""
+        bundles = [bundle for bundle in (self.attempt, self.waiting) if bundle is not None]
+        numbers = [event.sequence for bundle in bundles for event in bundle.events]
+        n_reports = sum(len(bundle.reports) for bundle in bundles) + self.dropped_reports
+        n_readings = sum(len(bundle.readings) for bundle in bundles) + self.dropped_readings
+        events = f"alarm events {min(numbers)} to {max(numbers)}" if numbers else "alarm events: none"
+        return f"the state to go on from, reports: {n_reports}, readings: {n_readings}, {events}"
+
     def add(self, step: Step, recorded_ns: int, reports: Iterable[PackedReport]) -> None:
         """Append a step to what waits."""
         waiting = self.waiting

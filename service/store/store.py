@@ -123,7 +123,13 @@ class Store:
         self._database.call(self._reduction.start)
 
     def close(self) -> None:
-        """Write what waits, if the database takes it, let go of all machines and end the thread."""
+        """Write what waits, if the database takes it, let go of all machines and end the thread.
+
+        Raises
+        ------
+        StoreError
+            Saying what is lost, if the database does not take it; everything is let go of all the same.
+        """
         if not self._database.is_open:
             return
         try:

@@ -66,17 +66,28 @@ class Writer:
         self._task = asyncio.create_task(self._run())
 
     async def stop(self) -> None:
-        """Write what waits, if the database takes it, and let go of all machines."""
+        """Write what waits, if the database takes it, and let go of all machines.
+
+        Raises
+        ------
+        StoreError
+            Saying what is lost, if the database does not take it.
+        """
         self._stopping.set()
         self._wake.set()
         if self._task is not None:
             await self._task
         await self._disconnect()
         self._files.close()
-        left = {claim.title: claim.backlog.steps for claim in self._claims.values() if claim.backlog.steps}
-        if left:
-            _log.error("steps could not be written before the end", steps=left, why=self.trouble)
+        claims = list(self._claims.values())
         self._claims.clear()
+        lost = [
+            f"{claim.title}: {claim.backlog.contents()} ({self.trouble or claim.trouble})"
+            for claim in claims
+            if claim.backlog.steps
+        ]
+        if lost:
+            raise StoreError(f"could not be written before the end, and is lost: {'; '.join(lost)}")
 
     async def claim(self, site: str, name: str) -> Claim:
         """Register a machine and take the right to write it.
