@@ -8,6 +8,7 @@ from models.physics.parameters import PARAMETER_TEXT
 __all__ = [
     "ALARM_TEXT",
     "CLOCK",
+    "CONFLICT",
     "DATA",
     "FAULT",
     "GAP",
@@ -36,7 +37,7 @@ FAULT, OVERLOADED = "monitor-fault", "monitor-overloaded"
 DATA = "data-"
 """What the names of all alarms of data health begin with."""
 
-GAP, CLOCK, PHASE_REFERENCE = "data-gap", "data-clock", "data-phase-reference"
+GAP, CLOCK, CONFLICT, PHASE_REFERENCE = "data-gap", "data-clock", "data-conflict", "data-phase-reference"
 
 ALARM_TEXT: Mapping[str, str] = MappingProxyType(
     {
@@ -48,6 +49,7 @@ ALARM_TEXT: Mapping[str, str] = MappingProxyType(
         OVERLOADED: "monitor overloaded",
         GAP: "data health, gap",
         CLOCK: "data health, clock",
+        CONFLICT: "data health, conflict of publishers",
         PHASE_REFERENCE: "data health, phase reference",
         "data-stuck": "data health, sensor stuck",
         "data-clipped": "data health, sensor clipped",

@@ -101,6 +101,16 @@ class Arrivals:
         self._next = known if known <= block.sequence <= known + self._bound else block.sequence
         return gone_on + self._place(arrived)
 
+    def withdraw(self, run: int, sequence: int) -> bool:
+        """Take back a block that waits; its place stays open.
+
+        Returns
+        -------
+        bool
+            Whether it waited.
+        """
+        return run == self._run and self._waiting.pop(sequence, None) is not None
+
     def flush(self) -> tuple[Arrived, ...]:
         """Hand on everything that waits: the stream is silent, or the recording has ended."""
         found: list[Arrived] = []

@@ -51,6 +51,7 @@ class Reason(StrEnum):
     SEQUENCE = "sequence"
     PAST = "past"
     FUTURE = "future"
+    CONFLICT = "conflict"
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,7 @@ class Gate:
         schema_hash : str
             Schema hash the sender named, empty if it named none.
         """
-        return self._form(block, schema_hash) or self._place(block)
+        return self.form(block, schema_hash) or self._place(block)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that is remembered, as named arrays."""
@@ -193,7 +194,7 @@ class Gate:
     def _refuse(self, reason: Reason, text: str) -> Verdict:
         return Verdict(reason, f"{self._name}: {text}")
 
-    def _form(self, block: SampleBlock, schema_hash: str) -> Verdict | None:  # noqa: PLR0911  # one return per reason
+    def form(self, block: SampleBlock, schema_hash: str = "") -> Verdict | None:  # noqa: PLR0911  # one return per reason
         """Refuse a block whose form is wrong, whatever its time."""
         settings, n_samples = self._settings, block.samples.shape[0]
         if schema_hash and schema_hash != self._schema_hash:

@@ -29,7 +29,8 @@ from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Gate, Reason, Verdict
-from models.signals.block import SampleBlock
+from models.senders import Senders
+from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState
@@ -60,6 +61,7 @@ class MachineMonitor:
         self._evaluator = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
+        self._senders = Senders()
         self._arrivals = Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
@@ -81,8 +83,7 @@ class MachineMonitor:
         self._fault = ""
         self._defect: Exception | None = None
         self._statistics: WindowStatistics | None = None
-        self._newest: deque[SampleBlock] = deque()
-        self._newest_samples = 0
+        self._newest = NewestBlocks(_NEWEST_SAMPLES)
 
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
@@ -108,6 +109,10 @@ class MachineMonitor:
         except WireError as error:
             name = f"{self.machine.site}/{self.machine.name}"
             return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
+        if self._disputed(block, schema_hash):
+            text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
+            verdict = Verdict(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
+            return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
         self._due.extend(self._arrivals.take(block, schema_hash))
@@ -117,6 +122,18 @@ class MachineMonitor:
         """Take the blocks that wait for earlier ones: those will not come any more."""
         self._due.extend(self._arrivals.flush())
         return self._step_due()
+
+    def _disputed(self, block: SampleBlock, schema_hash: str) -> bool:
+        """Whether a block contradicts one that has come; what is known of publishers is brought to the alarm."""
+        if self._gate.form(block, schema_hash) is not None:
+            return False  # refused anyway
+        disputed = self._senders.take(block)
+        if disputed and not self._arrivals.withdraw(block.run, block.sequence):
+            self._window.gap()  # the other version may be in the unfinished hop
+        conflict = self._senders.conflict
+        if conflict:
+            self._data_path.conflict(conflict, block.end_ns if self._end_ns is None else self._end_ns, at_once=True)
+        return disputed
 
     def _step_due(self) -> tuple[MonitorReport, ...]:
         """Take what is due; a defect that one block brings to light leaves the others for the next time."""
@@ -161,7 +178,7 @@ class MachineMonitor:
         """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
         if not verdict.continuous:
             self._window.gap()
-        self._keep(block, continuous=verdict.continuous and not verdict.clock_step_s)
+        self._newest.add(block, continuous=verdict.continuous and not verdict.clock_step_s)
         if verdict.clock_step_s:
             self._window.clear()
             self._kept_is_valid = False  # hops may end at the same times as before
@@ -225,7 +242,7 @@ class MachineMonitor:
     @property
     def blocks(self) -> tuple[SampleBlock, ...]:
         """The newest blocks, without a gap, about 20 000 samples at most."""
-        return tuple(self._newest)
+        return self._newest.blocks
 
     @property
     def next_sequence(self) -> int:
@@ -321,16 +338,6 @@ class MachineMonitor:
             self._end_ns,
         )
 
-    def _keep(self, block: SampleBlock, *, continuous: bool) -> None:
-        """Hold the newest blocks for whoever wants to see samples."""
-        if not continuous:
-            self._newest.clear()
-            self._newest_samples = 0
-        self._newest.append(block)
-        self._newest_samples += block.samples.shape[0]
-        while self._newest_samples - self._newest[0].samples.shape[0] >= _NEWEST_SAMPLES:
-            self._newest_samples -= self._newest.popleft().samples.shape[0]
-
     def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Verdict:
         """What the gate says; of the data that another monitor had before this one it knows nothing."""
         anew = not self._gate.courses
@@ -386,6 +393,7 @@ class MachineMonitor:
     def _evaluated(self, end_ns: int) -> WindowReport:
         filled = self._window.filled
         self._data_path.hop(end_ns)
+        self._data_path.conflict(self._senders.conflict, end_ns)
         statistics = self._statistics = self._window.statistics()
         if statistics is None:
             return WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)

@@ -1,11 +1,12 @@
 """A block of samples: the unit that travels, is refused, recorded and replayed."""
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["FloatArray", "SampleBlock"]
+__all__ = ["FloatArray", "NewestBlocks", "SampleBlock"]
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -39,3 +40,33 @@ class SampleBlock:
         """Acquisition time of the sample after the last one."""
         n_samples: int = self.samples.shape[0]
         return self.start_ns + round(n_samples * 1e9 / self.rate_hz)
+
+
+class NewestBlocks:
+    """The newest blocks without a gap, for whoever wants to see samples.
+
+    Parameters
+    ----------
+    n_samples : int
+        As many blocks as hold at least so many samples.
+    """
+
+    def __init__(self, n_samples: int) -> None:
+        self._enough = n_samples
+        self._blocks: deque[SampleBlock] = deque()
+        self._held = 0
+
+    @property
+    def blocks(self) -> tuple[SampleBlock, ...]:
+        """Oldest first."""
+        return tuple(self._blocks)
+
+    def add(self, block: SampleBlock, *, continuous: bool) -> None:
+        """Append a block; if it does not continue the others, these are forgotten."""
+        if not continuous:
+            self._blocks.clear()
+            self._held = 0
+        self._blocks.append(block)
+        self._held += block.samples.shape[0]
+        while self._held - self._blocks[0].samples.shape[0] >= self._enough:
+            self._held -= self._blocks.popleft().samples.shape[0]

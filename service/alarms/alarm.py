@@ -4,7 +4,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from models.alarm_names import CLOCK, FAULT, GAP, MODEL, OVERLOADED, PHASE_REFERENCE, SHAPE, STREAM_LOST, alarm_text
+from models.alarm_names import (
+    CLOCK,
+    CONFLICT,
+    FAULT,
+    GAP,
+    MODEL,
+    OVERLOADED,
+    PHASE_REFERENCE,
+    SHAPE,
+    STREAM_LOST,
+    alarm_text,
+)
 from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
@@ -20,6 +31,7 @@ _CLEARED: Mapping[str, str] = MappingProxyType(
         OVERLOADED: "the monitor keeps up again",
         GAP: "the data are without gaps again",
         CLOCK: "the clock of the data runs steadily again",
+        CONFLICT: "one publisher sends, and does not contradict itself",
         PHASE_REFERENCE: "the phase reference is there again",
     }
 )

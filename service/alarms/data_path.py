@@ -1,6 +1,6 @@
 """Alarms that say nothing of the machine: on the stream, its clock, the sensors, and the monitor itself."""
 
-from models.alarm_names import CLOCK, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
+from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
 from models.diagnosis.sensors.finding import FAULT_KINDS, SensorFinding
 from models.diagnosis.window import WindowStatistics
 from models.ingest import Verdict
@@ -58,6 +58,10 @@ class DataPathAlarms:
         """Time has passed since the end of the newest data."""
         if end_ns is not None and time_ns - end_ns >= self._silence_ns:
             self._lost(end_ns)
+
+    def conflict(self, text: str, time_ns: int, *, at_once: bool = False) -> None:
+        """Publishers contradict each other, or do not; `text` says which."""
+        self._book.update_state(CONFLICT, bool(text), time_ns, text, at_once=at_once)
 
     def hop(self, end_ns: int) -> None:
         """A hop is complete, without a gap: what could have spoiled it is over, unless it is found again."""

@@ -1,14 +1,19 @@
 """Messages made to cost more than they weigh."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import structlog
 
-from models.signals.wire import BLOCK_ENCODING
+from models.alarm_names import CONFLICT, of_the_machine
+from models.commissioning.installed import install
+from models.signals.wire import BLOCK_ENCODING, encode_block
 from service.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
-from tests.service.live import LAB, Feed, endpoint, open_session, service, until
+from service.monitor import MachineMonitor
+from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, service, until
 from tests.service.test_alarm_trouble import bench
 
 KB = 1024
@@ -58,3 +63,41 @@ def test_health_stays_small_whatever_is_sent() -> None:
         until(lambda: sum(worker.health().quality.refused_blocks.values()) == 4, "refusals")
         until(lambda: worker.health().stream.descriptor_mismatch != (), "the descriptor")
         assert len(worker.health().model_dump_json()) < 100 * KB
+
+
+# Two publishers, and forgeries
+
+
+def raised(monitor: MachineMonitor) -> set[str]:
+    return {alarm.name for alarm in monitor.health().alarms if alarm.raised}
+
+
+def test_two_publishers_on_one_key_are_named() -> None:
+    monitor = MachineMonitor(install(LAB, None))
+    ours = scenario_blocks(75.0)
+    theirs = [replace(one, run=2, samples=one.samples[::-1].copy()) for one in ours]
+    for number, (a, b) in enumerate(zip(ours, theirs, strict=True)):
+        monitor.step_payload(*encode_block(a, ""))
+        if number >= 20:
+            monitor.step_payload(*encode_block(b, ""))
+    (alarm,) = [alarm for alarm in monitor.health().alarms if alarm.raised]
+    assert alarm.name == CONFLICT
+    assert "runs 1 and 2" in alarm.note
+    assert monitor.health().quality.accepted == len(ours)  # the first goes on undisturbed
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 5])
+def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
+    monitor = MachineMonitor(install(LAB, None))
+    ours = scenario_blocks(70.0)
+    for number, one in enumerate(ours):
+        later = number + ahead
+        if number % 50 == 30 and later < len(ours):
+            forged = replace(ours[later], samples=(1.4 * ours[later].samples).astype(np.float32))
+            monitor.step_payload(*encode_block(forged, ""))
+        monitor.step_payload(*encode_block(one, ""))
+    monitor.flush()
+    health = monitor.health()
+    assert dict(health.quality.refused)["conflict"] == 14
+    assert CONFLICT in raised(monitor)
+    assert {name for name in raised(monitor) if of_the_machine(name)} == set()
