@@ -9,7 +9,8 @@ RUN python -m venv /opt/venv \
     && touch models/__init__.py service/__init__.py simulator/__init__.py \
     && echo '__version__ = "0"' > rotorwatch/__init__.py \
     && /opt/venv/bin/pip install --constraint constraints.txt . \
-    && /opt/venv/bin/pip uninstall --yes rotorwatch
+    && /opt/venv/bin/pip uninstall --yes rotorwatch \
+    && rm -r build  # or what is older than it would be taken from there
 COPY models models
 COPY rotorwatch rotorwatch
 COPY service service
