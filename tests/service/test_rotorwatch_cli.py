@@ -116,7 +116,7 @@ def test_used_addresses_are_run_time_errors_that_name_them() -> None:
         zenoh = run("run", "--machine", "lab", "--listen", address, "--http-port", "0")
         port = runtime.http_url.rsplit(":", 1)[1]
         http = run("run", "--machine", "lab", "--listen", endpoint(), "--http-port", port)
-    for found, named in ((zenoh, address), (http, f"127.0.0.1 port {port}: Address already in use")):
+    for found, named in ((zenoh, address), (http, f"127.0.0.1 port {port}: ")):
         assert found.returncode == 1
         assert named in found.stderr
         assert found.stdout == ""
