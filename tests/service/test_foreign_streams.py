@@ -12,13 +12,15 @@ from service.monitor import MachineMonitor
 from service.reports import WindowReport
 from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign
 
-DURATION_S = 75.0
+DURATION_S = 80.0
 SEED = 7_730_001
 
 
 def watched(name: str, kind: Foreign, seed: int) -> tuple[list[WindowReport], set[str]]:
     """Reports of full windows, and the alarms that were raised."""
     machine = load_machine(name)
+    alarms = machine.alarms.model_copy(update={"on_delay_s": machine.window.hop_s})
+    machine = machine.model_copy(update={"alarms": alarms})
     monitor = MachineMonitor(install(machine, None))
     windows, raised = [], set()
     for block in as_blocks(machine, foreign(machine, kind, seed, DURATION_S)):
