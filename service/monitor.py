@@ -429,6 +429,10 @@ class MachineMonitor:
         unexplained = evaluation.deciding.unexplained
         if unexplained:
             parameters = tuple(ParameterReading(one.name, one.by, reason=unexplained) for one in parameters)
+        # Where the window straddles a change, what is explained is in the verdict's current readings.
+        reason = "" if verdict.current else unexplained
+        if not unexplained and not evaluation.deciding.evaluable:
+            reason = _why_nothing(evaluation.deciding)
         if evaluation.shapes:
             evidence = Evidence(statistics.start_ns, end_ns)
             self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
@@ -450,7 +454,7 @@ class MachineMonitor:
             else detectable_changes(
                 looks[whole].complete(), self._test.thresholds(whole), self.machine.window.length_s
             ),
-            reason=unexplained or ("" if evaluation.deciding.evaluable else _why_nothing(evaluation.deciding)),
+            reason=reason,
             shapes=evaluation.shapes,
         )
 

@@ -159,7 +159,7 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
     windows, events = feed(MachineMonitor(install(machine, None)), stream_)
     assert windows[-1].state is HealthState.NOT_EVALUABLE
-    assert "speed is 2000 rpm, evaluated are 1320 rpm ± 20%" in windows[-1].reason
+    assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluated is at most 20 %" in windows[-1].reason
     assert windows[-1].parameters == ()
     assert not events
 
