@@ -14,6 +14,7 @@ def readiness_of(
     machines: Sequence[MachineReadiness],
     history_open: bool,
     history_trouble: str,
+    history_lost: str,
     failing_webhooks: Sequence[str],
 ) -> Readiness:
     """Judge.
@@ -29,10 +30,12 @@ def readiness_of(
         The database is connected and its tables are up to date.
     history_trouble : str
         Why it cannot be written; empty if it can.
+    history_lost : str
+        Why something of it is gone; empty if nothing is.
     failing_webhooks : sequence of str
         Name, and what is wrong.
     """
-    reasons = tuple(_reasons(session_open, machines, history_open, history_trouble))
+    reasons = tuple(_reasons(session_open, machines, history_open, history_trouble, history_lost))
     return Readiness(
         ready=not reasons,
         reasons=reasons,
@@ -45,7 +48,11 @@ def readiness_of(
 
 
 def _reasons(
-    session_open: bool, machines: Sequence[MachineReadiness], history_open: bool, history_trouble: str
+    session_open: bool,
+    machines: Sequence[MachineReadiness],
+    history_open: bool,
+    history_trouble: str,
+    history_lost: str,
 ) -> Iterator[str]:
     if not session_open:
         yield "the Zenoh session is closed: nothing arrives and nothing is published"
@@ -53,6 +60,8 @@ def _reasons(
         yield "the history is not open, or its tables are not up to date"
     if history_trouble:
         yield f"the history cannot be written, what happens waits in memory: {history_trouble}"
+    if history_lost:
+        yield f"{history_lost}; see docs/history.md, and start the monitor again when it is seen to"
     for machine in machines:
         place = f"{machine.site}/{machine.machine}"
         if not machine.worker_alive:

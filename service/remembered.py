@@ -94,11 +94,16 @@ class StepWriter:
         self._identity = identity
         self._owed: tuple[AlarmEvent, ...] = ()
         self._kept: tuple[int, ...] = ()
+        self._generation = 0
         self.refused: Exception | None = None
 
     def keeps(self, hops: tuple[int, ...]) -> None:
         """Take note of the hops that are in the history already."""
         self._kept = hops
+
+    def begun_anew(self) -> str:
+        """Why the history has to be given everything again; empty if it has not."""
+        return "" if self._generation == self._history.generation else self._history.news
 
     def owe(self, events: tuple[AlarmEvent, ...]) -> None:
         """Take note of events that go into the next step."""
@@ -115,6 +120,8 @@ class StepWriter:
             Reports and events as they are to be published, and whether all of it is in the database now.
         """
         self.refused = None
+        if (generation := self._history.generation) != self._generation:
+            self._kept, self._generation = (), generation
         reports: tuple[StoredReport, ...] = ()
         told = tuple(self._told(event, recorded_ns) for event in self._owed)
         try:

@@ -153,6 +153,7 @@ class Runtime:
             machines=machines,
             history_open=self._history_open,
             history_trouble=self.store.trouble or self.store.unreachable(),
+            history_lost=self.store.lost,
             failing_webhooks=self.webhooks.failing(),
         )
 
@@ -175,7 +176,9 @@ class Runtime:
             guard = Guard(self.store.tokens, self.store.audit, self.settings.access, self.settings.http.host)
             self._link = Link(self.settings.link)
             undo.callback(self._link.close)
-            self.store.open()
+            self.store.open(set_aside=True)
+            if self.store.lost:
+                _log.error("the history begins anew", why=self.store.lost)
             undo.callback(self.store.close)
             self._history_open = True
             links = []

@@ -168,6 +168,7 @@ class MachineWorker:
             return monitor, ""
         monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
         self._steps.keeps(monitor.hops)
+        self.history.go_on_from(monitor.next_sequence - 1)
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
         # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
@@ -348,6 +349,9 @@ class MachineWorker:
         if now_s - self._ticked_s > _HELD_UP_S:
             self._held_up_s = now_s
         self._ticked_s = now_s
+        if news := self._steps.begun_anew():
+            self._log.error("the history begins anew with what the monitor knows", why=news)
+            self._conclude((), self._monitor.fault(news, self._data_now_ns()), always=True)
         if len(self.inbox):
             return  # time passes with the blocks that wait
         if self._monitor.end_ns is not None:

@@ -282,7 +282,8 @@ class AlarmBook:
         text : str
             JSON.
         next_sequence : int, optional
-            Number of the next event by the log, which is the truth; without it what was remembered.
+            Number of the next event by the log. It may be ahead of what was remembered; it is behind only where
+            the log was begun anew.
 
         Raises
         ------
@@ -295,7 +296,7 @@ class AlarmBook:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
         # Another version of the program may have known others.
         self._alarms = {alarm.name: alarm for alarm in page.alarms if alarm.name in ALARM_TEXT}
-        self._next_sequence = page.next_sequence if next_sequence is None else next_sequence
+        self._next_sequence = max(page.next_sequence, next_sequence or 0)
         self._untold = []
 
     # Inside

@@ -2,19 +2,22 @@
 
 import asyncio
 import os
+import sqlite3
 import threading
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
+from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, event, make_url
+from sqlalchemy import URL, Connection, event, make_url, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, create_async_engine
 from sqlalchemy.sql.schema import Table
 
-from service.store.errors import StoreError
+from service.store.errors import DamagedError, StoreError
 from service.store.schema import migrate
 
 __all__ = ["Database"]
@@ -25,6 +28,10 @@ _T = TypeVar("_T")
 _ANSWER_S = 60.0  # at least; a query over a long time may take a while
 _JOIN_S = 10.0
 _IMMEDIATE = "rotorwatch_immediate"
+_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_hops", "series", "tokens", "webhook_cursors")
+"""Tables without which a monitor cannot go on; to look through the others would take minutes."""
+_COMPANIONS = ("", "-wal", "-shm")
 _FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://user:password@host/database"
 
 
@@ -37,6 +44,17 @@ class Database:
         ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
     timeout_s : float
         How long to wait for a connection, for a lock that another program holds, or for one transaction, in seconds.
+
+    Attributes
+    ----------
+    generation : int
+        Goes up each time the history is gone on with in another file than before.
+    news : str
+        What happened to the file then.
+    lost : str
+        The same, where something of the history is not in the present file; empty if all of it is.
+    damage : str
+        What SQLite found wrong with the file while it was in use; whoever finds it sets it.
 
     Raises
     ------
@@ -54,11 +72,20 @@ class Database:
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._engine: AsyncEngine | None = None
+        self._identity: tuple[int, int] | None = None
+        self._companions: dict[str, tuple[int, int] | None] = {}
+        self.generation = 0
+        self.news = self.lost = self.damage = ""
         # SQLite has one writer at a time. In memory there is one connection in all, which readers share.
         self._one_writer = asyncio.Lock()
 
-    def start(self) -> None:
+    def start(self, set_aside: bool = False) -> None:
         """Start the thread, connect, and bring the tables up to date.
+
+        Parameters
+        ----------
+        set_aside : bool
+            Whether a file that is damaged is renamed and a new one begun; otherwise it is an error.
 
         Raises
         ------
@@ -71,7 +98,7 @@ class Database:
         self._thread = threading.Thread(target=self._loop.run_forever, name="history", daemon=True)
         self._thread.start()
         try:
-            self.call(self._connect)
+            self.call(self._connect, set_aside)
         except BaseException:
             self.stop()
             raise
@@ -169,17 +196,130 @@ class Database:
         """Begin an INSERT that knows ON CONFLICT."""
         return sqlite.insert(table) if self.is_sqlite else postgresql.insert(table)
 
-    async def _connect(self) -> None:
+    def astray(self) -> str:
+        """Why what is written would not be found at the address any more; empty if it would."""
+        if self.file is None or self._identity is None:
+            return ""
+        found = _identity(self.file)
+        if found is None:
+            return f"{self.shown}: the file was deleted"
+        if found != self._identity:
+            return f"{self.shown}: another file was put in its place"
+        return f"{self.shown}: the file is damaged: {self.damage}" if self.damage else ""
+
+    def found_damaged(self, error: Exception) -> bool:
+        """Whether an error means that the file is damaged, and take note of it if so."""
+        if self.file is None or not _is_damage(error):
+            return False
+        self.damage = str(error.orig if isinstance(error, DBAPIError) else error)
+        return True
+
+    async def rescue(self, source: AsyncConnection | None) -> bool:
+        """Write what a deleted file holds, which is still open, into a new one at its path; say whether that is done.
+
+        Parameters
+        ----------
+        source : AsyncConnection or None
+            Opened before the file was deleted.
+        """
+        if self.file is None or source is None or _identity(self.file) is not None:
+            return False
+        copy = self.file.with_name(f"{self.file.name}.rescued")
+        try:
+            driver = (await source.get_raw_connection()).driver_connection
+            copy.unlink(missing_ok=True)
+            _make_file(copy)
+            target = sqlite3.connect(copy, check_same_thread=False)
+            try:
+                await driver.backup(target)  # type: ignore[union-attr]  # aiosqlite's, as it is SQLite
+            finally:
+                target.close()
+            self._set_aside("deleted")
+            copy.rename(self.file)
+        except (SQLAlchemyError, sqlite3.Error, OSError):
+            copy.unlink(missing_ok=True)
+            return False
+        return True
+
+    async def reconnect(self, why: str, rescued: bool) -> None:
+        """Go on in the file that is at the path now, or in a new one.
+
+        Parameters
+        ----------
+        why : str
+            From `astray`.
+        rescued : bool
+            Whether all that was in the former file is in it.
+
+        Raises
+        ------
+        StoreError, SQLAlchemyError, OSError
+            If that fails; readers have the former file still.
+        """
+        if not rescued and not self.damage:
+            self._set_aside("deleted", only_own=True)
+        former, generation = self._engine, self.generation
+        try:
+            await self._connect(set_aside=True)
+        except BaseException:
+            failed, self._engine = self._engine, former
+            if failed is not None and failed is not former:
+                await failed.dispose()
+            raise
+        if former is not None:
+            await former.dispose()
+        if self.generation == generation:  # not set aside
+            self.generation += 1
+            self.news = f"{why} while it was in use; " + (
+                "all that it held is in a new one" if rescued else "what was recorded before is not in it"
+            )
+            self.lost = "" if rescued else self.news
+
+    async def _connect(self, set_aside: bool) -> None:
+        try:
+            if self.damage and set_aside:
+                raise DamagedError(f"{self.shown}: the file is damaged: {self.damage}")
+            await self._open()
+        except (DamagedError, DBAPIError) as error:
+            if not set_aside or self.file is None or not _is_damage(error):
+                raise
+            await self._disconnect()
+            kept = self._set_aside("damaged")
+            self.news = self.lost = f"{self.failure(error)}: it is kept as {kept}, and the history begins anew"
+            self.generation += 1
+            await self._open()
+        self.damage = ""
+
+    async def _open(self) -> None:
         if self.file is not None:
             self.file.parent.mkdir(parents=True, exist_ok=True)
-            # The file holds hashes of secrets: it is made for its owner alone.
-            os.close(os.open(self.file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+            _make_file(self.file)
         self._engine = self._make_engine()
-        async with self.writing() as connection:
+        async with self.writers.connect() as connection, connection.begin():
             try:
                 await connection.run_sync(migrate)
             except StoreError as error:
                 raise StoreError(f"{self.shown}: {error}") from error
+            for table in _NEEDED if self.file is not None else ():
+                found = (await connection.execute(text(f"PRAGMA quick_check({table})"))).scalars().all()
+                if found != ["ok"]:
+                    raise DamagedError(f"{self.shown}: the file is damaged: table {table}: {found[0]}")
+        if self.file is not None:
+            self._identity = _identity(self.file)
+            self._companions = {end: _identity(self._beside(end)) for end in _COMPANIONS}
+
+    def _beside(self, end: str) -> Path:
+        return Path(f"{self.file}{end}")
+
+    def _set_aside(self, why: str, *, only_own: bool = False) -> Path:
+        """Rename the file and what SQLite keeps beside it; return the new name."""
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        kept = self._beside(f".{why}-{stamp}")
+        for end in _COMPANIONS:
+            there = self._beside(end)
+            if (found := _identity(there)) is not None and (not only_own or found == self._companions.get(end)):
+                there.rename(kept.with_name(kept.name + end))
+        return kept
 
     async def _disconnect(self) -> None:
         engine, self._engine = self._engine, None
@@ -188,9 +328,11 @@ class Database:
 
     def _make_engine(self) -> AsyncEngine:
         if self.is_sqlite:
-            engine = create_async_engine(
-                self._url.set(drivername="sqlite+aiosqlite"), connect_args={"timeout": self.timeout_s}
-            )
+            url = self._url.set(drivername="sqlite+aiosqlite")
+            if self.file is not None:
+                # A file that was deleted must not come back empty with the next reader.
+                url = url.set(database=f"file:{quote(str(self.file))}", query={"mode": "rw", "uri": "true"})
+            engine = create_async_engine(url, connect_args={"timeout": self.timeout_s})
             event.listen(engine.sync_engine, "connect", _prepare_sqlite)
             event.listen(engine.sync_engine, "begin", _begin_sqlite)
             return engine
@@ -209,6 +351,25 @@ class Database:
             )
         except ImportError as error:
             raise StoreError(f"{self.shown}: PostgreSQL needs psycopg: pip install 'rotorwatch[postgres]'") from error
+
+
+def _identity(file: Path) -> tuple[int, int] | None:
+    """What a file is known by, whatever its name; None if there is none."""
+    try:
+        found = file.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _make_file(file: Path) -> None:
+    """Make a file, if there is none, for its owner alone: it holds hashes of secrets."""
+    os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
+
+
+def _is_damage(error: Exception) -> bool:
+    code = getattr(error.orig if isinstance(error, DBAPIError) else error, "sqlite_errorcode", None)
+    return isinstance(error, DamagedError) or (isinstance(code, int) and code & 0xFF in _DAMAGE)
 
 
 def _checked(url: str) -> URL:

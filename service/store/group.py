@@ -50,6 +50,8 @@ class Claim:
         Why the database, which works, does not take what waits; empty if it does.
     retry_s : float
         When that is tried again, by the clock of the history's loop.
+    generation : int
+        Goes up when the history goes on in another file, which may lack what was written before.
     """
 
     machine_id: int
@@ -61,6 +63,7 @@ class Claim:
     lost: StoreError | None = None
     trouble: str = ""
     retry_s: float = 0.0
+    generation: int = 0
 
 
 @dataclass(slots=True)

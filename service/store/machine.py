@@ -58,6 +58,20 @@ class MachineStore:
         """Why the database, which works, does not take what waits; empty if it does."""
         return self._claim.trouble
 
+    @property
+    def generation(self) -> int:
+        """Goes up when the history goes on in another file, which may lack what was written before."""
+        return self._claim.generation
+
+    @property
+    def news(self) -> str:
+        """What happened to the file then."""
+        return self._database.news
+
+    def go_on_from(self, sequence: int) -> None:
+        """Number the next alarm event after this one, where the log of a file that was begun anew has fewer."""
+        self._last_sequence = max(self._last_sequence, sequence)
+
     def last_sequence(self) -> int:
         """Sequence of the latest alarm event that was committed, or waits to be; -1 if there is none."""
         return self._last_sequence

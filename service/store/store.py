@@ -97,6 +97,11 @@ class Store:
         """Why the latest write failed; empty if it did not."""
         return self._writer.trouble
 
+    @property
+    def lost(self) -> str:
+        """Why something of the history is not in the present file; empty if all of it is."""
+        return self._database.lost
+
     def unreachable(self) -> str:
         """Why the database takes no transaction now; empty if it does, also while nothing has to be written."""
 
@@ -104,21 +109,28 @@ class Store:
             async with asyncio.timeout(_PROBE_S), self._database.writing() as connection:
                 await connection.execute(text("SELECT 1"))
 
+        if astray := self._database.astray():
+            return astray
         try:
             self._database.call(ask)
         except StoreError as error:
             return str(error)
         return ""
 
-    def open(self) -> None:
+    def open(self, *, set_aside: bool = False) -> None:
         """Connect, and bring the tables up to date; a store is opened once.
+
+        Parameters
+        ----------
+        set_aside : bool
+            Whether an SQLite file that is damaged is renamed and a new one begun; `lost` says so.
 
         Raises
         ------
         StoreError
             If the database cannot be reached or used.
         """
-        self._database.start()
+        self._database.start(set_aside)
         self._database.call(self._writer.start)
         self._database.call(self._reduction.start)
 

@@ -21,9 +21,10 @@ from service.store.group import Claim, SeriesNumbers, write_group
 from service.store.records import Step
 from service.store.tables import machines
 
-__all__ = ["Writer"]
+__all__ = ["Writer", "lock_file"]
 
 _LOCK = 0x726F746F  # first number of PostgreSQL's advisory locks; the second is the machine's
+_LOOK_S = 2.0  # between looks whether the database is still where it should be
 _PATIENCE = 4.0  # times the database's timeout: others may be before this step
 _log = structlog.get_logger("rotorwatch", part="history")
 
@@ -105,16 +106,23 @@ class Writer:
                 raise
 
     async def _claim(self, connection: AsyncConnection, site: str, name: str) -> Claim:
-        title = f"{site}/{name}"
+        machine_id, owner, steps = await self._take(connection, site, name)
+        backlog = Backlog(self._most_reports)
+        claim = Claim(machine_id, f"{site}/{name}", owner, backlog, steps, generation=self._database.generation)
+        self._claims[machine_id] = claim
+        return claim
+
+    async def _take(self, connection: AsyncConnection, site: str, name: str) -> tuple[int, str, int]:
+        """Take the right to write a machine: its number, the mark left in the database, steps written so far."""
         machine_id = await self._register(connection, site, name)
-        taken = StoreError(f"another monitor writes the history of {title}")
+        taken = StoreError(f"another monitor writes the history of {site}/{name}")
         if machine_id in self._claims:
             raise taken
         owner = secrets.token_hex(16)
         chosen = machines.c.machine_id == machine_id
         with ExitStack() as undo:
             if self._database.file is not None:
-                descriptor = _lock_file(self._database.file, site, name)
+                descriptor = lock_file(self._database.file, site, name)
                 if descriptor is None:
                     raise taken
                 undo.callback(os.close, descriptor)
@@ -122,10 +130,9 @@ class Writer:
                 raise taken
             async with connection.begin():
                 await connection.execute(update(machines).where(chosen).values(owner=owner))
-                steps = await connection.scalar(select(machines.c.steps).where(chosen))
+                steps: int | None = await connection.scalar(select(machines.c.steps).where(chosen))
             self._files.push(undo.pop_all())
-        claim = self._claims[machine_id] = Claim(machine_id, title, owner, Backlog(self._most_reports), steps or 0)
-        return claim
+        return machine_id, owner, steps or 0
 
     async def _register(self, connection: AsyncConnection, site: str, name: str) -> int:
         number = select(machines.c.machine_id).where(machines.c.site == site, machines.c.name == name)
@@ -166,9 +173,9 @@ class Writer:
         while True:
             troubled = any(claim.trouble for claim in self._claims.values())
             with suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), self._retry_s if troubled else None)
+                await asyncio.wait_for(self._wake.wait(), self._retry_s if troubled else _LOOK_S)
             self._wake.clear()
-            while ready := [claim for claim in self._claims.values() if self._due(claim)]:
+            while await self._in_place() and (ready := [claim for claim in self._claims.values() if self._due(claim)]):
                 if await self._write(ready):
                     continue
                 if self._stopping.is_set():
@@ -178,6 +185,45 @@ class Writer:
                         await asyncio.wait_for(self._stopping.wait(), self._retry_s)
             if self._stopping.is_set():
                 return
+
+    async def _in_place(self) -> bool:
+        """Whether the database is at its address; one that was deleted, replaced or damaged is begun anew."""
+        if not self._claims or not (why := self._database.astray()):
+            return True
+        claims = list(self._claims.values())
+        self._fail(claims, why)
+        try:
+            async with self._turn, self._database.alone():
+                await self._begin_anew(why, claims)
+        except Exception as error:
+            # As in `_write`: this task must go on, and try again.
+            self._claims = {claim.machine_id: claim for claim in claims}
+            self._fail(claims, f"{why}; it could not be begun anew: {self._database.failure(error)}")
+            return False
+        _log.error("the history goes on in another file", why=self._database.news)
+        self._recover()
+        return True
+
+    async def _begin_anew(self, why: str, claims: list[Claim]) -> None:
+        """Go on in the file at the address, with the same machines."""
+        rescued = await self._database.rescue(self._connection)
+        await self._disconnect(broken=True)
+        await self._database.reconnect(why, rescued)
+        self._series.clear()
+        self._claims.clear()
+        self._files.close()
+        connection = await self._connected()
+        for claim in claims:
+            site, _, name = claim.title.partition("/")
+            try:
+                claim.machine_id, claim.owner, steps = await self._take(connection, site, name)
+            except StoreError as error:
+                claim.lost = error
+                continue
+            claim.steps = claim.steps if rescued else steps
+            claim.trouble = ""
+            claim.generation = self._database.generation
+            self._claims[claim.machine_id] = claim
 
     def _due(self, claim: Claim) -> bool:
         """Whether something of the machine is to be written now; what the database did not take has to wait."""
@@ -191,7 +237,7 @@ class Writer:
         except Exception as error:
             # Nothing narrower: whatever a driver raises, this task must go on, or no machine would be written again.
             await self._disconnect(broken=True)
-            if _is_operational(error):
+            if self._database.found_damaged(error) or _is_operational(error):
                 self._fail(ready, str(self._database.failure(error)))
             elif len(ready) > 1:
                 # The database is well, one machine's step is not: the others shall not wait for it.
@@ -293,7 +339,7 @@ async def _lock_row(connection: AsyncConnection, machine_id: int) -> bool:
         return bool(await connection.scalar(query, {"high": _LOCK, "low": machine_id}))
 
 
-def _lock_file(file: Path, site: str, name: str) -> int | None:
+def lock_file(file: Path, site: str, name: str) -> int | None:
     """Lock the file beside the database that stands for one machine; None if another has it.
 
     The system lets go of it when the process ends, however it ends.

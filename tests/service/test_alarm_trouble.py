@@ -224,15 +224,15 @@ def test_a_network_that_is_gone_fails_no_operation(tmp_path: Path) -> None:
         assert at.worker.last_error == "OSError: no route"
 
 
-def test_the_log_says_which_number_comes_next() -> None:
-    """Events that were never committed leave no hole: the history takes none that comes after one."""
+@pytest.mark.parametrize(("by_the_log", "expected"), [(5, 5), (1, 3)], ids=["log ahead", "log begun anew"])
+def test_no_number_of_an_event_is_given_twice(by_the_log: int, expected: int) -> None:
     book = AlarmBook(AlarmSettings())
     for _ in range(3):
         book.operate(order("shelve", "k_by"), 0)
     again = AlarmBook(AlarmSettings())
-    again.restore(book.checkpoint(), next_sequence=1)
+    again.restore(book.checkpoint(), next_sequence=by_the_log)
     (event,) = again.operate(order("unshelve", "k_by"), 1)
-    assert event.sequence == 1
+    assert event.sequence == expected
 
 
 def test_alarms_of_another_version_are_left_aside() -> None:

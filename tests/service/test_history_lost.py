@@ -3,8 +3,21 @@
 import sqlite3
 from pathlib import Path
 
-from tests.service.live import endpoint, machine_file
+import pytest
+
+from models.alarm_names import FAULT
+from service.config import HistorySettings
+from service.runtime import running as running_here
+from service.store.records import TokenRecord
+from service.store.retention import Retention
+from service.store.store import Store
+from tests.service.live import endpoint, machine_file, settings, until
+from tests.service.monitored import client
+from tests.service.test_alarm_trouble import Bench, bench, block
+from tests.service.test_store import AUDIT, T0
 from tests.service.test_survives import PATIENT, running
+
+TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
 
 
 def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_path: Path) -> None:
@@ -17,3 +30,117 @@ def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_pat
         (said,) = [line for line in at.errors().splitlines() if line.startswith("could not be written")]
         assert "demo/lab: the state to go on from" in said
         assert "database is locked" in said
+
+
+def history_of(folder: Path) -> Path:
+    return folder / "history.sqlite"
+
+
+def in_file(folder: Path, query: str) -> list[tuple[object, ...]]:
+    """What is found at the path, by whoever opens it."""
+    with sqlite3.connect(history_of(folder)) as connection:
+        found = connection.execute(query).fetchall()
+    connection.close()
+    return found
+
+
+def ticked(at: Bench) -> bool:
+    """Let time pass for the monitor, as the supervisor does."""
+    at.tick()
+    return True
+
+
+def test_a_deleted_history_is_written_again_with_all_it_held(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        at.store.tokens.add(TOKEN)
+        at.store.audit.append(AUDIT)
+        before = at.log()
+        assert before
+        history_of(tmp_path).unlink()
+        assert "the file was deleted" in at.store.unreachable()
+        until(lambda: history_of(tmp_path).exists() and at.store.unreachable() == at.store.trouble == "", "a new file")
+        until(lambda: ticked(at) and len(at.log()) > len(before), "the alarm")
+        at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 15)))
+        log = at.log()
+        assert log[: len(before) + 1] == [*before, (len(before), "raised", FAULT)]
+        assert at.store.lost == ""
+        assert at.history.waiting == 0
+    assert in_file(tmp_path, "SELECT sequence, kind, alarm FROM alarm_events ORDER BY sequence")[: len(log)] == log
+    assert in_file(tmp_path, "SELECT token_id FROM tokens") == [("aaaa",)]
+    assert in_file(tmp_path, "SELECT count(*) FROM audit_log") == [(1,)]
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+        assert at.log()[: len(log)] == log
+
+
+@pytest.mark.parametrize("damaged", [False, True], ids=["another", "damaged"])
+def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_path: Path, damaged: bool) -> None:
+    other = tmp_path / "other"
+    if damaged:
+        other.write_bytes(b"no database " * 1000)
+    else:
+        store = Store(f"sqlite:///{other}", Retention())
+        store.open()
+        store.close()
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 35)))
+        last = at.history.last_sequence()
+        hops = in_file(tmp_path, "SELECT count(*) FROM checkpoint_hops")
+        assert last >= 0
+        other.rename(history_of(tmp_path))
+        until(lambda: at.store.lost != "", "the notice")
+        until(lambda: ticked(at) and at.history.last_sequence() > last, "the alarm")
+        until(lambda: at.history.waiting == 0, "the state in the new file")
+        assert at.log() == [(last + 1, "raised", FAULT)]
+        assert in_file(tmp_path, "SELECT count(*) FROM checkpoint_hops") == hops != [(0,)]
+        # Nobody else gets the machine meanwhile.
+        second = Store(f"sqlite:///{history_of(tmp_path)}", Retention())
+        second.open()
+        with pytest.raises(Exception, match="another monitor writes the history of demo/lab"):
+            second.machine("demo", "lab")
+        second.close()
+    assert len(list(tmp_path.glob("history.sqlite.damaged-*"))) == damaged
+    with bench(tmp_path) as at:
+        assert at.worker.restart.startswith("went on where it stood")
+        at.put(block(90, run=3, sequence=0))
+        assert [number for number, _, _ in at.log()][:2] == [last + 1, last + 2]
+
+
+def test_a_machine_without_a_new_alarm_keeps_its_numbers_in_a_file_begun_anew(tmp_path: Path) -> None:
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        last = at.history.last_sequence()
+    with sqlite3.connect(history_of(tmp_path)) as connection:
+        connection.executescript("DROP TRIGGER alarm_events_no_delete; DELETE FROM alarm_events;")
+    connection.close()
+    with bench(tmp_path) as at:
+        assert at.history.last_sequence() == last
+        at.put(block(90, run=3, sequence=0))
+        assert at.log()[0][0] == last + 1
+
+
+@pytest.mark.parametrize("where", ["head", "tables"])
+def test_a_monitor_starts_with_a_damaged_history_and_keeps_it_aside(tmp_path: Path, where: str) -> None:
+    file = history_of(tmp_path)
+    plan = settings(endpoint(), machine_file(tmp_path, PATIENT))
+    plan = plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")})
+    with running_here(plan):
+        pass
+    data = bytearray(file.read_bytes())
+    start = 0 if where == "head" else 8192
+    data[start:] = b"\xa5" * (len(data) - start)
+    file.write_bytes(data)
+    with running_here(plan) as runtime, client(runtime) as http:
+        (kept,) = tmp_path.glob("history.sqlite.damaged-*Z")
+        assert kept.read_bytes() == data
+        answer = http.get("/readyz")
+        assert answer.status_code == 503
+        (reason,) = answer.json()["reasons"]
+        assert str(kept) in reason
+        worker = runtime.machines()[0]
+        until(lambda: FAULT in {alarm.name for alarm in worker.alarms().alarms}, "the alarm")
+        assert runtime.store.unreachable() == ""
+    with running_here(plan) as runtime:
+        assert runtime.readiness().ready

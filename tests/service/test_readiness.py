@@ -142,7 +142,8 @@ def started(plan: ServiceSettings) -> list[str]:
 )
 def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> None:
     good: dict[str, object] = {
-        "session_open": True, "history_open": True, "history_trouble": "", "failing_webhooks": ("pager: 404",),
+        "session_open": True, "history_open": True, "history_trouble": "", "history_lost": "",
+        "failing_webhooks": ("pager: 404",),
         "machines": [machine()],
     }  # fmt: skip
     assert readiness_of(**good).ready  # type: ignore[arg-type]  # as below
@@ -153,7 +154,12 @@ def test_each_reason_in_a_sentence(change: dict[str, object], reason: str) -> No
 def test_the_trouble_of_one_machine_is_a_reason_that_names_it() -> None:
     machines = [machine(), machine(machine="pump", trouble="no window was evaluated")]
     found = readiness_of(
-        session_open=True, machines=machines, history_open=True, history_trouble="", failing_webhooks=()
+        session_open=True,
+        machines=machines,
+        history_open=True,
+        history_trouble="",
+        history_lost="",
+        failing_webhooks=(),
     )
     assert found.reasons == ("demo/pump: no window was evaluated",)
 
