@@ -64,6 +64,7 @@ def health(
     stream: StreamStatus,
     *,
     queue_dropped_blocks: int = 0,
+    unread_messages: int = 0,
     link_missed_blocks: int = 0,
     worker_errors: int = 0,
     last_worker_error: str = "",
@@ -95,7 +96,7 @@ def health(
         sensors=() if window is None else window.sensors,
         shapes=() if window is None else window.shapes,
         alarms=alarm_entries(record.alarms),
-        quality=_quality(record.quality, queue_dropped_blocks, link_missed_blocks),
+        quality=_quality(record.quality, queue_dropped_blocks, link_missed_blocks, unread_messages),
         stream=stream,
         restart=restart,
         worker_errors=worker_errors,
@@ -284,10 +285,11 @@ def _shapes(shapes: Iterable[ChannelShape]) -> tuple[Shape, ...]:
     )
 
 
-def _quality(quality: DataQuality, queue_dropped_blocks: int, link_missed_blocks: int) -> Quality:
+def _quality(quality: DataQuality, queue_dropped_blocks: int, link_missed_blocks: int, unread_messages: int) -> Quality:
+    unread = {"unread": unread_messages} if unread_messages else {}
     return Quality(
         accepted_blocks=quality.accepted,
-        refused_blocks=dict(quality.refused),
+        refused_blocks=dict(quality.refused) | unread,
         gaps=quality.gaps,
         missing_s=quality.missing_s,
         queue_dropped_blocks=queue_dropped_blocks,

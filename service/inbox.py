@@ -6,7 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from models.signals.wire import sender_of
+
 __all__ = ["Inbox", "RawBlock"]
+
+_MOST_ODD = 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,45 +33,107 @@ class RawBlock:
 class Inbox:
     """Bounded queue between the network's thread and the machine's worker.
 
+    What cannot be a block, and what others send than the publisher that is followed, costs that publisher no block.
+
     Parameters
     ----------
     bound : int
         Most blocks that wait.
     when_full : {"drop", "wait"}
-        "drop" throws away everything that waits and counts it: one long gap. Dropping block by block would make many
-        short gaps, and each of them costs the hop it falls into. "wait" makes `put` wait for the worker.
+        "drop" throws away what others sent, or else everything that waits, and counts it: one long gap. Dropping block
+        by block would make many short gaps, and each of them costs the hop it falls into. "wait" makes `put` wait for
+        the worker.
+    most_bytes : int
+        Most bytes that wait.
+    may_be_block : callable
+        Whether a message may be one of the machine's blocks. Of those that cannot, a few are handed on, so that
+        it can be said what is wrong with them; the others are counted.
     """
 
-    def __init__(self, bound: int, when_full: Literal["drop", "wait"]) -> None:
+    def __init__(
+        self,
+        bound: int,
+        when_full: Literal["drop", "wait"],
+        most_bytes: int = 2**26,
+        may_be_block: Callable[[RawBlock], bool] = lambda _: True,
+    ) -> None:
         self._bound = bound
         self._wait = when_full == "wait"
+        self._most_bytes = most_bytes
+        self._may_be_block = may_be_block
         self._blocks: deque[RawBlock] = deque()
+        self._bytes = 0
+        self._odd: deque[RawBlock] = deque()
+        self._followed: tuple[str, int | None] | None = None
         self._calls: deque[Callable[[], None]] = deque()
         self._changed = threading.Condition()
         self._closed = False
-        self._dropped = 0
+        self._dropped = self._unread = 0
 
     @property
     def dropped(self) -> int:
         """Blocks thrown away because the queue was full."""
         return self._dropped
 
+    @property
+    def unread(self) -> int:
+        """Messages that could be no blocks, thrown away because too many of them came."""
+        return self._unread
+
     def __len__(self) -> int:
-        return len(self._blocks)
+        return len(self._blocks) + len(self._odd)
+
+    def follow(self, block: RawBlock) -> None:
+        """Take note of a block that was used: its publisher is the one that is followed."""
+        self._followed = sender_of(block.attachment, block.encoding)
 
     def put(self, block: RawBlock) -> None:
         """Append a block; after `close` it is ignored."""
+        odd = not self._may_be_block(block)
         with self._changed:
+            if odd:
+                if len(self._odd) >= _MOST_ODD:
+                    self._unread += 1
+                elif not self._closed:
+                    self._odd.append(block)
+                    self._changed.notify_all()
+                return
             if self._wait:
-                self._changed.wait_for(lambda: self._closed or len(self._blocks) < self._bound)
-            elif len(self._blocks) >= self._bound:
-                self._dropped += len(self._blocks)
-                before = len(self._blocks) + sum(one.dropped_before for one in self._blocks)
-                self._blocks.clear()
-                block = replace(block, dropped_before=before)
+                self._changed.wait_for(lambda: self._closed or not self._is_full)
+            elif self._is_full:
+                made = self._room_for(block)
+                if made is None:
+                    return
+                block = made
             if not self._closed:
                 self._blocks.append(block)
+                self._bytes += len(block.payload)
                 self._changed.notify_all()
+
+    @property
+    def _is_full(self) -> bool:
+        return len(self._blocks) >= self._bound or self._bytes >= self._most_bytes
+
+    def _is_followed(self, block: RawBlock) -> bool:
+        return self._followed is None or sender_of(block.attachment, block.encoding) == self._followed
+
+    def _room_for(self, block: RawBlock) -> RawBlock | None:
+        """Make room: others go first. The block with what was dropped before it, or None if it has to go itself."""
+        followed = deque(one for one in self._blocks if self._is_followed(one))
+        others = len(self._blocks) - len(followed)
+        if others:
+            self._dropped += others
+            self._blocks = followed
+            self._bytes = sum(len(one.payload) for one in followed)
+            return block
+        if not self._is_followed(block):
+            self._dropped += 1
+            return None
+        self._dropped += len(followed)
+        before = len(followed) + sum(one.dropped_before for one in followed)
+        self._blocks.clear()
+        self._bytes = 0
+        return replace(block, dropped_before=before)
 
     def call(self, function: Callable[[], None]) -> bool:
         """Have a function called by the worker before the next block; False after `close`: it will not be."""
@@ -80,12 +146,15 @@ class Inbox:
     def get(self) -> RawBlock | Callable[[], None] | None:
         """Take what is to be called, or else the oldest block, waiting for one; None after `close`."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or bool(self._calls) or bool(self._blocks))
+            self._changed.wait_for(lambda: self._closed or bool(self._calls) or len(self) > 0)
             if self._calls:
                 return self._calls.popleft()
             if self._closed:
                 return None
+            if not self._blocks:
+                return self._odd.popleft()
             block = self._blocks.popleft()
+            self._bytes -= len(block.payload)
             self._changed.notify_all()
             return block
 
@@ -94,4 +163,5 @@ class Inbox:
         with self._changed:
             self._closed = True
             self._blocks.clear()
+            self._odd.clear()
             self._changed.notify_all()

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from models.alarm_names import MODEL, SHAPE
+from models.alarm_names import SHAPE
 from models.arrivals import Arrivals, Arrived
 from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
 from models.commissioning.installed import Installed
@@ -24,7 +24,7 @@ from models.diagnosis.moments import HopMoments, plan_for
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.verdict.detectable import detectable_changes
-from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
@@ -424,7 +424,7 @@ class MachineMonitor:
         looks[whole] = _stretch(evaluation.deciding, statistics)
         verdict = self._test.update(looks)
         changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
-        self._alarm(verdict, evaluation.deciding.suspect, end_ns)
+        self._alarms.found(verdict, evaluation.deciding.suspect, end_ns)
         parameters = evaluation.deciding.parameters
         unexplained = evaluation.deciding.unexplained
         if unexplained:
@@ -457,27 +457,6 @@ class MachineMonitor:
             reason=reason,
             shapes=evaluation.shapes,
         )
-
-    def _alarm(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> None:
-        """Bring what was found to the alarms; without clean data they stay where they are."""
-        named = {finding.name for finding in verdict.findings}
-        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.isolation.confidence)
-        for reading in verdict.current:
-            if reading.change is not None and reading.standard_error is not None:
-                self._alarms.update(
-                    reading.name,
-                    reading.change,
-                    reading.standard_error,
-                    end_ns,
-                    named=reading.name in named,
-                    low_confidence=verdict.isolation.outside,
-                    evidence=evidence,
-                    note="" if reading.vector is None else reading.vector.sentence,
-                )
-        if verdict.current or verdict.unexplained:
-            note = verdict.unexplained or (f"best explained by: {suspect}" if suspect else "")
-            outside = verdict.isolation.outside
-            self._alarms.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""

@@ -12,7 +12,7 @@ from rotorwatch.records.health import HealthState
 from service.alarms.alarm import Alarm, AlarmEvent
 from service.residuals import Opinion
 
-__all__ = ["DataQuality", "MachineHealth", "MonitorReport", "MonitorState", "WindowReport"]
+__all__ = ["DataQuality", "MachineHealth", "MonitorReport", "MonitorState", "Tally", "WindowReport"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,3 +177,26 @@ class MachineHealth:
     sequence: int = -1
     reason: str = ""
     end_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """What a worker has done since it started, for whoever measures the service.
+
+    Attributes
+    ----------
+    windows, blocks : int
+        Windows evaluated, blocks taken.
+    step_s : float
+        Time spent in the monitor altogether.
+    commit_s : float
+        Time spent waiting for the history altogether.
+    data_s : float
+        Length of the data taken altogether.
+    """
+
+    windows: int = 0
+    blocks: int = 0
+    step_s: float = 0.0
+    commit_s: float = 0.0
+    data_s: float = 0.0

@@ -4,6 +4,7 @@ What a block brought and what the monitor remembers afterwards are committed to 
 anything published.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -12,6 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from models.commissioning.installed import Installed
+from models.signals.wire import may_be_block
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, StreamStatus
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
@@ -26,12 +28,12 @@ from service.inbox import Inbox, RawBlock
 from service.logs import Limiter, logger
 from service.monitor import MachineMonitor
 from service.remembered import StepWriter, restored
-from service.reports import MachineHealth, MonitorReport, WindowReport
+from service.reports import MachineHealth, MonitorReport, Tally, WindowReport
 from service.snapshots.desk import LatestData, SnapshotDesk
 from service.store.machine import MachineStore
 from service.store.records import StoredEvent, StoredReport
 
-__all__ = ["Clocks", "MachineWorker", "Outlet", "Tally"]
+__all__ = ["Clocks", "MachineWorker", "Outlet"]
 
 _OPERATION_S = 10.0
 _HELD_UP_S = 2.0
@@ -54,29 +56,6 @@ class Clocks:
 
     monotonic_s: Callable[[], float] = time.monotonic
     utc_ns: Callable[[], int] = time.time_ns
-
-
-@dataclass(frozen=True, slots=True)
-class Tally:
-    """What a worker has done since it started, for whoever measures the service.
-
-    Attributes
-    ----------
-    windows, blocks : int
-        Windows evaluated, blocks taken.
-    step_s : float
-        Time spent in the monitor altogether.
-    commit_s : float
-        Time spent waiting for the history altogether.
-    data_s : float
-        Length of the data taken altogether.
-    """
-
-    windows: int = 0
-    blocks: int = 0
-    step_s: float = 0.0
-    commit_s: float = 0.0
-    data_s: float = 0.0
 
 
 class Outlet(Protocol):
@@ -120,7 +99,13 @@ class MachineWorker:
         on_events: Callable[[], None] = lambda: None,
     ) -> None:
         self.machine = machine = installed.machine
-        self.inbox = Inbox(queue.blocks, queue.when_full)
+        n_channels, most_samples = len(machine.sensors), math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
+        self.inbox = Inbox(
+            queue.blocks,
+            queue.when_full,
+            round(queue.mb * 1e6),
+            lambda one: may_be_block(one.payload, one.attachment, one.encoding, n_channels, most_samples),
+        )
         self.history = history
         self.identity = Identity(
             site=machine.site,
@@ -246,6 +231,7 @@ class MachineWorker:
                 descriptor_mismatch=self._mismatch,
             ),
             queue_dropped_blocks=self.inbox.dropped,
+            unread_messages=self.inbox.unread,
             link_missed_blocks=self._missed,
             worker_errors=self.errors,
             last_worker_error=self.last_error,
@@ -397,6 +383,8 @@ class MachineWorker:
         reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
         tally = self.tally
         self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
+        if reports and reports[-1].verdict.accepted:
+            self.inbox.follow(block)
         self._conclude_reports(reports)
 
     def _conclude_reports(self, reports: Sequence[MonitorReport]) -> None:

@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 
 from pydantic import TypeAdapter
 
-from models.alarm_names import ALARM_TEXT, of_the_machine
+from models.alarm_names import ALARM_TEXT, MODEL, of_the_machine
+from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
@@ -85,6 +86,36 @@ class AlarmBook:
         return told
 
     # What the data say
+
+    def found(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> None:
+        """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
+
+        Parameters
+        ----------
+        verdict : SequentialVerdict
+        suspect : str
+            What explains data outside the model best; empty if nothing does.
+        end_ns : int
+            End of the hop.
+        """
+        named = {finding.name for finding in verdict.findings}
+        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.isolation.confidence)
+        for reading in verdict.current:
+            if reading.change is not None and reading.standard_error is not None:
+                self.update(
+                    reading.name,
+                    reading.change,
+                    reading.standard_error,
+                    end_ns,
+                    named=reading.name in named,
+                    low_confidence=verdict.isolation.outside,
+                    evidence=evidence,
+                    note="" if reading.vector is None else reading.vector.sentence,
+                )
+        if verdict.current or verdict.unexplained:
+            note = verdict.unexplained or (f"best explained by: {suspect}" if suspect else "")
+            outside = verdict.isolation.outside
+            self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
     def update(
         self,

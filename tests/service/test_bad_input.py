@@ -58,8 +58,13 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
     "NaN": (Reason.NOT_FINITE, lambda feed: feed.put(with_nan(feed.block())), "channel z1_dot: sample 12 is nan"),
     "repeated": (
         Reason.OVERLAP,
-        lambda feed: feed.put(feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 100_000_000)),
+        lambda feed: feed.put(feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 300_000_000)),
         "a repetition or out of order",
+    ),
+    "two versions": (
+        Reason.CONFLICT,
+        lambda feed: feed.put(feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 100_000_000)),
+        "came in two versions",
     ),
     "number skipped": (Reason.SEQUENCE, lambda feed: feed.put(feed.block(sequence=feed.sequence + 5)), "sequence is"),
     "clock set back": (

@@ -1,6 +1,8 @@
 """Messages made to cost more than they weigh."""
 
 import json
+import struct
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +12,9 @@ import structlog
 
 from models.alarm_names import CONFLICT, of_the_machine
 from models.commissioning.installed import install
-from models.signals.wire import BLOCK_ENCODING, encode_block
+from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, encode_block, sender_of
 from service.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
+from service.inbox import Inbox, RawBlock
 from service.monitor import MachineMonitor
 from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, service, until
 from tests.service.test_alarm_trouble import bench
@@ -101,3 +104,75 @@ def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
     assert dict(health.quality.refused)["conflict"] == 14
     assert CONFLICT in raised(monitor)
     assert {name for name in raised(monitor) if of_the_machine(name)} == set()
+
+
+# Floods
+
+
+def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING) -> RawBlock:
+    header = struct.pack("<qQdBBHI", 0, 0, 2000.0, 1, 1, run, size // 4)
+    return RawBlock(b"\0" * size, header, encoding)
+
+
+def test_what_cannot_be_a_block_costs_no_place() -> None:
+    inbox = Inbox(10, "drop", may_be_block=lambda one: one.encoding == BLOCK_ENCODING)
+    good = [raw(1) for _ in range(10)]
+    for one in good:
+        for _ in range(1000):
+            inbox.put(raw(1, encoding="text/plain"))
+        inbox.put(one)
+    assert inbox.dropped == 0
+    assert [inbox.get() for _ in range(10)] == good
+    assert len(inbox) + inbox.unread == 10_000
+    assert len(inbox) < 100  # a few are looked at
+
+
+def test_another_publisher_costs_the_one_that_is_followed_no_block() -> None:
+    inbox = Inbox(20, "drop")
+    good = [raw(1) for _ in range(15)]
+    inbox.follow(good[0])
+    for one in good:
+        for run in range(2, 50):
+            inbox.put(raw(run))
+        inbox.put(one)
+    kept = [one for one in (inbox.get() for _ in range(len(inbox))) if isinstance(one, RawBlock)]
+    assert [one for one in kept if sender_of(one.attachment, one.encoding)[1] == 1] == good
+
+
+def test_a_queue_is_bounded_in_bytes_too() -> None:
+    inbox = Inbox(1000, "drop", most_bytes=1_000_000)
+    for _ in range(50):
+        inbox.put(raw(1, size=100_000))
+    assert len(inbox) <= 10
+    assert inbox.dropped == 50 - len(inbox)
+
+
+def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
+    """Ten thousand bad messages for every second of good data, at the pace of the data."""
+    address = endpoint()
+    with service(address, bound=100) as (_, worker), open_session(address) as session:
+        feed, stop = Feed(session), threading.Event()
+        bad = [b"", b"rubbish", b"\0" * 7200]
+        sent = [0]
+
+        def flood() -> None:
+            with open_session(address) as other:
+                while not stop.wait(0.01):
+                    for _ in range(100):
+                        sent[0] += 1
+                        kind = (BLOCK_ENCODING, ARROW_ENCODING, "text/plain")[sent[0] % 3]
+                        other.put(LAB.keys.stream, bad[sent[0] % 3], attachment=b"x" * 32, encoding=kind)
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            for _ in range(80):
+                feed.put_good()
+                stop.wait(0.1)  # a block is a tenth of a second
+        finally:
+            stop.set()
+            thread.join()
+        until(lambda: worker.health().quality.accepted_blocks == 80, "all good blocks")
+        health = worker.health()
+        assert (health.quality.gaps, health.quality.queue_dropped_blocks) == (0, 0)
+        assert sum(health.quality.refused_blocks.values()) > 1000  # how many come through is the network's affair
