@@ -41,12 +41,30 @@ _ENV_PREFIX = "ROTORWATCH_"
 
 
 class HttpSettings(BaseModel):
-    """Where the HTTP API is served."""
+    """Where the HTTP API is served, to how many at once, and how long it waits for them."""
 
     model_config = _STRICT
 
     host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on")
     port: int = Field(default=8080, ge=0, le=65535, description="TCP port; 0 takes a free one, which is printed")
+    connections: int = Field(
+        default=300,
+        ge=1,
+        le=100_000,
+        description="most connections at once; never more than a third of the files that the process may open",
+    )
+    connections_per_address: int = Field(
+        default=100, ge=1, le=100_000, description="most connections of one address, proxies of [access] excepted"
+    )
+    head_timeout_s: float = Field(
+        default=10.0, ge=0.1, le=3600.0, description="longest time until the head of a request is there, in seconds"
+    )
+    body_timeout_s: float = Field(
+        default=60.0, ge=0.1, le=86_400.0, description="longest time until its body is there, in seconds"
+    )
+    send_timeout_s: float = Field(
+        default=60.0, ge=0.1, le=86_400.0, description="longest time in which nothing of an answer is taken, in seconds"
+    )
 
 
 class MachineEntry(BaseModel):

@@ -38,6 +38,8 @@ def configure_logging(settings: LogSettings) -> None:
     # The chatter of libraries is of interest only when something is wrong.
     for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx", "alembic"):
         logging.getLogger(name).setLevel(logging.WARNING)
+    # It warns of every request that is no HTTP, which anybody can send.
+    logging.getLogger("uvicorn.error").filters[:] = [_OnceAMinute()]
     structlog.configure(
         processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
         logger_factory=structlog.stdlib.LoggerFactory(),
@@ -53,16 +55,19 @@ def logger(**context: str) -> FilteringBoundLogger:
 
 
 class Limiter:
-    """Lets one line of a kind through per ten seconds and says how many were left out.
+    """Lets one line of a kind through now and then and says how many were left out.
 
     Parameters
     ----------
     clock : callable
         Monotonic seconds.
+    quiet_s : float
+        How long after a line the next one of its kind is let through.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic, quiet_s: float = _QUIET_S) -> None:
         self._clock = clock
+        self._quiet_s = quiet_s
         self._next_s: dict[str, float] = {}
         self._withheld: dict[str, int] = {}
 
@@ -72,5 +77,17 @@ class Limiter:
         if now_s < self._next_s.get(kind, float("-inf")):
             self._withheld[kind] = self._withheld.get(kind, 0) + 1
             return None
-        self._next_s[kind] = now_s + _QUIET_S
+        self._next_s[kind] = now_s + self._quiet_s
         return self._withheld.pop(kind, 0)
+
+
+class _OnceAMinute(logging.Filter):
+    """Lets a warning through once a minute, and every error."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._limiter = Limiter(quiet_s=60.0)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a line is written."""
+        return record.levelno >= logging.ERROR or self._limiter.admit(str(record.msg)) is not None

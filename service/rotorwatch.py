@@ -24,6 +24,7 @@ from service.commands.running import (
     VersionOption,
     exit_codes,
     one_blas_thread,
+    raise_file_limit,
 )
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
@@ -92,6 +93,7 @@ def run(
     """
     with exit_codes():
         one_blas_thread()
+        raise_file_limit()
         from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
         from service.logs import configure_logging  # noqa: PLC0415
         from service.runtime import running  # noqa: PLC0415  # must see the variables set above

@@ -17,29 +17,22 @@ snapshots, or asks it to do something between two blocks (operators; the passing
 is noticed on the monotonic clock; the time of day is used for what is recorded when, and for how long a restart took.
 """
 
-import errno
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-import uvicorn
-from fastapi import FastAPI
-
 from models.commissioning.installed import install
-from models.errors import RotorwatchError
 from models.machine import MachineFile
 from models.signals.keys import MachineKeys
 from rotorwatch.records.health import Health
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
-from service.access.tls import server_arguments
-from service.access_settings import AccessSettings
-from service.config import HttpSettings, ServiceSettings
+from service.config import ServiceSettings
 from service.event_feed import EventFeed
 from service.http.app import create_app
 from service.http.replays import ReplayDesk
+from service.http.server import HttpError, HttpServer
 from service.logs import logger
 from service.metrics.collector import Metrics
 from service.metrics.requests import RequestCounts, RequestMeter
@@ -57,14 +50,8 @@ from service.worker import MachineWorker
 __all__ = ["HttpError", "Runtime", "running"]
 
 _TICK_S = 0.25
-_JOIN_S = 10.0
-_LAST_ANSWERS_S = 5
 
 _log = logger(part="runtime")
-
-
-class HttpError(RotorwatchError):
-    """The HTTP API cannot be served; the message names the address."""
 
 
 class Runtime:
@@ -100,7 +87,7 @@ class Runtime:
         self.replays = ReplayDesk(settings, self.catalogue)
         self._recorders: dict[tuple[str, str], MachineRecorder] = {}
         self._link: Link | None = None
-        self._server: _HttpServer | None = None
+        self._server: HttpServer | None = None
         self._undo = ExitStack()
 
     @property
@@ -171,7 +158,7 @@ class Runtime:
         """
         with ExitStack() as undo:
             # Takes the port first: the commonest mistake, the quickest check.
-            server = _HttpServer(self.settings.http, self.settings.access)
+            server = HttpServer(self.settings.http, self.settings.access)
             undo.callback(server.stop)
             guard = Guard(self.store.tokens, self.store.audit, self.settings.access, self.settings.http.host)
             self._link = Link(self.settings.link)
@@ -335,48 +322,3 @@ def _news(health: Health) -> Health:
             "quality": health.quality.model_copy(update={"accepted_blocks": 0}),
         }
     )
-
-
-def _why(error: OSError) -> str:
-    if error.errno == errno.EADDRINUSE:
-        return "the port is in use: does another program listen there? --http-port 0 takes a free one"
-    return (error.strerror or str(error)).partition(" (while")[0]
-
-
-class _HttpServer:
-    """The HTTP server in a thread of its own; the address is taken when it is built."""
-
-    def __init__(self, settings: HttpSettings, access: AccessSettings) -> None:
-        self._arguments = server_arguments(access)
-        family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
-        try:
-            self._socket = socket.create_server((settings.host, settings.port), family=family)
-            # Without it the end of every answer waits for the other side's acknowledgement, 40 ms.
-            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        except OSError as error:
-            raise HttpError(f"HTTP cannot listen on {settings.host} port {settings.port}: {_why(error)}") from error
-        host = f"[{settings.host}]" if ":" in settings.host else settings.host
-        self.url = f"{'http' if access.tls is None else 'https'}://{host}:{self._socket.getsockname()[1]}"
-        self._server: uvicorn.Server | None = None
-        self._thread: threading.Thread | None = None
-
-    def start(self, app: FastAPI) -> None:
-        """Serve the API."""
-        config = uvicorn.Config(
-            app,
-            log_config=None,
-            access_log=False,
-            lifespan="off",
-            timeout_graceful_shutdown=_LAST_ANSWERS_S,  # for whoever has stopped reading
-            **self._arguments,
-        )
-        server = self._server = uvicorn.Server(config)
-        self._thread = threading.Thread(target=server.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Finish present requests and free the address."""
-        if self._server is not None and self._thread is not None:
-            self._server.should_exit = True
-            self._thread.join(_JOIN_S)
-        self._socket.close()

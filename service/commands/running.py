@@ -1,8 +1,9 @@
 """What the commands share: exit codes, one thread for linear algebra, common options."""
 
 import os
+import resource
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,10 +23,13 @@ __all__ = [
     "VersionOption",
     "exit_codes",
     "one_blas_thread",
+    "raise_file_limit",
 ]
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
+
+_FILES = 65_536
 
 ConnectOption = Annotated[
     list[str] | None,
@@ -86,6 +90,15 @@ def one_blas_thread() -> None:
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
+
+
+def raise_file_limit() -> None:
+    """Let this program open as many files and connections as the system allows it, up to 65 536."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _FILES if hard == resource.RLIM_INFINITY else min(hard, _FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        with suppress(OSError, ValueError):  # where even this is forbidden, it goes on with what there is
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 @contextmanager
