@@ -12,13 +12,17 @@ Everything here runs in the event loop of the server.
 
 import asyncio
 import errno
+import fcntl
 import ipaddress
 import socket
+import struct
+import sys
+import termios
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
@@ -43,6 +47,10 @@ _REFUSAL = (
     "HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/problem+json\r\nretry-after: 5\r\n"
     f"connection: close\r\ncontent-length: {len(_BUSY)}\r\n\r\n{_BUSY}"
 ).encode()
+_BYTES_ACKED = 120
+"""Where ``tcpi_bytes_acked`` is in ``struct tcp_info`` (linux/tcp.h), since Linux 4.1."""
+
+_AT_ONCE = struct.pack("ii", 1, 0)
 _log = logger(part="http")
 
 _Doing = Literal["handshake", "head", "body", "answering"]
@@ -60,6 +68,7 @@ class _Connection:
     doing: _Doing = "handshake"
     request: RequestResponseCycle | None = None
     unsent: int = 0
+    taken: int = 0
     ended: bool = False
     protocol: H11Protocol | None = None
 
@@ -67,10 +76,11 @@ class _Connection:
         """Find out what it does now, and whether anything of an answer was taken."""
         request: RequestResponseCycle | None = None
         doing: _Doing = "handshake"
-        unsent = 0
+        unsent = taken = 0
         if self.protocol is not None:
-            request = self.protocol.cycle
-            unsent = self.protocol.transport.get_write_buffer_size()
+            request = cast("RequestResponseCycle | None", self.protocol.cycle)  # None before the first request
+            taken, queued = _taken_and_queued(self.accepted)
+            unsent = self.protocol.transport.get_write_buffer_size() + queued
             if self.protocol.conn.their_state is h11.SEND_BODY:
                 doing = "body"
             elif (request is None or request.response_complete) and not unsent:
@@ -79,13 +89,15 @@ class _Connection:
                 doing = "answering"
         if doing != self.doing or request is not self.request:
             self.doing, self.request, self.since_s = doing, request, now_s
-        if not unsent or unsent < self.unsent:
+        if not unsent or unsent < self.unsent or taken != self.taken:
             self.taken_s = now_s
-        self.unsent = unsent
+        self.unsent, self.taken = unsent, taken
 
     def end(self) -> None:
-        """End it at once, whatever is unsent."""
+        """End it at once; what is unsent is dropped, or the system would keep it for who knows how long."""
         self.ended = True
+        with suppress(OSError):
+            self.accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
         if self.protocol is not None:
             self.protocol.transport.abort()
             return
@@ -206,6 +218,7 @@ class HttpConnections:
         return [one for one in self._open.values() if not one.ended]
 
     def _look(self, loop: asyncio.AbstractEventLoop) -> None:
+        loop.call_later(_LOOK_S, self._look, loop)
         now_s = self._clock()
         for one in self._present():
             one.look(now_s)
@@ -215,7 +228,6 @@ class HttpConnections:
             elif now_s - one.taken_s > self._send_s:
                 self._say("ended", one.address, f"nothing of the answer was taken for {self._send_s:g} s")
                 one.end()
-        loop.call_later(_LOOK_S, self._look, loop)
 
     def _say(self, what: str, address: str, why: str) -> None:
         withheld = self._limiter.admit(what)
@@ -265,3 +277,15 @@ class _Listener(socket.socket):
             self._pause = False
             raise BlockingIOError
         return accepted, address
+
+
+def _taken_and_queued(connection: socket.socket) -> tuple[int, int]:
+    """Bytes that the other side has acknowledged, and those that the system keeps for it; zeros if it does not tell.
+
+    The system takes megabytes off our hands: our own buffer may stand still for long although the other side reads.
+    """
+    if sys.platform != "linux":
+        return 0, 0
+    (taken,) = struct.unpack_from("Q", connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256), _BYTES_ACKED)
+    (queued,) = struct.unpack("i", fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, bytes(4)))
+    return taken, queued
