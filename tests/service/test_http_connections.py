@@ -91,7 +91,7 @@ def test_requests_whose_body_never_ends_are_ended(access: AccessSettings) -> Non
 def test_streams_and_regular_callers_go_on() -> None:
     """While others are ended, whoever is being answered stays, and so does whoever asks now and then."""
     with (
-        monitor(head_timeout_s=0.5, body_timeout_s=0.5, send_timeout_s=0.5) as runtime,
+        monitor(head_timeout_s=2, body_timeout_s=2, send_timeout_s=2) as runtime,
         connections(runtime.http_url, 3, EVENTS) as streams,
         httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as client,
     ):
@@ -126,7 +126,10 @@ def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
 
 def test_half_open_requests_make_room_for_others() -> None:
     """Nobody waits for them to run out of time: the one that has waited longest goes when somebody else comes."""
-    with monitor(connections_per_address=8) as runtime, connections(runtime.http_url, 60, HEAD) as waiting:
+    with (
+        monitor(connections_per_address=8, head_timeout_s=600) as runtime,
+        connections(runtime.http_url, 60, HEAD) as waiting,
+    ):
         assert healthy(runtime.http_url)
         until(lambda: sum(not over(one) for one in waiting) <= 8, "all but the latest to be ended")
         assert not over(waiting[-1])
@@ -151,7 +154,10 @@ def test_no_more_connections_than_the_settings_say() -> None:
 
 def test_a_proxy_may_have_more_connections_than_others() -> None:
     access = AccessSettings(proxies=("127.0.0.0/24",), limits=LimitSettings())
-    with monitor(access, connections_per_address=2) as runtime, connections(runtime.http_url, 10, HEAD) as waiting:
+    with (
+        monitor(access, connections_per_address=2, head_timeout_s=600) as runtime,
+        connections(runtime.http_url, 10, HEAD) as waiting,
+    ):
         assert healthy(runtime.http_url)
         assert not any(map(over, waiting))
 
