@@ -202,7 +202,7 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
         clash = settings(endpoint()).model_copy(update={"http": HttpSettings(port=port)})
         with pytest.raises(HttpError) as http:
             Runtime(clash).start()
-        assert f"HTTP cannot listen on 127.0.0.1 port {port}: Address already in use" in str(http.value)
+        assert f"HTTP cannot listen on 127.0.0.1 port {port}: the port is in use" in str(http.value)
         second = settings(address)
         failed = Runtime(second)
         with pytest.raises(LinkError) as link:
