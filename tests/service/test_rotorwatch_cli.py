@@ -157,6 +157,20 @@ def test_watch_and_status_without_a_monitor_say_so() -> None:
     assert f"{url}: the monitor's HTTP API does not answer" in found.stderr
 
 
+def test_status_tells_data_that_have_stopped_from_an_alarm(tmp_path: Path) -> None:
+    silence = ("[operation]", "[ingest]\nblock_to_s = 0.2\nno_data_after_s = 0.5\n\n[operation]")
+    address = endpoint()
+    with service(address, machine_file(tmp_path, silence)) as (runtime, worker), open_session(address) as session:
+        Feed(session, worker.machine).put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 1, "a block")
+        until(lambda: "stream-lost" in {one.name for one in worker.alarms().alarms if one.raised}, "the silence")
+        found = run("status", "--url", runtime.http_url, "--json")
+    assert found.returncode == 3
+    said = json.loads(found.stdout)
+    assert said["summary"] == "no-data"
+    assert said["machines"][0]["reason"].startswith("no data since 20")
+
+
 def test_status_names_a_certificate_it_cannot_use(tmp_path: Path) -> None:
     url = f"https://{endpoint().removeprefix('tcp/')}"
     found = run("status", "--url", url, "--ca", str(tmp_path / "ca.pem"))
