@@ -242,7 +242,9 @@ class Runtime:
         """
         try:
             self._undo.close()
-            refused = [f"{worker.history.title}: {worker.refused}" for worker in self._workers if worker.refused]
+            refused = [
+                f"{worker.history.title}: {worker.steps.refused}" for worker in self._workers if worker.steps.refused
+            ]
             if refused:
                 raise StoreError(f"the history refused the latest step, which is lost: {'; '.join(refused)}")
         except StoreError as error:

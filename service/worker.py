@@ -122,7 +122,7 @@ class MachineWorker:
         self._on_events = on_events
         self._log = logger(machine=f"{machine.site}/{machine.name}")
         self._limiter = Limiter(clocks.monotonic_s)
-        self._steps = StepWriter(history, self.identity)
+        self.steps = StepWriter(history, self.identity)
         self._unpublished: tuple[StoredEvent, ...] = ()
         self._asleep_s = 0.0
         self._unevaluated_s = 0.0
@@ -152,7 +152,7 @@ class MachineWorker:
                 monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
         monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
-        self._steps.keeps(monitor.hops)
+        self.steps.keeps(monitor.hops)
         self.history.go_on_from(monitor.next_sequence - 1)
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
         # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
@@ -167,14 +167,10 @@ class MachineWorker:
         return self._thread.is_alive()
 
     @property
-    def refused(self) -> Exception | None:
-        """Why the latest step is not in the history as a whole; None if it is, or waits to be."""
-        return self._steps.refused
-
-    @property
     def trouble(self) -> str:
         """Why the machine is not monitored as it should be although data come in; empty if it is."""
-        reasons = [] if self.refused is None else [f"the history refuses what happens: {self.refused}"]
+        refused = self.steps.refused
+        reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
         if self.history.trouble:
             reasons.append(f"the history does not take what happens: {self.history.trouble}")
         if self._unevaluated_s > 2 * self.machine.window.hop_s and not self._silent:
@@ -335,8 +331,7 @@ class MachineWorker:
         if now_s - self._ticked_s > _HELD_UP_S:
             self._held_up_s = now_s
         self._ticked_s = now_s
-        if news := self._steps.begun_anew():
-            self._log.error("the history begins anew with what the monitor knows", why=news)
+        if news := self.steps.begun_anew():
             self._conclude((), self._monitor.fault(news, self._data_now_ns()), always=True)
         if len(self.inbox):
             return  # time passes with the blocks that wait
@@ -410,7 +405,7 @@ class MachineWorker:
     ) -> tuple[str, ...]:
         """Commit, then let it be seen and publish; returns the events as they are published."""
         events += self._monitor.take_events()  # left behind by a defect
-        self._steps.owe(events)
+        self.steps.owe(events)
         snapshot = self._monitor.health()
         reports: tuple[StoredReport, ...] = ()
         told: tuple[StoredEvent, ...] = ()
@@ -430,16 +425,16 @@ class MachineWorker:
             self._publish([one.text for one in reports], texts)
         except Exception as error:  # the network's, of whatever kind; who lacks an event asks for it
             self._failed(error)
-        if self._steps.refused is not None:
-            self._fault(f"the history refuses what happens: {self._steps.refused}")
+        if self.steps.refused is not None:
+            self._fault(f"the history refuses what happens: {self.steps.refused}")
         return texts
 
     def _commit(self, windows: tuple[WindowReport, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
         """Bring windows, events and the monitor's state into the history, as they are to be published."""
         begin_s = self._clocks.monotonic_s()
-        reports, told, written = self._steps.commit(self._monitor, windows, self._clocks.utc_ns())
-        if self._steps.refused is not None:
-            self._failed(self._steps.refused)
+        reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns())
+        if self.steps.refused is not None:
+            self._failed(self.steps.refused)
         elif not written:
             self._warn("history", "the history cannot be written; what happened waits in memory and is published")
         tally = self.tally

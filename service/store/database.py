@@ -98,7 +98,8 @@ class Database:
         self._thread = threading.Thread(target=self._loop.run_forever, name="history", daemon=True)
         self._thread.start()
         try:
-            self.call(self._connect, set_aside)
+            # Without a limit: bringing the tables of a large history up to date may take minutes.
+            asyncio.run_coroutine_threadsafe(self._guarded(None, self._connect, set_aside), self._loop).result()
         except BaseException:
             self.stop()
             raise
@@ -127,11 +128,14 @@ class Database:
         loop = self._loop
         if loop is None:
             raise StoreError(f"{self.shown}: the history is closed")
-        return asyncio.run_coroutine_threadsafe(self._guarded(function, *args, **kwargs), loop).result()
+        limit_s = max(_ANSWER_S, 10.0 * self.timeout_s)
+        return asyncio.run_coroutine_threadsafe(self._guarded(limit_s, function, *args, **kwargs), loop).result()
 
-    async def _guarded(self, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs) -> _T:
+    async def _guarded(
+        self, limit_s: float | None, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs
+    ) -> _T:
         try:
-            async with asyncio.timeout(max(_ANSWER_S, 10.0 * self.timeout_s)):
+            async with asyncio.timeout(limit_s):
                 return await function(*args, **kwargs)
         except (SQLAlchemyError, OSError, TimeoutError) as error:
             raise self.failure(error) from error

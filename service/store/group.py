@@ -9,7 +9,9 @@ from sqlalchemy import delete, insert, or_, select, update
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from service.store.backlog import Backlog, Bundle
+from service.store.database import Database
 from service.store.errors import StoreError
+from service.store.filling import fill
 from service.store.records import StoredEvent
 from service.store.tables import (
     alarm_events,
@@ -74,21 +76,25 @@ class _Rows:
     reports: list[_Row] = field(default_factory=list)
     evaluations: list[_Row] = field(default_factory=list)
     readings: list[_Row] = field(default_factory=list)
+    in_buckets: list[tuple[int, int, int, float, float | None]] = field(default_factory=list)
 
 
 async def write_group(
-    connection: AsyncConnection, claims: Sequence[Claim], known: SeriesNumbers
+    database: Database, connection: AsyncConnection, claims: Sequence[Claim], known: SeriesNumbers, bucket_ns: int
 ) -> tuple[dict[Claim, StoreError], SeriesNumbers]:
     """Write the attempts of several machines within the connection's transaction.
 
     Parameters
     ----------
+    database : Database
     connection : AsyncConnection
         Within a transaction.
     claims : sequence of Claim
         Each with an attempt.
     known : dict
         Numbers of series by machine, quantity and name, as far as they have been looked up.
+    bucket_ns : int
+        Length of the buckets that readings are added to.
 
     Returns
     -------
@@ -130,6 +136,7 @@ async def write_group(
     ):
         if values:
             await connection.execute(insert(table), values)
+    await fill(database, connection, rows.in_buckets, bucket_ns)
     return refused, new_series
 
 
@@ -215,6 +222,7 @@ def _collect(
                 }
             )
         seen.add(series_id)
+        rows.in_buckets.append((series_id, reading.end_ns, recorded_ns, reading.value, reading.standard_error))
         rows.readings.append(
             {
                 "machine_id": machine_id,

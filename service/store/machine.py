@@ -277,9 +277,10 @@ class MachineStore:
         names : sequence of str, optional
             Which; all if left out.
         since_ns, until_ns : int, optional
-            Windows with since_ns ≤ end_ns < until_ns; all if left out. Where the readings themselves have been dropped,
-            what they were reduced to is taken if its beginning is within; then buckets are multiples of that in length
-            and begin at multiples of it, so the first may begin before `since_ns`.
+            Windows with since_ns ≤ end_ns < until_ns; all if left out. Over more than 20 000 windows, or where readings
+            have been dropped, stored buckets are taken; those returned are multiples of them in length then and begin
+            at multiples of that, so the first may begin before `since_ns`. Only where readings have been dropped, a
+            stored bucket counts as a whole, if its beginning is within.
         points : int
             At most this many buckets for each name; those without a reading are left out.
         """

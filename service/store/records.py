@@ -234,7 +234,7 @@ class TokenRecord:
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """What retention removed: reports, windows whose readings were reduced to buckets, and buckets."""
+    """What retention removed: reports, windows with their readings, and buckets."""
 
     reports: int = 0
     windows: int = 0

@@ -1,17 +1,17 @@
-"""Drops what has been kept long enough, and reduces readings to buckets before they go."""
+"""Drops what has been kept long enough."""
 
 import asyncio
 from collections.abc import Callable
 
 import structlog
-from sqlalchemy import BigInteger, Table, bindparam, case, delete, func, literal, select, text
+from sqlalchemy import Table, bindparam, delete, func, select, text, update
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from service.store.database import Database
 from service.store.records import Dropped
 from service.store.retention import Retention
-from service.store.tables import buckets, evaluations, readings, reports
+from service.store.tables import buckets, evaluations, readings, reports, series
 
 __all__ = ["Reduction"]
 
@@ -59,7 +59,9 @@ class Reduction:
             return Dropped(
                 reports=await self._repeat(reports, now_ns - round(kept.reports_days * _DAY_NS)),
                 windows=await self._repeat(evaluations, now_ns - round(kept.readings_days * _DAY_NS)),
-                buckets=await self._repeat(buckets, now_ns - round(kept.buckets_days * _DAY_NS)),
+                buckets=await self._repeat(
+                    buckets, now_ns - round(max(kept.buckets_days, kept.readings_days) * _DAY_NS)
+                ),
             )
 
     async def _run(self) -> None:
@@ -92,53 +94,17 @@ class Reduction:
             if boundary_ns is None:
                 return 0
             if table is evaluations:
-                await self._reduce(connection, boundary_ns)
+                await self._drop_readings(connection, boundary_ns)
             done = await connection.execute(delete(table).where(table.c.recorded_ns <= boundary_ns))
             return done.rowcount
 
-    async def _reduce(self, connection: AsyncConnection, boundary_ns: int) -> None:
-        """Turn the readings of old windows into buckets."""
-        length_ns = self._retention.bucket_s * 10**9
-        window, reading, stored = evaluations.c, readings.c, buckets.c
-        start = (window.end_ns // length_ns * length_ns).label("start_ns")
-        joined = evaluations.join(
-            readings, (reading.machine_id == window.machine_id) & (reading.number == window.number)
-        )
-        added = (
-            select(
-                reading.series_id,
-                start,
-                literal(length_ns, BigInteger).label("length_ns"),
-                func.max(window.recorded_ns),
-                func.count(),
-                func.min(reading.value),
-                func.max(reading.value),
-                func.sum(reading.value),
-                func.count(reading.standard_error),
-                func.coalesce(func.sum(reading.standard_error), 0.0),
-            )
-            .select_from(joined)
-            .where(window.recorded_ns <= boundary_ns)
-            .group_by(reading.series_id, "start_ns")
-        )
-        made = self._database.insert(buckets).from_select([column.name for column in stored], added)
-        new = made.excluded
-        await connection.execute(
-            made.on_conflict_do_update(
-                index_elements=[stored.series_id, stored.start_ns, stored.length_ns],
-                set_={
-                    "recorded_ns": case(
-                        (new.recorded_ns > stored.recorded_ns, new.recorded_ns), else_=stored.recorded_ns
-                    ),
-                    "count": stored["count"] + new["count"],
-                    "minimum": case((new.minimum < stored.minimum, new.minimum), else_=stored.minimum),
-                    "maximum": case((new.maximum > stored.maximum, new.maximum), else_=stored.maximum),
-                    "total": stored.total + new.total,
-                    "errors": stored.errors + new.errors,
-                    "errors_total": stored.errors_total + new.errors_total,
-                },
-            )
-        )
+    async def _drop_readings(self, connection: AsyncConnection, boundary_ns: int) -> None:
+        """Drop the readings of old windows, which are in buckets since they came, and note how far that reaches."""
+        window, reading, of = evaluations.c, readings.c, series.c
+        latest = select(window.machine_id, func.max(window.end_ns)).where(window.recorded_ns <= boundary_ns)
+        for machine_id, end_ns in (await connection.execute(latest.group_by(window.machine_id))).all():
+            behind = (of.machine_id == machine_id, of.dropped_ns < end_ns)
+            await connection.execute(update(series).where(*behind).values(dropped_ns=end_ns))
         chosen = select(window.machine_id, window.number).where(window.recorded_ns <= boundary_ns)
         gone = [{"of_machine": row.machine_id, "of_window": row.number} for row in await connection.execute(chosen)]
         # One by one along the key: a condition on all of them would make a database look through the whole table.

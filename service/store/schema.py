@@ -15,8 +15,8 @@ __all__ = ["migrate"]
 MIGRATING = (0x726F746F, 0)  # PostgreSQL's advisory lock; second numbers from 1 are machines
 
 
-def migrate(connection: Connection) -> None:
-    """Run the migrations that are missing, in the transaction of the connection.
+def migrate(connection: Connection, revision: str = "head") -> None:
+    """Run the migrations that are missing, up to a revision, in the transaction of the connection.
 
     Raises
     ------
@@ -42,4 +42,4 @@ def migrate(connection: Connection) -> None:
         raise StoreError(
             "the database holds a table 'machines' that is not ours: give the history a database of its own"
         )
-    command.upgrade(config, "head")
+    command.upgrade(config, revision)

@@ -4,7 +4,7 @@
 
     machines' threads --commit--> Writer --one transaction for all that wait--> SQLite or PostgreSQL
     HTTP threads ------queries------------------------------------------------> (or, while it fails, memory)
-                                  Reduction: drops and reduces what is old
+                                  Reduction: drops what is old
 """
 
 import asyncio
@@ -80,7 +80,7 @@ class Store:
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._database = Database(url, timeout_s)
-        self._writer = Writer(self._database, retry_s, waiting_reports, now_ns)
+        self._writer = Writer(self._database, retry_s, waiting_reports, retention.bucket_s * 10**9)
         self._reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
         self.tokens = TokenStore(self._database)

@@ -5,7 +5,7 @@
     machines --< alarm_events                      the log of alarms; triggers refuse to change it
              --< reports                           the newest, whole and compressed
              --< evaluations --< readings >-- series    a window's numbers: one row for the window, one for each number
-                                 buckets >-- series     what is left of older ones
+                                 buckets >-- series     the same reduced, filled as they come, and kept longer
              --- checkpoints --< checkpoint_hops   where a monitor goes on from
     tokens    audit_log    webhook_cursors
 """
@@ -23,6 +23,7 @@ from sqlalchemy import (
     Table,
     Text,
     UniqueConstraint,
+    text,
 )
 
 __all__ = [
@@ -126,6 +127,8 @@ series = Table(
     _machine_id(),
     Column("quantity", Text, nullable=False),
     Column("name", Text, nullable=False),
+    # End of the latest window whose reading has been dropped, so that only buckets know of it; -1 if there is none.
+    Column("dropped_ns", BigInteger, nullable=False, server_default=text("-1")),
     UniqueConstraint("machine_id", "quantity", "name"),
 )
 

@@ -4,7 +4,6 @@ import asyncio
 import fcntl
 import os
 import secrets
-from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
@@ -43,15 +42,15 @@ class Writer:
         Time between attempts while the database fails, in seconds.
     most_reports : int
         Reports of one machine that wait meanwhile.
-    now_ns : callable
-        The computer's time.
+    bucket_ns : int
+        Length of the buckets that readings are added to.
     """
 
-    def __init__(self, database: Database, retry_s: float, most_reports: int, now_ns: Callable[[], int]) -> None:
+    def __init__(self, database: Database, retry_s: float, most_reports: int, bucket_ns: int) -> None:
         self._database = database
         self._retry_s = retry_s
         self._most_reports = most_reports
-        self._now_ns = now_ns
+        self._bucket_ns = bucket_ns
         self._claims: dict[int, Claim] = {}
         self._files = ExitStack()
         self._series: SeriesNumbers = {}
@@ -292,7 +291,9 @@ class Writer:
         async with asyncio.timeout(2 * self._database.timeout_s), self._turn, self._database.alone():
             connection = await self._connected()
             async with connection.begin():
-                refused, new_series = await write_group(connection, ready, self._series)
+                refused, new_series = await write_group(
+                    self._database, connection, ready, self._series, self._bucket_ns
+                )
         self._series.update(new_series)
         return refused
 

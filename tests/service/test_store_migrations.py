@@ -11,6 +11,7 @@ from sqlalchemy.engine import Engine
 
 from service.store.errors import StoreError
 from service.store.retention import Retention
+from service.store.schema import migrate
 from service.store.store import Store
 from service.store.tables import metadata
 from tests.service.postgres import KINDS, database_url
@@ -63,8 +64,38 @@ def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
         list(pool.map(opened_and_closed, [url] * 4))
     engine = engine_for(url)
     with engine.connect() as connection:
-        assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == ["0001"]
+        assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == ["0002"]
     engine.dispose()
+
+
+def test_buckets_of_an_older_version_get_the_readings_that_are_still_there(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.store.trend._SINGLE", 0)
+    engine = engine_for(url)
+    statements = (
+        "INSERT INTO machines VALUES (1, 'demo', 'lab', '', 3, 0, 3)",
+        "INSERT INTO series VALUES (1, 1, 'parameter', 'k_by')",
+        # Two readings were reduced, of which the later one ended in a bucket in which there are others still.
+        "INSERT INTO buckets VALUES (1, 0, 600000000000, 5, 1, 7.0, 7.0, 7.0, 0, 0.0)",
+        "INSERT INTO buckets VALUES (1, 600000000000, 600000000000, 6, 1, 1.0, 1.0, 1.0, 1, 0.5)",
+        "INSERT INTO evaluations VALUES (1, 2, 800000000000, 2), (1, 3, 1200000000000, 3), (1, 4, 1600000000000, 4)",
+        "INSERT INTO readings VALUES (1, 2, 1, 2, 0.25), (1, 3, 1, 3, 0.25), (1, 4, 1, 4, 0.25)",
+    )
+    with engine.begin() as connection:
+        migrate(connection, "0001")
+        for statement in statements:
+            connection.execute(text(statement))
+    engine.dispose()
+    store = Store(url, Retention())
+    store.open()
+    try:
+        found = store.machine("demo", "lab").downsampled(quantity="parameter", points=100)
+    finally:
+        store.close()
+    assert [(one.count, one.minimum, one.mean, one.maximum, one.mean_standard_error) for one in found] == [
+        (1, 7.0, 7.0, 7.0, None), (2, 1.0, 1.5, 2.0, 0.375), (2, 3.0, 3.5, 4.0, 0.25)
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -161,6 +161,41 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
         assert_same(found, by_numpy(written, name, starts, found[0]))
 
 
+def test_a_trend_over_many_windows_is_taken_from_buckets_to_the_reading(
+    store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.store.trend._SINGLE", 100)
+    lab = store.machine("demo", "lab")
+    written = write(lab, clock, 1500)
+    bounds = (None, int(written.ends[137])), (int(written.ends[137]), int(written.ends[1301])), (None, None)
+    for since, until in (*bounds, (int(written.ends[137]), None)):
+        inside = (written.ends >= (since or 0)) & (written.ends < (until or 2**63 - 1))
+        part = Written(
+            written.ends[inside],
+            {name: values[inside] for name, values in written.values.items()},
+            {name: errors[inside] for name, errors in written.errors.items()},
+        )
+        found = lab.downsampled(quantity="parameter", since_ns=since, until_ns=until, points=300)
+        assert {(bucket.length_ns, bucket.start_ns % (600 * NS)) for bucket in found} == {(600 * NS, 0)}
+        for name in ("e", "k_by"):
+            of_name = [bucket for bucket in found if bucket.name == name]
+            assert_same(of_name, by_numpy(part, name, part.ends, of_name[0]))
+    few = lab.downsampled(
+        quantity="parameter", since_ns=int(written.ends[0]), until_ns=int(written.ends[99]), points=33
+    )
+    assert few[0].start_ns == written.ends[0]
+
+
+def test_what_is_not_finite_is_kept_and_has_no_mean(store: Store) -> None:
+    lab = store.machine("demo", "lab")
+    for number, value in enumerate((float("inf"), 1.0, float("-inf"))):
+        assert lab.commit(Step(readings=(StoredReading(T0 + number, "misfit", "misfit", value, None),)))
+    assert len(lab.readings(quantity="misfit", name="misfit")) == 3
+    store.retain(T0 + 1000 * DAY)
+    (bucket,) = lab.downsampled(quantity="misfit")
+    assert (bucket.count, bucket.mean) == (1, 1.0)
+
+
 def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: Clock) -> None:
     lab = store.machine("demo", "lab")
     assert lab.commit(Step(events=(alarm_event(0),)))
