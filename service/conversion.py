@@ -27,6 +27,9 @@ from service.residuals import Opinion
 __all__ = ["detectable_changes", "health", "machine_description", "machine_hash", "report"]
 
 
+_REPLAYED = "a replay is announced on this machine's own keys: what is sent is not evaluated"
+
+
 def machine_hash(machine: MachineFile) -> str:
     """Twelve hexadecimal digits that change with anything in the machine file but comments and layout."""
     text = json.dumps(machine.model_dump(mode="json"), sort_keys=True)
@@ -81,7 +84,7 @@ def health(
         site=identity.site,
         machine=identity.machine,
         state=HealthState.NO_DATA if stream.silent and not record.state.alarmed else record.state,
-        reason="; ".join(filter(None, (silence, record.reason))),
+        reason="; ".join(filter(None, (_REPLAYED if stream.replay_announced else "", silence, record.reason))),
         filled=record.filled,
         window_start_ns=None if window is None else window.start_ns,
         window_end_ns=None if window is None else window.end_ns,

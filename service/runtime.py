@@ -223,6 +223,7 @@ class Runtime:
             health=lambda: worker.health().model_dump_json(),
             alarm_state=lambda: worker.alarms().model_dump_json(),
             alarm_events=worker.alarm_log,
+            on_replay=worker.replay,
         )
         machine_link = MachineLink(link, keys, callbacks, wait_when_full=self.settings.queue.when_full == "wait")
         undo.callback(machine_link.close)

@@ -75,6 +75,8 @@ class MachineCallbacks:
     alarm_events : callable
         Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
         time; what it raises is told to whoever asked.
+    on_replay : callable
+        Takes whether a replay is announced on the machine's own keys: nothing of the stream is handed on meanwhile.
     """
 
     on_block: Callable[[RawBlock], None]
@@ -84,6 +86,7 @@ class MachineCallbacks:
     health: Callable[[], str]
     alarm_state: Callable[[], str]
     alarm_events: Callable[[int, int], str]
+    on_replay: Callable[[bool], None] = lambda _: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,6 +253,7 @@ class MachineLink:
 
     def _take_replay(self, sample: zenoh.Sample) -> None:
         replayed = sample.kind == zenoh.SampleKind.PUT
+        self._callbacks.on_replay(replayed)
         if replayed:
             _log.warning("a replay on this machine's own keys: what it sends is not evaluated", key=self._keys.root)
         else:  # samples may arrive after the token's end; blocks come on another thread, so this is first

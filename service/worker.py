@@ -134,7 +134,7 @@ class MachineWorker:
         self._told = self._monitor.next_sequence
         self._ticked_s = self._held_up_s = clocks.monotonic_s()
         self._missed = 0
-        self._publisher_alive = False
+        self._publisher_alive = self._replay_announced = False
         self._mismatch: tuple[str, ...] = ()
         self._outlet: Outlet | None = None
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
@@ -206,6 +206,10 @@ class MachineWorker:
         if not alive:
             self._mismatch = ()
 
+    def replay(self, announced: bool) -> None:
+        """Take note of a replay on the machine's own keys that begins or ends; nothing of it arrives here."""
+        self._replay_announced = announced
+
     def descriptor(self, announced: bytes) -> None:
         """Compare an announced channel descriptor with the machine file."""
         mismatch = descriptor_mismatch(announced, self.machine)
@@ -224,6 +228,7 @@ class MachineWorker:
                 data_age_s=None if latest_s is None else round(max(0.0, self._clocks.monotonic_s() - latest_s), 3),
                 silent=silent,
                 silent_since_ns=snapshot.end_ns if silent else None,
+                replay_announced=self._replay_announced,
                 descriptor_mismatch=self._mismatch,
             ),
             queue_dropped_blocks=self.inbox.dropped,

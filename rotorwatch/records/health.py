@@ -135,6 +135,10 @@ class StreamStatus(BaseModel):
     data_age_s: float | None = Field(
         description="time since the last accepted block was processed; null before the first", examples=[0.04]
     )
+    replay_announced: bool = Field(
+        description="somebody announces a replay on the machine's own keys; what is sent is not evaluated meanwhile",
+        examples=[False],
+    )
     descriptor_mismatch: tuple[str, ...] = Field(
         description="fields of the announced channel descriptor that differ from the machine file", examples=[()]
     )

@@ -135,7 +135,12 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
         IDENTITY,
         MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", beyond_ns=1),), DataQuality(), -1),
         StreamStatus(
-            publisher_alive=False, silent=False, silent_since_ns=None, data_age_s=None, descriptor_mismatch=()
+            publisher_alive=False,
+            silent=False,
+            silent_since_ns=None,
+            data_age_s=None,
+            replay_announced=False,
+            descriptor_mismatch=(),
         ),
     )
     text = health.model_dump_json()
@@ -159,7 +164,12 @@ def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
     latest = WindowReport(0, 7, HealthState.HEALTHY, 1.0)
     record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), DataQuality(), 0)
     lost = StreamStatus(
-        publisher_alive=True, data_age_s=9.0, silent=True, silent_since_ns=1_767_225_600 * 10**9, descriptor_mismatch=()
+        publisher_alive=True,
+        data_age_s=9.0,
+        silent=True,
+        silent_since_ns=1_767_225_600 * 10**9,
+        replay_announced=False,
+        descriptor_mismatch=(),
     )
     health = conversion.health(IDENTITY, record, lost)
     assert health.state == "alert"

@@ -176,3 +176,14 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
         health = worker.health()
         assert (health.quality.gaps, health.quality.queue_dropped_blocks) == (0, 0)
         assert sum(health.quality.refused_blocks.values()) > 1000  # how many come through is the network's affair
+
+
+def test_a_replay_that_is_announced_is_told_as_the_reason_for_silence() -> None:
+    address = endpoint()
+    with service(address) as (_, worker), open_session(address) as session:
+        token = session.liveliness().declare_token(LAB.keys.replay_alive)
+        until(lambda: worker.health().stream.replay_announced, "the announcement")
+        assert "replay" in worker.health().reason
+        token.undeclare()  # type: ignore[no-untyped-call]
+        until(lambda: not worker.health().stream.replay_announced, "its end")
+        assert "replay" not in worker.health().reason
