@@ -8,6 +8,7 @@ import typer
 
 from models.errors import RotorwatchError
 from service.commands import access as access_commands
+from service.commands import history as history_commands
 from service.commands import interchange as interchange_commands
 from service.commands import plot as plot_commands
 from service.commands import record as record_commands
@@ -271,6 +272,7 @@ def _checked(file: Path) -> str:
 watching_commands.register(app)
 access_commands.register(app)
 webhook_commands.register(app)
+history_commands.register(app)
 record_commands.register(app)
 replay_commands.register(app)
 interchange_commands.register(app)

@@ -238,7 +238,7 @@ class Database:
                 await driver.backup(target)  # type: ignore[union-attr]  # aiosqlite's, as it is SQLite
             finally:
                 target.close()
-            self._set_aside("deleted")
+            self.set_aside("deleted")
             copy.rename(self.file)
         except (SQLAlchemyError, sqlite3.Error, OSError):
             copy.unlink(missing_ok=True)
@@ -261,7 +261,7 @@ class Database:
             If that fails; readers have the former file still.
         """
         if not rescued and not self.damage:
-            self._set_aside("deleted", only_own=True)
+            self.set_aside("deleted", only_own=True)
         former, generation = self._engine, self.generation
         try:
             await self._connect(set_aside=True)
@@ -288,7 +288,7 @@ class Database:
             if not set_aside or self.file is None or not _is_damage(error):
                 raise
             await self._disconnect()
-            kept = self._set_aside("damaged")
+            kept = self.set_aside("damaged")
             self.news = self.lost = f"{self.failure(error)}: it is kept as {kept}, and the history begins anew"
             self.generation += 1
             await self._open()
@@ -315,7 +315,7 @@ class Database:
     def _beside(self, end: str) -> Path:
         return Path(f"{self.file}{end}")
 
-    def _set_aside(self, why: str, *, only_own: bool = False) -> Path:
+    def set_aside(self, why: str, *, only_own: bool = False) -> Path:
         """Rename the file and what SQLite keeps beside it; return the new name."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
         kept = self._beside(f".{why}-{stamp}")

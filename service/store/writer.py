@@ -121,7 +121,7 @@ class Writer:
         chosen = machines.c.machine_id == machine_id
         with ExitStack() as undo:
             if self._database.file is not None:
-                descriptor = lock_file(self._database.file, site, name)
+                descriptor = lock_file(self._database.file.with_name(f"{self._database.file.name}.{site}.{name}.lock"))
                 if descriptor is None:
                     raise taken
                 undo.callback(os.close, descriptor)
@@ -340,12 +340,11 @@ async def _lock_row(connection: AsyncConnection, machine_id: int) -> bool:
         return bool(await connection.scalar(query, {"high": _LOCK, "low": machine_id}))
 
 
-def lock_file(file: Path, site: str, name: str) -> int | None:
+def lock_file(path: Path) -> int | None:
     """Lock the file beside the database that stands for one machine; None if another has it.
 
     The system lets go of it when the process ends, however it ends.
     """
-    path = file.with_name(f"{file.name}.{site}.{name}.lock")
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

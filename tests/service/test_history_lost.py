@@ -1,12 +1,15 @@
 """A history that is locked at the end, deleted, replaced or damaged: it is said, and monitoring goes on."""
 
 import sqlite3
+import stat
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from models.alarm_names import FAULT
 from service.config import HistorySettings
+from service.rotorwatch import app
 from service.runtime import running as running_here
 from service.store.records import TokenRecord
 from service.store.retention import Retention
@@ -144,3 +147,45 @@ def test_a_monitor_starts_with_a_damaged_history_and_keeps_it_aside(tmp_path: Pa
         assert runtime.store.unreachable() == ""
     with running_here(plan) as runtime:
         assert runtime.readiness().ready
+
+
+def history(folder: Path, *arguments: str) -> tuple[int, str]:
+    done = CliRunner().invoke(
+        app, ["history", *arguments], env={"ROTORWATCH_HISTORY__URL": f"sqlite:///{history_of(folder)}"}
+    )
+    return done.exit_code, done.output
+
+
+def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    with bench(tmp_path) as at:
+        at.put(*map(block, range(12)), block(40, run=2, sequence=0))
+        before = at.log()
+        assert history(tmp_path, "check")[0] == 0
+        assert history(tmp_path, "backup", str(copy))[0] == 0
+        assert stat.S_IMODE(copy.stat().st_mode) == 0o600
+        code, said = history(tmp_path, "backup", str(copy))
+        assert (code, "expected a new file" in said) == (1, True)
+        at.put(block(90, run=3, sequence=0))
+        assert len(at.log()) > len(before)
+        code, said = history(tmp_path, "restore", str(copy))
+        assert (code, "history.sqlite.demo.lab.lock is locked" in said) == (1, True)
+    data = bytearray(copy.read_bytes())
+    data[8192:] = b"\xa5" * (len(data) - 8192)
+    (tmp_path / "damaged").write_bytes(data)
+    assert history(tmp_path, "restore", str(tmp_path / "damaged"))[0] == 1
+    code, said = history(tmp_path, "restore", str(copy))
+    (kept,) = tmp_path.glob("history.sqlite.replaced-*Z")
+    assert (code, str(kept) in said) == (0, True)
+    with bench(tmp_path) as at:
+        assert at.log()[: len(before)] == before
+    history_of(tmp_path).write_bytes(data)
+    for end in ("-wal", "-shm"):
+        Path(f"{history_of(tmp_path)}{end}").unlink(missing_ok=True)
+    assert history(tmp_path, "check")[0] == 1
+
+
+def test_a_server_has_its_own_programs_for_backups() -> None:
+    address = {"ROTORWATCH_HISTORY__URL": "postgresql://anna:secret@host/db"}
+    done = CliRunner().invoke(app, ["history", "check"], env=address)
+    assert (done.exit_code, "pg_dump" in done.output, "secret" in done.output) == (2, True, False)

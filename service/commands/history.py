@@ -1,0 +1,95 @@
+"""``rotorwatch history``: check, back up and restore the SQLite file of the history."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from models.errors import MachineFileError
+from service.commands.running import exit_codes
+
+if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
+    from service.store.database import Database
+
+__all__ = ["register"]
+
+_ConfigOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    history = typer.Typer(no_args_is_help=True, help="The SQLite file of the history: is it whole, copy it, go back.")
+    history.command("check")(check)
+    history.command("backup")(backup)
+    history.command("restore")(restore)
+    app.add_typer(history, name="history")
+
+
+def check(config: _ConfigOption = None) -> None:
+    """Look through the whole file, also while a monitor runs; exit code 1 if it is damaged.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch history check --config plant.toml[/cyan]
+    """
+    with exit_codes():
+        from service.store.backup import faults  # noqa: PLC0415  # keeps --help quick
+
+        _, file = _chosen(config)
+        found = faults(file)
+        for fault in found:
+            typer.echo(f"{file}: {fault}", err=True)
+        if found:
+            raise typer.Exit(1)
+        typer.echo(f"{file}: ok")
+
+
+def backup(
+    copy: Annotated[Path, typer.Argument(metavar="FILE", help="New file.")], config: _ConfigOption = None
+) -> None:
+    """Copy the history, also while a monitor runs, and check the copy.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch history backup /backup/history-monday.sqlite --config plant.toml[/cyan]
+    """
+    with exit_codes():
+        from service.store.backup import back_up  # noqa: PLC0415  # keeps --help quick
+
+        _, file = _chosen(config)
+        back_up(file, copy)
+        typer.echo(
+            f"{file} is copied to {copy}; it holds hashes of the access tokens: keep it where others cannot read it"
+        )
+
+
+def restore(
+    backup_file: Annotated[Path, typer.Argument(metavar="FILE", help="From: rotorwatch history backup.")],
+    config: _ConfigOption = None,
+) -> None:
+    """Put a backup in the place of the history; the monitor must be stopped. The former file is kept.
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch history restore /backup/history-monday.sqlite --config plant.toml[/cyan]
+    """
+    with exit_codes():
+        from service.store.backup import restore as put_back  # noqa: PLC0415  # keeps --help quick
+
+        database, file = _chosen(config)
+        kept = put_back(database, backup_file)
+        typer.echo(f"{file} is that of {backup_file} now" + (f"; the former one is kept as {kept}" if kept else ""))
+
+
+def _chosen(config: Path | None) -> "tuple[Database, Path]":
+    from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
+    from service.store.database import Database  # noqa: PLC0415
+
+    database = Database(load_settings(config).history.database, 5.0)
+    if database.file is None:
+        way = "expected a file" if database.is_sqlite else "use pg_dump and pg_restore"
+        raise MachineFileError(f"{config or 'settings'}: history.url is {database.shown}: {way}")
+    return database, database.file
