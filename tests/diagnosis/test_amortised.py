@@ -55,6 +55,7 @@ def test_drawn_spectra_scatter_around_their_expectation_like_averaged_segments()
     assert np.all(coherent < 0.07 * np.sqrt(expected[0, :, 0, 0].real * expected[0, :, 1, 1].real))
 
 
+@pytest.mark.slow
 def test_simulated_windows_look_like_drawn_ones() -> None:
     reader = NetworkDiagnostician(LAB, shipped())
     novelty = []

@@ -60,6 +60,7 @@ def test_training_is_reproducible_and_progress_is_told() -> None:
     assert told == sorted(told)
 
 
+@pytest.mark.slow
 def test_round_trip(trained: EquationNetwork, tmp_path: Path) -> None:
     saved = save_bundle(tmp_path / "bundle", LAB, (trained,), MADE)
     loaded = load_bundle(tmp_path / "bundle", LAB)

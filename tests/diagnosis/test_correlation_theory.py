@@ -59,6 +59,7 @@ def test_correlation_functions_agree_with_theory(condition: Scenario, windows: l
     assert np.all(error / np.outer(scale, scale) < 0.05)  # or agreement would mean little
 
 
+@pytest.mark.slow
 def test_synchronous_vectors_agree_with_theory(condition: Scenario, windows: list[WindowStatistics]) -> None:
     speed = next(event.speed_rpm for event in condition.events if event.speed_rpm is not None) * 2 * np.pi / 60
     q1, q2 = synchronous_response(MACHINE.rotor, speed)

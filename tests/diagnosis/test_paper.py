@@ -91,6 +91,7 @@ def test_phase_correlation_follows_the_definition(rig: Machine) -> None:
     assert np.max(np.abs(found - theory)) < 0.1 * np.max(np.abs(theory))
 
 
+@pytest.mark.slow
 def test_rows_are_the_papers_from_lag_zero(rig: Machine, training: list[WindowStatistics]) -> None:
     for equation, n_inputs in zip(PAPER_EQUATIONS, (3, 3, 2, 3), strict=True):
         inputs, target = paper_rows(equation, training[0], rig)
@@ -141,6 +142,7 @@ def test_an_equation_without_its_channels_is_not_evaluated(
     assert "EI" not in paper.flagged_parameters(diagnosis)
 
 
+@pytest.mark.slow
 def test_too_few_windows_for_the_declared_rate_are_refused(
     rig: Machine, training: list[WindowStatistics], healthy: list[WindowStatistics]
 ) -> None:
