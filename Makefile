@@ -13,6 +13,8 @@ RUN := $(VENV)/.run
 READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 MODELS_AND_MONITOR := models tests/physics tests/signals tests/diagnosis tests/commissioning $(wildcard tests/service/test_monitor*.py)
+# One more than cores: many tests wait more than they compute.
+WORKERS ?= 3
 FAULT ?= k_by
 SEED ?= 1
 PACE ?= 10
@@ -39,7 +41,7 @@ $(READY): $(RUN)
 demo: $(RUN)
 	@$(BIN)/rotorwatch demo --fault $(FAULT) --seed $(SEED) --pace $(PACE) $(if $(ONCE),--once)
 
-# Side by side: many tests wait more than they compute.
+# Side by side; the tests take longest.
 test: $(READY)
 	@$(MAKE) --no-print-directory --jobs=2 lint types contracts tests
 
@@ -54,10 +56,10 @@ contracts: $(READY)
 	$(BIN)/lint-imports
 
 tests: $(READY)
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n $(WORKERS)
 
 quick: $(READY)
-	$(BIN)/pytest -n 2 -m "not slow" $(MODELS_AND_MONITOR)
+	$(BIN)/pytest -n $(WORKERS) -m "not slow" $(MODELS_AND_MONITOR)
 
 format: $(READY)
 	$(BIN)/ruff format .

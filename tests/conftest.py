@@ -32,3 +32,15 @@ def _state_folder() -> Iterator[None]:
         os.environ["XDG_STATE_HOME"] = folder
         yield
         del os.environ["XDG_STATE_HOME"]
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Let go of what a module of tests has simulated and remembered, when it is done."""
+    if not isinstance(item, pytest.Function) or (
+        isinstance(nextitem, pytest.Function) and nextitem.module is item.module
+    ):
+        return
+    for value in vars(item.module).values():
+        if hasattr(value, "cache_clear") and value.__module__ == item.module.__name__:
+            value.cache_clear()
