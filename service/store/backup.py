@@ -50,6 +50,7 @@ def back_up(file: Path, copy: Path) -> None:
     try:
         with closing(_opened(file)) as source, closing(sqlite3.connect(copy)) as target:
             source.backup(target)
+            target.execute("PRAGMA journal_mode = DELETE")  # so that the copy is one file, also when it is read
         if found := faults(copy):
             raise StoreError(f"{file}: {found[0]}")
     except BaseException as error:

@@ -164,6 +164,7 @@ def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_p
         assert history(tmp_path, "check")[0] == 0
         assert history(tmp_path, "backup", str(copy))[0] == 0
         assert stat.S_IMODE(copy.stat().st_mode) == 0o600
+        assert list(tmp_path.glob("copy*")) == [copy]
         code, said = history(tmp_path, "backup", str(copy))
         assert (code, "expected a new file" in said) == (1, True)
         at.put(block(90, run=3, sequence=0))
@@ -177,6 +178,7 @@ def test_a_backup_is_taken_from_a_running_monitor_and_restored_without_one(tmp_p
     code, said = history(tmp_path, "restore", str(copy))
     (kept,) = tmp_path.glob("history.sqlite.replaced-*Z")
     assert (code, str(kept) in said) == (0, True)
+    assert not list(tmp_path.glob("*.restored*"))
     with bench(tmp_path) as at:
         assert at.log()[: len(before)] == before
     history_of(tmp_path).write_bytes(data)
