@@ -14,6 +14,7 @@ A route that declares no scope is refused by the gate. How an application is gua
     guard.protect(app)                      # after all of them
 """
 
+import functools
 import hmac
 import math
 import secrets
@@ -23,7 +24,7 @@ from collections.abc import AsyncIterator, Callable
 from typing import Annotated, Any, NamedTuple
 
 from fastapi import Depends, FastAPI, Request
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
@@ -130,8 +131,12 @@ class Guard:
         """
 
         @app.get("/openapi.json", include_in_schema=False, dependencies=[self.read])
-        def description() -> JSONResponse:
-            return JSONResponse(app.openapi())
+        def description() -> Response:
+            return Response(written(), media_type="application/json")
+
+        @functools.cache
+        def written() -> bytes:
+            return bytes(JSONResponse(app.openapi()).body)
 
         outside = unguarded_routes(app, self.pass_gate)
         if outside:

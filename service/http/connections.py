@@ -36,6 +36,8 @@ __all__ = ["HttpConnections"]
 
 _LOOK_S = 0.2
 _MINUTE_S = 60.0
+_MOMENTS_S = 5.0
+"""A reader that takes nothing for longer makes room when there is none."""
 _NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 _BUSY = Problem(
     title="Service Unavailable",
@@ -93,6 +95,12 @@ class _Connection:
             self.taken_s = now_s
         self.unsent, self.taken = unsent, taken
 
+    def waited_for(self, now_s: float) -> float | None:
+        """Since when the server waits for the other side; None if it does not, or for moments."""
+        if self.doing != "answering":
+            return self.since_s
+        return self.taken_s if now_s - self.taken_s > _MOMENTS_S else None
+
     def end(self) -> None:
         """End it at once; what is unsent is dropped, or the system would keep it for who knows how long."""
         self.ended = True
@@ -149,6 +157,7 @@ class HttpConnections:
         self._plain = plain
         self._clock = clock
         self._limiter = Limiter(clock, _MINUTE_S)
+        self._looked_s = clock()
         self._open: dict[Any, _Connection] = {}
 
     def listener(self, listening: socket.socket) -> socket.socket:
@@ -170,6 +179,7 @@ class HttpConnections:
 
     def watch(self, loop: asyncio.AbstractEventLoop) -> None:
         """Look at all connections a few times a second from now on; accept errors are logged once a minute."""
+        self._looked_s = self._clock()
         loop.set_exception_handler(self._on_error)
         loop.call_later(_LOOK_S, self._look, loop)
 
@@ -197,7 +207,7 @@ class HttpConnections:
             crowd = present
         for one in crowd:
             one.look(now_s)
-        waiting = [one for one in crowd if one.doing != "answering"]
+        waiting = {one: since_s for one in crowd if (since_s := one.waited_for(now_s)) is not None}
         if crowd and not waiting:
             self._say("refused", address[0], "all connections are in use")
             if self._plain:
@@ -208,7 +218,7 @@ class HttpConnections:
             return False
         self._open[address] = _Connection(accepted, address[0], network, now_s, now_s)
         if waiting:
-            longest = min(waiting, key=lambda one: one.since_s)
+            longest = min(waiting, key=waiting.__getitem__)
             self._say("ended", longest.address, f"another one came; this one was waited for: {longest.doing}")
             longest.end()
         return not crowd
@@ -220,7 +230,12 @@ class HttpConnections:
     def _look(self, loop: asyncio.AbstractEventLoop) -> None:
         loop.call_later(_LOOK_S, self._look, loop)
         now_s = self._clock()
+        # What the loop was late itself, because the computer is busy, is not charged to the other side.
+        late_s = max(0.0, now_s - self._looked_s - _LOOK_S)
+        self._looked_s = now_s
         for one in self._present():
+            one.since_s = min(now_s, one.since_s + late_s)
+            one.taken_s = min(now_s, one.taken_s + late_s)
             one.look(now_s)
             if now_s - one.since_s > self._longest_s.get(one.doing, float("inf")):
                 self._say("ended", one.address, f"the {one.doing} took longer than {self._longest_s[one.doing]:g} s")

@@ -27,6 +27,7 @@ SHELVE = (
     b"POST /api/v1/machines/demo/lab/alarms/k_by/shelve HTTP/1.1\r\nhost: 127.0.0.1\r\n"
     b"content-type: application/json\r\ncontent-length: 500\r\n\r\n"
 )
+DESCRIPTION = b"GET /openapi.json HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
 EVENTS = b"GET /api/v1/events HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
 
 
@@ -108,7 +109,7 @@ def test_whoever_takes_nothing_of_an_answer_is_cut_off() -> None:
             for one in (reader, steady):
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
                 one.connect((place.host, place.port))
-                one.sendall((b"GET /openapi.json HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n") * 40)
+                one.sendall(DESCRIPTION * 40)
             taken = 0
 
             def cut_off() -> bool:
@@ -150,6 +151,18 @@ def test_no_more_connections_than_the_settings_say() -> None:
         streams[0].close()
         until(lambda: httpx.get(f"{runtime.http_url}/healthz", trust_env=False).status_code == 200, "room")
         assert not any(map(over, streams[1:]))
+
+
+def test_readers_that_stop_make_room_for_others() -> None:
+    """Not at once, but long before their time is over."""
+    with monitor(connections=3, send_timeout_s=3600) as runtime, ExitStack() as opened:
+        place = httpx.URL(runtime.http_url)
+        for _ in range(3):
+            one = opened.enter_context(socket.socket())
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            one.connect((place.host, place.port))
+            one.sendall(DESCRIPTION * 40)
+        until(lambda: httpx.get(f"{runtime.http_url}/healthz", trust_env=False).status_code == 200, "room")
 
 
 def test_a_proxy_may_have_more_connections_than_others() -> None:

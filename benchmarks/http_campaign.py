@@ -1,0 +1,280 @@
+"""What slow, silent and too many HTTP callers do to a monitor that is at work, and how soon it is over.
+
+Run: ``python benchmarks/http_campaign.py`` (about twenty minutes), ``--small`` for half a minute. For each number of
+files that the monitor may open (256 and 1024), a monitor is started on loopback, a simulated rotor kit sends to it at
+pace 1, and callers of one kind after the other attack its API from the same address: what they are and how many stands
+in the table that is printed. Whatever is ended, they open again, until their time is over; then they hold what they
+have.
+
+Meanwhile somebody asks for ``/healthz``, over a new connection each time. Exit code 1 if a question was not answered, a
+block was lost, the monitor came near its last file, wrote more than 100 kB of log, or did not recover.
+"""
+
+import argparse
+import json
+import os
+import re
+import resource
+import select
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+
+_PLACE = "demo/lab"
+_GET = "GET {} HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
+_POST = (
+    f"POST /api/v1/machines/{_PLACE}/alarms/k_by/shelve HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    "content-type: application/json\r\ncontent-length: 100000\r\n\r\n"
+)
+_LOG_BYTES = 100_000
+_ANSWER_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Attack:
+    """One kind of caller."""
+
+    name: str
+    count: int
+    sends: str
+    trickles: bool = False
+    reads: bool = True
+
+
+ATTACKS = (
+    Attack("nothing sent", 900, ""),
+    Attack("half a head, then silence", 900, _GET.format("/healthz")[:-2]),
+    Attack("a byte of the head every 0.5 s", 300, _GET.format("/healthz")[:-2] + "x-slow: ", trickles=True),
+    Attack("a byte of the body every 0.5 s", 300, _POST, trickles=True),
+    Attack("event streams", 500, _GET.format("/api/v1/events")),
+    Attack("readers that take nothing", 200, _GET.format("/openapi.json") * 15, reads=False),
+)
+
+
+@dataclass(slots=True)
+class Callers:
+    """Connections of one attack."""
+
+    address: tuple[str, int]
+    attack: Attack
+    count: int
+    opened: int = 0
+    ended: int = 0
+    statuses: dict[str, int] = field(default_factory=dict)
+    held: list[socket.socket] = field(default_factory=list)
+
+    def fill(self) -> None:
+        """Open what is missing, a hundred at most."""
+        for _ in range(min(100, self.count - len(self.held))):
+            one = socket.socket()
+            if not self.attack.reads:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            one.settimeout(_ANSWER_S)
+            try:
+                one.connect(self.address)
+                one.sendall(self.attack.sends.encode())
+            except OSError:
+                one.close()
+                self.ended += 1
+                continue
+            one.setblocking(False)
+            self.opened += 1
+            self.held.append(one)
+
+    def look(self, *, trickle: bool) -> None:
+        """Send a byte each, if it is time, and find out who was ended or told something."""
+        poll = select.poll()
+        held = {one.fileno(): one for one in self.held}
+        for number in held:
+            poll.register(number, select.POLLIN if self.attack.reads else 0)
+        over = {held[number] for number, _ in poll.poll(0) if self._over(held[number])}
+        if trickle and self.attack.trickles:
+            for one in set(self.held) - over:
+                try:
+                    one.send(b"x")
+                except OSError:
+                    over.add(one)
+        for one in over:
+            one.close()
+        self.ended += len(over)
+        self.held = [one for one in self.held if one not in over]
+
+    def close(self) -> None:
+        """Leave."""
+        while self.held:
+            self.held.pop().close()
+
+    def _over(self, one: socket.socket) -> bool:
+        try:
+            while self.attack.reads:
+                text = one.recv(65536)
+                if not text:
+                    return True
+                for status in re.findall(rb"HTTP/1.1 (\d+)", text):
+                    self.statuses[status.decode()] = self.statuses.get(status.decode(), 0) + 1
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True  # who does not read is only woken by the end
+
+
+@dataclass(slots=True)
+class Monitor:
+    """A running monitor and its machine."""
+
+    process: subprocess.Popen[bytes]
+    url: str
+    log: Path
+
+    def files(self) -> int:
+        """Files that it has open."""
+        return len(os.listdir(f"/proc/{self.process.pid}/fd"))
+
+    def asked(self) -> tuple[int, float]:
+        """Status of ``/healthz``, 0 if there is no answer, and seconds until then."""
+        begin_s, status = time.monotonic(), 0
+        with suppress(httpx.HTTPError):
+            status = httpx.get(f"{self.url}/healthz", trust_env=False, timeout=_ANSWER_S).status_code
+        return status, time.monotonic() - begin_s
+
+    def blocks(self) -> tuple[int, int]:
+        """Blocks accepted, and those refused, dropped or missing."""
+        health = httpx.get(f"{self.url}/api/v1/machines/{_PLACE}/health", trust_env=False, timeout=_ANSWER_S).json()
+        quality = health["quality"]
+        lost = sum(quality["refused_blocks"].values()) + quality["queue_dropped_blocks"] + quality["gaps"]
+        return quality["accepted_blocks"], lost
+
+
+@contextmanager
+def monitor(folder: Path, files: int, timeouts: dict[str, str]) -> Iterator[Monitor]:
+    """A monitor that may open so many files, and a machine that sends to it."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    environment = {
+        **os.environ,
+        **timeouts,
+        "ROTORWATCH_LINK": json.dumps({"listen": [endpoint]}),
+        "ROTORWATCH_HTTP__PORT": "0",
+        "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
+        "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
+        "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
+    }
+    run = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", sys.executable, "-m"]
+    send = [sys.executable, "-m", "simulator.rotorsim", "publish", "--pace", "1", "--connect", endpoint]
+    out, log = folder / "out", folder / "log"
+    with out.open("wb") as output, log.open("wb") as errors:
+        process = subprocess.Popen(
+            [*run, "service.rotorwatch", "run"], stdout=output, stderr=errors, env=environment, stdin=subprocess.DEVNULL
+        )
+        publisher = subprocess.Popen(send, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            found = Monitor(process, _url(process, out, log), log)
+            while found.blocks()[0] < 20:
+                time.sleep(0.1)
+            yield found
+        finally:
+            for one in (publisher, process):
+                one.terminate()
+            for one in (publisher, process):
+                one.wait(60)
+
+
+def _url(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:
+    while process.poll() is None:
+        if (told := re.search(r"HTTP API (http\S+)\s", out.read_text(encoding="utf-8"))) is not None:
+            return told[1]
+        time.sleep(0.1)
+    raise SystemExit(f"the monitor did not start:\n{log.read_text(encoding='utf-8')}")
+
+
+def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit: int, recovery_s: float) -> list[str]:
+    """Attack, print a line, and return what should not be."""
+    place = httpx.URL(one.url)
+    callers = Callers((place.host, place.port or 0), attack, count)
+    before, log_before = one.files(), one.log.stat().st_size
+    accepted, lost = one.blocks()
+    asked: list[tuple[int, float]] = []
+    most = 0
+    begin_s = trickled_s = time.monotonic()
+    while time.monotonic() < begin_s + duration_s:
+        callers.fill()
+        now_s = time.monotonic()
+        callers.look(trickle=now_s - trickled_s > 0.5)
+        if now_s - trickled_s > 0.5:
+            trickled_s = now_s
+        asked.append(one.asked())
+        most = max(most, one.files())
+    end_s = time.monotonic()
+    opened = callers.opened
+    if attack.name == "event streams":  # who is answered may stay, so these have to leave
+        callers.close()
+    while one.files() > before + 5 and time.monotonic() < end_s + recovery_s:
+        time.sleep(0.05)
+        asked.append(one.asked())
+        callers.look(trickle=True)
+    took_s = time.monotonic() - end_s
+    recovered = one.files() <= before + 5
+    callers.close()
+    accepted_after, lost_after = one.blocks()
+    log = one.log.stat().st_size - log_before
+    answers = {status: sum(status == found for found, _ in asked) for status, _ in sorted(asked)}
+    answered = ", ".join(f"{number} x {status or 'nothing'}" for status, number in answers.items())
+    # Where all are being answered, the monitor says so until it knows better.
+    unanswered = len(asked) - answers.get(200, 0) - (0 if attack.reads else answers.get(503, 0))
+    slowest_s = max(wait_s for _, wait_s in asked)
+    told = ", ".join(f"{number} x {status}" for status, number in sorted(callers.statuses.items()))
+    print(
+        f"| {attack.name} | {count} at once, {opened} in all | {callers.ended} ended{'; ' + told if told else ''} "
+        f"| {answered}; {slowest_s:.2f} s at most "
+        f"| {most} of {limit} (before: {before}) | {accepted_after - accepted}, {lost_after - lost} lost "
+        f"| {log / 1000:.1f} | {f'{took_s:.1f}' if recovered else 'never'} |",
+        flush=True,
+    )
+    faults = {
+        f"{unanswered} questions were not answered": bool(unanswered),
+        f"{lost_after - lost} blocks were lost": lost_after != lost or accepted_after == accepted,
+        f"{most} files were open": most > limit * 2 // 3,
+        f"{log} bytes of log": log > _LOG_BYTES,
+        f"{one.files()} files are open after {took_s:.0f} s": not recovered,
+    }
+    return [f"{limit} files, {attack.name}: {text}" for text, found in faults.items() if found]
+
+
+def main() -> int:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--small", action="store_true", help="some dozens of callers, for seconds")
+    parser.add_argument("--files", type=int, nargs="+", help="how many the monitor may open (256 1024)")
+    parser.add_argument("--seconds", type=float, help="how long each attack lasts (70; small: 2)")
+    options = parser.parse_args()
+    small = options.small
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    names = ("HEAD", "BODY", "SEND")
+    timeouts = {f"ROTORWATCH_HTTP__{name}_TIMEOUT_S": "1" for name in names} if small else {}
+    seconds = options.seconds or (2.0 if small else 70.0)
+    print("| callers | how many | what became of them | /healthz | files open | blocks | log, kB | over after, s |")
+    print("|---|---|---|---|---|---|---|---|")
+    faults: list[str] = []
+    for limit in options.files or ([160] if small else [256, 1024]):
+        with tempfile.TemporaryDirectory() as folder, monitor(Path(folder), limit, timeouts) as one:
+            for attack in ATTACKS:
+                count = min(attack.count, 80) if small else attack.count
+                faults += campaign(one, attack, count, seconds, limit, 60.0 if small else 120.0)
+            if one.process.poll() is not None:
+                faults.append(f"{limit} files: the monitor ended")
+    print("\n".join(faults) if faults else "every question was answered, no block was lost, and all was over in time")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
