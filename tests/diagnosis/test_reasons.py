@@ -74,11 +74,28 @@ def test_a_parameter_far_from_nominal_says_how_far(window: WindowStatistics) -> 
     assert_beyond(str(caught.value))
 
 
-def test_what_would_be_noise_says_how_much() -> None:
-    quiet = simulate_window(Draw(MACHINE, 7_700_041, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT), 0)
-    noise = np.einsum("fii->i", quiet.spectrum).real / len(quiet.spectrum)
-    drowned = replace(quiet, spectrum=0.02 * quiet.spectrum + np.diag(noise))
-    assert_beyond(reason_of(drowned))
+def test_what_would_be_noise_says_how_much(window: WindowStatistics) -> None:
+    """Every motion mostly white, its displacement and velocity alike."""
+    w, states = 2 * np.pi * window.frequencies_hz, list(window.states)
+    spectrum = 0.01 * window.spectrum
+    for at, name in enumerate(states):
+        if name.endswith("_dot"):
+            continue
+        rate = states.index(f"{name}_dot")
+        density = window.spectrum[:, at, at].real.mean()
+        spectrum[:, at, at] += 1.0001 * density
+        spectrum[:, rate, rate] += 1.0001 * density * w**2
+        spectrum[:, rate, at] += 1j * w * density
+        spectrum[:, at, rate] -= 1j * w * density
+    reason = reason_of(replace(window, spectrum=spectrum))
+    assert "noise" in reason
+    assert_beyond(reason)
+
+
+def test_a_rotor_in_noisy_sensors_is_read(window: WindowStatistics) -> None:
+    """Three times as much noise as motion, but each sensor's own."""
+    noise = 3 * np.einsum("fii->i", window.spectrum).real / len(window.spectrum)
+    assert reason_of(replace(window, spectrum=window.spectrum + np.diag(noise))) == ""
 
 
 def test_a_vague_reading_says_how_vague(window: WindowStatistics) -> None:

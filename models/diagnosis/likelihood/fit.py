@@ -49,9 +49,12 @@ _MOST_EXCESS = 100.0
 _MOST_DEVIATION = 0.2
 """Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
 Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17."""
-_MOST_NOISE = 0.5
-"""Share of the sensors' noise in what they show, by the theory, up to which a rotor can be seen behind it. A rotor's
-spectrum has resonances; one without any is taken for coloured noise, and what is left of it fits any rotor."""
+_MOST_NOISE = 0.3
+"""Share of the motion that the theory takes for noise of the sensors though displacement and velocity show it alike,
+up to which a rotor can be seen behind it: a spectrum without resonances is taken for coloured noise, and what is left
+of it fits any rotor."""
+_UNEQUAL = 5.0
+"""How many times more noise one sensor of a pair may have than the other."""
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12
@@ -194,11 +197,11 @@ class LikelihoodFit:
             self.reset()
             raise UnexplainedError(nowhere)
         self._last, self._strength = found.theta, weights.strength
-        unexplained = self._check_explained(model, weights, found)
+        states = model.groups.average(window.spectrum)
+        unexplained = self._check_explained(model, weights, found, states)
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
-        states = model.groups.average(window.spectrum)
         goodness = goodness_of_fit(self._machine, model, weights, found, states)
         read = self._read(window, model, found.whitened.point, structural, speed)
         return replace(
@@ -376,7 +379,7 @@ class LikelihoodFit:
         explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
         return float(explained**-0.5)
 
-    def _check_explained(self, model: SpectralModel, weights: Weights, found: Maximum) -> str:
+    def _check_explained(self, model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray) -> str:
         """Say why nothing at this maximum means anything; empty if it does.
 
         Raises
@@ -384,7 +387,7 @@ class LikelihoodFit:
         UnexplainedError
             If nothing within the model comes near the window, so that there is no maximum to speak of.
         """
-        why, far = _deviation(model, weights, found)
+        why, far = _deviation(model, weights, found, states)
         structural = found.theta[: len(STRUCTURAL)]
         worst = int(np.argmax(np.abs(structural)))
         if not why and abs(structural[worst]) > _MOST_LOG_RATIO:
@@ -403,7 +406,7 @@ class LikelihoodFit:
         return reason
 
 
-def _deviation(model: SpectralModel, weights: Weights, found: Maximum) -> tuple[str, bool]:
+def _deviation(model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray) -> tuple[str, bool]:
     """What a maximum leaves unexplained, or explains by noise, if that is too much; and whether it is far too much."""
     excess, point, bins = found.whitened.excess, found.whitened.point, model.groups.bins
     squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2
@@ -412,10 +415,15 @@ def _deviation(model: SpectralModel, weights: Weights, found: Maximum) -> tuple[
     if far or deviation > _MOST_DEVIATION:
         text, limit = beyond(100 * deviation, 100 * _MOST_DEVIATION)
         return f"its spectra deviate from it by {text} % (rms, sampling aside), evaluated is at most {limit} %", far
-    noise = float(np.mean(bins @ model.noise(point.theta) / (bins @ np.einsum("fii->fi", point.S).real)))
-    if noise > _MOST_NOISE:
-        text, limit = beyond(100 * noise, 100 * _MOST_NOISE)
-        return f"{text} % of what the sensors show would be their own noise, evaluated is at most {limit} %", False
+    # Noise is a sensor's own: what both sensors of a motion show is motion, and this one the theory does not explain.
+    shared = np.maximum(model.noise(point.theta) - _UNEQUAL * model.motions.rest(states, model.centre), 0)
+    share = float(np.mean(bins @ shared / (bins @ np.einsum("fii->fi", point.S).real)))
+    if share > _MOST_NOISE:
+        text, limit = beyond(100 * share, 100 * _MOST_NOISE)
+        return (
+            f"{text} % of what pairs of sensors show alike would be noise of each, evaluated is at most {limit} %",
+            False,
+        )
     return "", False
 
 

@@ -129,6 +129,25 @@ class Motions:
                 shares[self.states[self._v[at]]] = at, share
         return shares
 
+    def rest(self, states: ComplexArray, w: FloatArray) -> FloatArray:
+        """Power of what the two sensors of a motion do not share, shape (n_groups, n); infinite where there is one.
+
+        Parameters
+        ----------
+        states : ndarray, shape (n_groups, n_states, n_states)
+            Cross-spectra of the states, SI.
+        w : ndarray, shape (n_groups,)
+        """
+        r = self._r(w)
+        left = np.full(r.shape, np.inf)
+        for at in np.flatnonzero(self._has_x & self._has_v):
+            x, v = self._x[at], self._v[at]
+            of_x, of_v = (states[:, one, one].real / self.scale[one] ** 2 for one in (x, v))
+            between = states[:, v, x] / (self.scale[x] * self.scale[v])
+            # |v - jr x|² / (1 + r²)
+            left[:, at] = (of_v + r[:, at] ** 2 * of_x - 2 * r[:, at] * between.imag) / (1 + r[:, at] ** 2)
+        return left
+
     def mismatches(self, states: ComplexArray, w: FloatArray, averages: FloatArray) -> list[Mismatch]:
         """Compare displacement and velocity of every degree of freedom that has both.
 
