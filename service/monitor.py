@@ -425,7 +425,10 @@ class MachineMonitor:
         verdict = self._test.update(looks)
         changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
         self._alarms.found(verdict, evaluation.deciding.suspect, end_ns)
-        parameters = evaluation.deciding.parameters
+        parameters = tuple(
+            ParameterReading(one.name, one.by, reason=one.vector.foreign) if one.vector and one.vector.foreign else one
+            for one in evaluation.deciding.parameters
+        )
         unexplained = evaluation.deciding.unexplained
         if unexplained:
             parameters = tuple(ParameterReading(one.name, one.by, reason=unexplained) for one in parameters)

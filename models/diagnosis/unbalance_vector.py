@@ -21,6 +21,9 @@ class UnbalanceVector:
         Of ρ.
     variance_real, covariance, variance_imaginary : float
         Of these two.
+    foreign : str
+        Why what turns with the shaft is not what an unbalance makes, so that none of this should be believed; empty if
+        it is.
     """
 
     real: float
@@ -28,6 +31,7 @@ class UnbalanceVector:
     variance_real: float
     covariance: float
     variance_imaginary: float
+    foreign: str = ""
 
     def widened(self, variance: float) -> "UnbalanceVector":
         """Return the same with an error added to both parts."""

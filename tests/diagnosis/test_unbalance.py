@@ -7,6 +7,7 @@ import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import ParameterReading
+from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine
 from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
@@ -71,9 +72,13 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     window = drawn(2)
     assert window.synchronous is not None
     foreign = np.abs(window.synchronous) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
-    reading = e_of(replace(window, synchronous=foreign))
-    assert reading.change is None
-    assert "not what an unbalance makes" in reading.reason
+    diagnosis = LikelihoodFit(MACHINE).diagnose(replace(window, synchronous=foreign))
+    vector = diagnosis.parameters[-1].vector
+    assert vector is not None
+    assert "not what an unbalance makes" in vector.foreign
+    verdict = isolate_window(diagnosis, 0.001)
+    assert "e" not in verdict.changed
+    assert not verdict.outside
 
 
 @pytest.mark.slow

@@ -256,14 +256,10 @@ class LikelihoodFit:
             for name, value, error in zip(STRUCTURAL, change, errors, strict=True)
         ]
         if window.synchronous is not None:
-            try:
-                e = self._unbalance(window, model, point, structural, speed)
-            except EstimationError as error:
-                readings.append(ParameterReading("e", self.by, reason=str(error)))
-            else:
-                cross = (e.covariance * ratio)[:, None]
-                spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
-                readings.append(ParameterReading("e", self.by, e.change, math.sqrt(e.variance), vector=e.vector))
+            e = self._unbalance(window, model, point, structural, speed)
+            cross = (e.covariance * ratio)[:, None]
+            spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
+            readings.append(ParameterReading("e", self.by, e.change, math.sqrt(e.variance), vector=e.vector))
         return Diagnosis(self.by, tuple(readings), covariance=np.asarray(spread, dtype=np.float64))
 
     def _unbalance(

@@ -62,17 +62,21 @@ class _Ratios:
         Covariance of the two parts.
     covariance : ndarray, shape (3, 5)
         Of the three with the logarithmic ratios of the structural parameters.
+    foreign : str
+        See `UnbalanceVector`.
     """
 
     values: FloatArray
     variances: FloatArray
     between: float
     covariance: FloatArray
+    foreign: str
 
     def decided(self) -> Unbalance:
         """Take that of the descriptions which holds, see this module."""
         known, real, imaginary = self.values.tolist()
-        vector = UnbalanceVector(real, imaginary, float(self.variances[1]), self.between, float(self.variances[2]))
+        variances = float(self.variances[1]), self.between, float(self.variances[2])
+        vector = UnbalanceVector(real, imaginary, *variances, self.foreign)
         size = math.hypot(real, imaginary)
         turn = math.hypot(real - size, imaginary)
         if vector.turned_error_deg is None:  # so little is left that it has no direction
@@ -117,7 +121,7 @@ def estimate_unbalance(
     Raises
     ------
     EstimationError
-        If the vector says nothing about e, or is not what an unbalance makes.
+        If the vector says nothing about e.
     """
     return _ratios(machine, model, point, covariance, synchronous, speed_rad_s, duration_s).decided()
 
@@ -169,25 +173,26 @@ def _ratios(
         variances[at] = np.diag(spread)
         with_structural[at] = -spread @ (weight @ J) @ covariance
         between = float(spread[0, -1])
-    _check_unbalance(machine.name, q2, design @ values[1:], total)
-    return _Ratios(values, variances, between, with_structural)
+    foreign = _foreign(machine.name, q2, design @ values[1:], total)
+    return _Ratios(values, variances, between, with_structural, foreign)
 
 
-def _check_unbalance(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray) -> None:
-    """Raise EstimationError where what turns with the shaft is not what an unbalance makes on this rotor."""
+def _foreign(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray) -> str:
+    """Why what turns with the shaft is not what an unbalance makes on this rotor; empty if it is."""
     n = q2.size // 2
     if n < 2:
-        return
+        return ""
     amplitude = np.maximum(np.hypot(q2[:n], q2[n:]), np.hypot(explained[:n], explained[n:]))
     allowed = total + np.diag(np.tile((_GAIN * amplitude) ** 2 / 2, 2))
     left = q2 - explained
     chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chi2_distribution.isf(_RATE, 2 * n - 2))
-    if chi2 > most:
-        text, limit = beyond(chi2, round(most, 1))
-        raise EstimationError(
-            f"{name}: what turns with the shaft is not what an unbalance makes on this rotor: its misfit χ² is {text} "
-            f"with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
-        )
+    if chi2 <= most:
+        return ""
+    text, limit = beyond(chi2, round(most, 1))
+    return (
+        f"{name}: what turns with the shaft is not what an unbalance makes on this rotor: its misfit χ² is {text} "
+        f"with {2 * n - 2} degrees of freedom, evaluated is at most {limit}"
+    )
 
 
 def estimate_unbalance_by_hop(
@@ -236,6 +241,7 @@ def estimate_unbalance_by_hop(
         np.einsum("ha,ha->a", weight**2, own) + np.diag(left),
         float(weight[:, 1] ** 2 @ between + left[1, 2]),
         together,
+        next((hop.foreign for hop in hops if hop.foreign), ""),
     ).decided()
 
 

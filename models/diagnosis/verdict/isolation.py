@@ -86,7 +86,7 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
     rate : float
         Probability that a healthy window is called changed; the test of the model has the same rate to itself.
     """
-    stretch = stretch_of(diagnosis, 0, 0).complete()
+    stretch = stretch_of(diagnosis, 0, 0).complete().believed()
     isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
     return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
 

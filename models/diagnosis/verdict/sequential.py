@@ -315,10 +315,11 @@ class SequentialTest:
         """
         window_hops = self.settings.window_hops
         own = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}
-        for windows, total in self._accumulate(looks[window_hops]).items():
-            own[windows * window_hops] = total if windows == 1 else total.blurred(self.settings.systematic)
+        for windows, total in self._accumulate(looks[window_hops].believed()).items():
+            own[windows * window_hops] = total.blurred(self.settings.systematic)
+        own[window_hops] = looks[window_hops]
         self._watch_for_contradiction(own)  # an error that all stretches share makes none contradict another
-        every = {hops: look.complete() for hops, look in own.items()}
+        every = {hops: look.complete().believed() for hops, look in own.items()}
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
         # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.

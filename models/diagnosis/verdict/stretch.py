@@ -118,6 +118,19 @@ class Stretch:
         known = list(self.known)
         return self._widened(self.common[np.ix_(known, known)], None)
 
+    def believed(self) -> "Stretch":
+        """Return the same without what it reads as unbalance, if that is none.
+
+        It stays part of what tells two conditions of a machine apart: a window of two rotors has vectors of neither.
+        """
+        if self.unbalance is None or not self.unbalance.foreign:
+            return self
+        at = [number for number, i in enumerate(self.known) if PARAMETERS[i] != "e"]
+        values, covariance = self.estimate()
+        known = [self.known[number] for number in at]
+        own = _stretch(self.start_ns, self.end_ns, known, values[at], covariance[np.ix_(at, at)], self.misfit_z)
+        return replace(own, common=self.common, unexplained=self.unexplained)
+
     def _widened(self, added_covariance: FloatArray, common: FloatArray | None) -> "Stretch":
         values, covariance = self.estimate()
         wider = _stretch(
