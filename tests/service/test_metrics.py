@@ -70,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
-    """12 good blocks, one with a nan, one that comes twice, 3 s that are missing, another 2 good blocks; recorded."""
+    """12 good blocks, one with a nan, one whose number was there, 3 s that are missing, another 2 good blocks; recorded."""
     address = endpoint()
     file = machine_file(
         folder, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
@@ -92,7 +92,7 @@ def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
             feed = Feed(session)
             for _ in range(12):
                 feed.put_good()
-            twice = feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 100_000_000)
+            twice = feed.block(sequence=feed.sequence - 1, start_ns=feed.start_ns - 300_000_000)
             feed.put(twice)
             samples = feed.samples()
             samples[3, 1] = np.nan
