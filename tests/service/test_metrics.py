@@ -70,7 +70,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def served(folder: Path) -> Iterator[tuple[Runtime, str, Read]]:
-    """12 good blocks, one with a nan, one whose number was there, 3 s that are missing, another 2 good blocks; recorded."""
+    """12 good blocks, one with a nan, one of a number that was there, 3 s missing, 2 good blocks; recorded."""
     address = endpoint()
     file = machine_file(
         folder, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
