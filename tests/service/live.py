@@ -59,8 +59,10 @@ _ALONE = {
     "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
     "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
     "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
+    "ROTORWATCH_QUEUE__WHEN_FULL": "wait",
 }
-"""Unless a test says otherwise, programs leave nothing behind and are open to everybody on this computer."""
+"""Unless a test says otherwise, programs leave nothing behind, are open to everybody on this computer, and lose nothing
+when it is busy."""
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> None:

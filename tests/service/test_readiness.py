@@ -52,7 +52,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(tmp_path: Pat
             until(lambda: not runtime.readiness().ready, "trouble")
             status, found = asked(runtime)
             assert (status, found.history_open, found.session_open) == (503, True, True)
-            assert "locked" in found.history_trouble
+            assert str(file) in found.history_trouble
             assert found.reasons == (
                 f"the history cannot be written, what happens waits in memory: {found.history_trouble}",
             )

@@ -21,7 +21,7 @@ def monitor(address: str, http_port: str = "0") -> tuple[str, ...]:
 def simulator(address: str, start: str, *more: str) -> tuple[str, ...]:
     return (
         "simulator.rotorsim", "publish", "healthy", "--connect", address, "--pace", PACE, "--start", start,
-        "--wait-for-subscriber", "30", *more,
+        "--wait-for-subscriber", "180", *more,
     )  # fmt: skip
 
 
@@ -57,9 +57,7 @@ def test_killed_publisher_comes_back_and_the_monitor_carries_on(tmp_path: Path, 
             assert "publisher restarted" in gap.quality.last_gap
             assert gap.stream.publisher_alive
             # Windows of a run that was ahead are later than those that are waited for.
-            until(
-                lambda: 130e9 < newest_full_window(watched) - start_ns(start) < 3600e9, "a minute of full windows", 60.0
-            )
+            until(lambda: 130e9 < newest_full_window(watched) - start_ns(start) < 3600e9, "a minute of full windows")
             after = watched.health()
         assert after.quality.gaps == 1
         events = httpx.get(

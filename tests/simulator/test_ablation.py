@@ -85,7 +85,7 @@ def test_the_linear_fit_leaves_nothing_that_its_inputs_explain(window: WindowSta
 
 def _plan(variants: tuple[Variant, ...], calibration: int = 9) -> AblationPlan:
     faults: tuple[dict[str, float], ...] = ({}, {"k_by": -0.4}, {"k_bz": -0.4})
-    return AblationPlan(SHORT, BUNDLE, 42, 2, 8, calibration, 0.1, variants, faults)
+    return AblationPlan(SHORT, BUNDLE, 42, 2, 16, calibration, 0.1, variants, faults)
 
 
 def test_a_halved_stiffness_is_found_where_it_is_and_not_elsewhere() -> None:
@@ -102,7 +102,7 @@ def test_a_halved_stiffness_is_found_where_it_is_and_not_elsewhere() -> None:
         (label,) = row.detected
         assert label == f"{parameter} -40%"
         assert row.detected[label].count == row.named[label].count == 2
-        assert -0.5 < row.reads[label] < -0.2  # eight training windows of 20 s
+        assert -0.5 < row.reads[label] < -0.2  # sixteen training windows of 20 s
         assert row.elsewhere.of == 2
         assert row.elsewhere.count < 2
     assert not ablation.rows[1].named  # the MSD names no parameter
