@@ -199,6 +199,6 @@ def test_status_says_why_a_token_is_refused(tmp_path: Path) -> None:
         mistaken = subprocess.run(
             asked, cwd=ROOT, env=plain | {"ROTORWATCH_TOKEN": wrong}, capture_output=True, text=True, check=False
         )
-    assert (without.returncode, mistaken.returncode) == (1, 1)
+    assert (without.returncode, mistaken.returncode) == (4, 4)
     assert wanted in without.stderr
     assert "not valid" in mistaken.stderr

@@ -68,7 +68,7 @@ def test_environment_goes_over_the_file(tmp_path: Path, monkeypatch: pytest.Monk
     [
         (("port = 9000", "port = 99000"), r"service.toml: http.port: .*65535 \(found 99000\)"),
         (("port = 9000", "prot = 9000"), r"service.toml: http.prot: unknown; did you mean port"),
-        (("[queue]", "[cue]"), r"service.toml: cue: unknown; did you mean queue"),
+        (("[queue]", "[cue]"), r"service.toml: cue: unknown"),
         (('"wait"', '"hope"'), r"service.toml: queue.when_full: .*drop, wait \(found 'hope'\)"),
         (("blocks = 10", "blocks = 0"), r"service.toml: queue.blocks: .*\(found 0\)"),
         (('file = "machine.toml"', ""), r"service.toml: machines.0.file: missing"),
@@ -94,7 +94,7 @@ def test_mistake_in_the_environment_names_the_variable(monkeypatch: pytest.Monke
     monkeypatch.setenv("ROTORWATCH_MACHINES", "lab")
     with pytest.raises(MachineFileError) as broken:
         load_settings()
-    assert "machines" in str(broken.value)
+    assert "ROTORWATCH_MACHINES" in str(broken.value)
 
 
 def test_two_entries_for_one_machine_are_refused(tmp_path: Path) -> None:
