@@ -4,6 +4,7 @@ And keeps what programs leave behind by default out of the home of whoever runs 
 """
 
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -17,6 +18,8 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 
+# A run that a shell has put into the background ignores Ctrl-C, and so would all programs that tests start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 # As the programs show it: the library's own way prints every local variable, arrays included, which takes seconds.
 structlog.configure(
     processors=[
