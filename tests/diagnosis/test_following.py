@@ -1,5 +1,6 @@
 """Following a sliding window reads what searching it anew reads; news is noticed."""
 
+from contextlib import suppress
 from functools import lru_cache
 
 import numpy as np
@@ -10,11 +11,13 @@ from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.errors import UnexplainedError
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.scenario import Event
 from simulator.stream import blocks
+from tests.service.foreign import Foreign, as_blocks, foreign
 
 LAB = load_machine("lab")
 SEED = 61
@@ -91,3 +94,18 @@ def test_nothing_is_glanced_at_before_a_window_was_searched() -> None:
     stretch = window.statistics(2)
     assert stretch is not None
     assert LikelihoodFit(LAB, follow=True).glance(stretch) is None
+
+
+@pytest.mark.parametrize("kind", ["drift", "late copy"])
+def test_what_could_not_be_explained_leaves_nothing_behind(kind: Foreign) -> None:
+    """A window of something else in between: the next one is read as if it were the first."""
+    plan, window = plan_for(LAB), SlidingWindow(plan_for(LAB))
+    for block in as_blocks(LAB, foreign(LAB, kind, SEED, 70.0)):
+        tuple(window.feed(plan.to_si(block.samples), block.start_ns))
+    strange = window.statistics()
+    assert strange is not None
+    fit = LikelihoodFit(LAB, follow=True)
+    with suppress(UnexplainedError):
+        assert fit.diagnose(strange).unexplained
+    ours = slid(Layout.ONE_SOURCE)[1][0]
+    np.testing.assert_array_equal(values(fit.diagnose(ours)), values(LikelihoodFit(LAB, follow=True).diagnose(ours)))

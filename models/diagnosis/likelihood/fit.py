@@ -395,9 +395,9 @@ class LikelihoodFit:
             why = f"{name} would be {text} times nominal, evaluated is {side} {limit} times"
         if not why:
             return ""
+        self.reset()  # perhaps the search has followed another maximum: the next window is searched anew
         reason = f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
         if far or abs(structural[worst]) > _MOST_LOG_RATIO:
-            self.reset()
             raise UnexplainedError(reason)
         return reason
 
