@@ -119,16 +119,19 @@ def _moved(machine: Machine, moves: dict[str, float], windows: Sequence[WindowSt
 
 
 def _with_unbalance(machine: Machine, windows: Sequence[WindowStatistics]) -> Machine:
-    """Size and phase of the unbalance: e read along two phases at right angles."""
-    parts = []
-    for turn in (0.0, math.pi / 2):
-        operation = machine.operation.model_copy(update={"unbalance_phase_rad": turn})
-        turned = machine.model_copy(update={"operation": operation})
-        readings = [reading for each in _read(turned, windows) for reading in each.evaluable if reading.name == "e"]
-        weights = np.array([1 / (reading.standard_error or np.inf) ** 2 for reading in readings])
-        values = np.array([1 + (reading.change or 0.0) for reading in readings])
-        parts.append(float(weights @ values / weights.sum()))
-    size, phase = math.hypot(*parts), math.atan2(parts[1], parts[0])
+    """Size and phase of the unbalance, from the vectors that are read in the windows."""
+    vectors = [
+        reading.vector
+        for diagnosis in _read(machine, windows)
+        for reading in diagnosis.parameters
+        if reading.vector is not None
+    ]
+    if not vectors:
+        return machine
+    weights = np.array([1 / (one.variance_real + one.variance_imaginary) for one in vectors])
+    parts = weights @ np.array([(one.real, one.imaginary) for one in vectors]) / weights.sum()
+    size, turned = math.hypot(*parts), math.atan2(parts[1], parts[0])
+    phase = math.remainder(machine.operation.unbalance_phase_rad + turned, 2 * math.pi)
     return machine.model_copy(
         update={
             "rotor": machine.rotor.model_copy(update={"e_m": machine.rotor.e_m * size}),
