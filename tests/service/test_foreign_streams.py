@@ -50,7 +50,10 @@ def test_no_parameter_is_blamed_for_what_is_no_rotor(kind: Foreign) -> None:
 
 
 # One sine beside the 1x, far from every mode of the lightly damped machine, is read as a softer shaft and named.
-MISSED = pytest.mark.xfail(reason="EI is named, with reserve: outside the model is found one hop too late")
+# Not strict: it is close to the limit, and processors round differently.
+MISSED = pytest.mark.xfail(
+    strict=False, reason="EI is named, with reserve: outside the model is found one hop too late"
+)
 CASES = [
     pytest.param(name, kind, marks=MISSED if (name, kind) == ("light", "sines") else ())
     for name in ("heavy", "light")
