@@ -27,7 +27,7 @@ from service.residuals import Opinion
 __all__ = ["detectable_changes", "health", "machine_description", "machine_hash", "report"]
 
 
-_REPLAYED = "a replay is announced on this machine's own keys: what is sent is not evaluated"
+_REPLAYED = "a replay is announced on this machine's own keys: what is replayed is not evaluated"
 
 
 def machine_hash(machine: MachineFile) -> str:

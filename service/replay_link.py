@@ -19,6 +19,7 @@ from models.errors import RotorwatchError
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
+from models.signals.wire import REPLAY_MARK
 from rotorwatch.records.replays import ReplayProgress
 from service.replay.control import Control
 from service.replay.player import PlayPlan, play
@@ -188,13 +189,17 @@ class ReplayLink:
         self._undo.close()
 
     def put(self, message: RecordedMessage) -> None:
-        """Publish a message as it was recorded: key below the prefix, payload, attachment and encoding."""
+        """Publish a message as it was recorded: key below the prefix, payload, attachment and encoding.
+
+        On the original keys the encoding of a block says that it is replayed, so that no monitor takes it for the
+        machine's, whenever it comes.
+        """
         with self._lock:
             if self._live:
                 return
-        self._publisher(message.key).put(
-            message.payload, attachment=message.attachment or None, encoding=message.encoding
-        )
+        marked = not self._present().prefix and message.key.endswith("/stream")
+        encoding = message.encoding + REPLAY_MARK if marked else message.encoding
+        self._publisher(message.key).put(message.payload, attachment=message.attachment or None, encoding=encoding)
 
     def wait_for_subscribers(self, timeout_s: float, stopped: Callable[[], bool]) -> bool:
         """Wait until somebody subscribes to every machine's stream; say whether that came true."""

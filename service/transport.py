@@ -27,6 +27,7 @@ from models.errors import RotorwatchError
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage
+from models.signals.wire import REPLAY_MARK
 from service.inbox import RawBlock
 from service.log_query import read_log_query
 from service.logs import logger
@@ -41,7 +42,6 @@ _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 2.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
-_STRAGGLERS_S = 2.0
 _NEVER = timedelta(days=365)
 
 _T = TypeVar("_T")
@@ -76,7 +76,8 @@ class MachineCallbacks:
         Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
         time; what it raises is told to whoever asked.
     on_replay : callable
-        Takes whether a replay is announced on the machine's own keys: nothing of the stream is handed on meanwhile.
+        Takes whether a replay is announced on the machine's own keys. Anybody may announce one, so the stream is handed
+        on all the same, but for blocks that say themselves that they are replayed.
     """
 
     on_block: Callable[[RawBlock], None]
@@ -179,8 +180,7 @@ class MachineLink:
         self._keys = keys
         self._callbacks = callbacks
         self._lock = threading.Lock()
-        self._closed = self._replayed = False
-        self._deaf_until_s = 0.0
+        self._closed = False
         with ExitStack() as undo:
             self._declare(link.session, undo, wait_when_full)
             self._undeclare = undo.pop_all()
@@ -204,11 +204,7 @@ class MachineLink:
         log = _answering_from_log(keys.alarm_event, self._callbacks.alarm_events)
         # A thread of its own, because it waits for the database: the others, and Zenoh, go on.
         keep(session.declare_queryable(keys.alarm_event, zenoh.handlers.Callback(guarded(log), indirect=True)))
-        # What is replayed on a machine's own keys is not of the machine, whoever was there first.
         keep(session.liveliness().declare_subscriber(keys.replay_alive, guarded(self._take_replay), history=True))
-        self._replayed = self._replayed or any(
-            reply.ok is not None for reply in session.liveliness().get(keys.replay_alive, timeout=_QUERY_TIMEOUT_S)
-        )
         # Descriptor and liveliness before the stream: they say what the stream should look like.
         keep(
             zenoh.ext.declare_advanced_subscriber(
@@ -252,20 +248,13 @@ class MachineLink:
                 publisher.put(text)
 
     def _take_replay(self, sample: zenoh.Sample) -> None:
-        replayed = sample.kind == zenoh.SampleKind.PUT
-        self._callbacks.on_replay(replayed)
-        if replayed:
-            _log.warning("a replay on this machine's own keys: what it sends is not evaluated", key=self._keys.root)
-        else:  # samples may arrive after the token's end; blocks come on another thread, so this is first
-            self._deaf_until_s = time.monotonic() + _STRAGGLERS_S
-        self._replayed = replayed
+        self._callbacks.on_replay(sample.kind == zenoh.SampleKind.PUT)
 
     def _take_block(self, sample: zenoh.Sample) -> None:
-        if self._replayed or time.monotonic() < self._deaf_until_s:
-            return
-        if sample.kind == zenoh.SampleKind.PUT:
+        encoding = str(sample.encoding)
+        if sample.kind == zenoh.SampleKind.PUT and not encoding.endswith(REPLAY_MARK):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, str(sample.encoding)))
+            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding))
 
     def _take_miss(self, miss: zenoh.ext.Miss) -> None:
         self._callbacks.on_missed(miss.nb)

@@ -207,8 +207,10 @@ class MachineWorker:
             self._mismatch = ()
 
     def replay(self, announced: bool) -> None:
-        """Take note of a replay on the machine's own keys that begins or ends; nothing of it arrives here."""
+        """Take note of a replay on the machine's own keys that begins or ends; its blocks do not arrive here."""
         self._replay_announced = announced
+        if announced:
+            self._warn("replay", "a replay is announced on this machine's own keys; the machine's own blocks count")
 
     def descriptor(self, announced: bytes) -> None:
         """Compare an announced channel descriptor with the machine file."""

@@ -83,5 +83,5 @@ class MachineKeys:
 
     @property
     def replay_alive(self) -> str:
-        """Liveliness token of a replay on the machine's own keys: no monitor listens as long as it is there."""
+        """Liveliness token of a replay on the machine's own keys, which monitors state and do not evaluate."""
         return f"{self.root}/alive/replay"

@@ -18,6 +18,7 @@ __all__ = [
     "ARROW_ENCODING",
     "BLOCK_ENCODING",
     "HEADER_BYTES",
+    "REPLAY_MARK",
     "decode_block",
     "encode_arrow",
     "encode_block",
@@ -27,6 +28,8 @@ __all__ = [
 
 BLOCK_ENCODING = "application/x-rotorwatch-block"
 ARROW_ENCODING = "application/vnd.apache.arrow.stream"
+REPLAY_MARK = ";replay"
+"""Ends the encoding of a block that is replayed on a machine's own keys."""
 
 _HEADER = struct.Struct("<qQdBBHI")  # start_ns, sequence, rate_hz, dtype, channels, run, samples
 HEADER_BYTES = _HEADER.size

@@ -136,7 +136,7 @@ class StreamStatus(BaseModel):
         description="time since the last accepted block was processed; null before the first", examples=[0.04]
     )
     replay_announced: bool = Field(
-        description="somebody announces a replay on the machine's own keys; what is sent is not evaluated meanwhile",
+        description="somebody announces a replay on the machine's own keys; what is replayed is not evaluated",
         examples=[False],
     )
     descriptor_mismatch: tuple[str, ...] = Field(

@@ -3,6 +3,7 @@
 import json
 import struct
 import threading
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +13,14 @@ import structlog
 
 from models.alarm_names import CONFLICT, of_the_machine
 from models.commissioning.installed import install
-from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, encode_block, sender_of
+from models.signals.link import LinkSettings
+from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_block, sender_of
 from service.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
 from service.inbox import Inbox, RawBlock
 from service.monitor import MachineMonitor
-from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, service, until
+from service.runtime import running
+from service.transport import Link, route
+from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, service, settings, until
 from tests.service.test_alarm_trouble import bench
 
 KB = 1024
@@ -178,12 +182,45 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
         assert sum(health.quality.refused_blocks.values()) > 1000  # how many come through is the network's affair
 
 
-def test_a_replay_that_is_announced_is_told_as_the_reason_for_silence() -> None:
+# Replays
+
+
+@pytest.mark.parametrize("first", ["monitor", "token"])
+def test_a_replay_that_is_announced_silences_no_machine(first: str) -> None:
+    """Anybody on a link without grants can announce one: what the machine sends is evaluated all the same."""
+    address = endpoint()
+    joined = LinkSettings(mode="client", connect=(address,))
+    with route(LinkSettings(listen=(address,))), closing(Link(joined)) as liar:
+        plan = settings(address).model_copy(update={"link": joined})
+        announce = liar.session.liveliness().declare_token
+        early = None if first == "monitor" else announce(LAB.keys.replay_alive)
+        with running(plan) as runtime, open_session(address, "client") as session:
+            worker, feed = runtime.machines()[0], Feed(session)
+            for _ in range(5):
+                feed.put_good()
+            token = early or announce(LAB.keys.replay_alive)
+            until(lambda: worker.health().stream.replay_announced, "the announcement")
+            assert "replay" in worker.health().reason
+            for _ in range(5):
+                feed.put_good()
+            until(lambda: worker.health().quality.accepted_blocks == 10, "all blocks of the machine")
+            token.undeclare()  # type: ignore[no-untyped-call]
+            until(lambda: not worker.health().stream.replay_announced, "its end")
+            assert "replay" not in worker.health().reason
+            for _ in range(5):
+                feed.put_good()
+            until(lambda: worker.health().quality.accepted_blocks == 15, "what comes afterwards")
+            assert worker.health().quality.gaps == 0
+
+
+def test_blocks_that_say_they_are_replayed_are_not_the_machines() -> None:
     address = endpoint()
     with service(address) as (_, worker), open_session(address) as session:
-        token = session.liveliness().declare_token(LAB.keys.replay_alive)
-        until(lambda: worker.health().stream.replay_announced, "the announcement")
-        assert "replay" in worker.health().reason
-        token.undeclare()  # type: ignore[no-untyped-call]
-        until(lambda: not worker.health().stream.replay_announced, "its end")
-        assert "replay" not in worker.health().reason
+        feed = Feed(session)
+        feed.put_good()
+        for one in scenario_blocks(2.0, start_ns=feed.start_ns, run=2):
+            payload, header, encoding = encode_block(one, "")
+            feed.put_raw(payload, header, encoding + REPLAY_MARK)
+        feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 2, "the machine's own blocks")
+        assert worker.health().quality.refused_blocks == {}
