@@ -24,7 +24,7 @@ from rotorwatch.records.health import Health
 from service.store.errors import StoreError
 from service.store.records import StoredEvent
 
-__all__ = ["AlarmLog", "Cursor", "CursorError", "EventFeed", "cursor_text", "parsed_cursor"]
+__all__ = ["CURSOR_PATTERN", "AlarmLog", "Cursor", "CursorError", "EventFeed", "cursor_text", "parsed_cursor"]
 
 Cursor = dict[str, int]
 """Sequence of the last alarm event that was delivered, for each ``site/machine``; -1 before the first."""
@@ -33,7 +33,9 @@ _PAGE = 100
 _KEEP_ALIVE_S = 15.0
 _AGAIN_S = 1.0
 _RETRY_MS = 2000
-_ENTRY = re.compile(r"([A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63})=(-1|[0-9]{1,18})")
+_ENTRY = r"([A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63})=(-1|[0-9]{1,18})"
+CURSOR_PATTERN = f"^({_ENTRY}(,{_ENTRY})*)?$"
+"""What the id of an event looks like; each ``site/machine`` is there once."""
 
 
 class CursorError(RotorwatchError):
@@ -76,7 +78,7 @@ def parsed_cursor(text: str) -> Cursor:
     """
     found: Cursor = {}
     for entry in text.split(","):
-        part = _ENTRY.fullmatch(entry)
+        part = re.fullmatch(_ENTRY, entry)
         if part is None or part[1] in found:
             raise CursorError(
                 f"cursor: {entry[:80]!r} is not site/machine=sequence; pass the id of an event as it was received"

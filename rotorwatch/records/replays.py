@@ -2,7 +2,7 @@
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.fields import JSON
@@ -146,7 +146,14 @@ class ReplayJob(BaseModel):
 class ReplaySeek(BaseModel):
     """Where a replay is to go on: a time, or a distance from where it is."""
 
-    model_config = JSON
+    model_config = ConfigDict(
+        **JSON,
+        json_schema_extra={
+            "if": {"properties": {"to_ns": {"type": "integer"}}, "required": ["to_ns"]},
+            "then": {"properties": {"by_s": {"type": "null"}}},
+            "else": {"properties": {"by_s": {"type": "number"}}, "required": ["by_s"]},
+        },
+    )
 
     to_ns: int | None = Field(default=None, ge=0, description="time of the data", examples=[1767225700000000000])
     by_s: float | None = Field(

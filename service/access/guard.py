@@ -31,7 +31,7 @@ from starlette.exceptions import HTTPException
 from models.errors import RotorwatchError
 from service.access.audit import AuditLog, AuditTrail, Visit
 from service.access.middleware import VISIT, AccessMiddleware
-from service.access.origin import SAFE_METHODS, check_origin
+from service.access.origin import SAFE_METHODS, check_body_type, check_origin
 from service.access.presented import address_of, key_of, network_of, presented_text, unauthenticated
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import Requirement, requires
@@ -155,7 +155,7 @@ class Guard:
         Raises
         ------
         HTTPException
-            401, 403, 415, 429 or 503.
+            401, 403, 429 or 503.
         """
         address = address_of(request)
         in_the_open = self.access.open_on_loopback
@@ -182,7 +182,8 @@ class Guard:
         Raises
         ------
         HTTPException
-            403 if the scope is missing or the route declares none, 503 if the audit log cannot be written.
+            403 if the scope is missing or the route declares none, 415 if a body is not sent as JSON, 503 if the audit
+            log cannot be written.
         """
         if _is_public(request):
             return
@@ -193,6 +194,7 @@ class Guard:
             Requirement(scope)(request)
         if request.method in SAFE_METHODS:
             return
+        check_body_type(request.headers, request.method)
         visit: Visit = getattr(request.state, VISIT)
         try:
             self.trail.start(visit)

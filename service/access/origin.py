@@ -12,7 +12,7 @@ from starlette.exceptions import HTTPException
 
 from service.access_settings import is_address
 
-__all__ = ["SAFE_METHODS", "check_origin"]
+__all__ = ["SAFE_METHODS", "check_body_type", "check_origin"]
 
 SAFE_METHODS = frozenset(("GET", "HEAD", "OPTIONS"))
 """Methods that change nothing."""
@@ -41,7 +41,7 @@ def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple
     Raises
     ------
     HTTPException
-        403 for a request from elsewhere, 415 for a body that a form could send.
+        403 for a request from elsewhere.
     """
     host = headers.get("host", "")
     if open_to_all:
@@ -60,7 +60,18 @@ def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple
         raise HTTPException(403, f"a page from {origin[:200]} may not do this")
     if headers.get("sec-fetch-site", "none") not in _FROM_HERE:
         raise HTTPException(403, "a page from elsewhere may not do this")
-    # A form can send neither this type nor other methods; a script from elsewhere would have to ask first.
+
+
+def check_body_type(headers: Headers, method: str) -> None:
+    """Refuse what a form of somebody else's page could send to a route that takes a body.
+
+    A form can send neither JSON nor other methods; a script from elsewhere would have to ask first.
+
+    Raises
+    ------
+    HTTPException
+        415 for a body that is not sent as JSON.
+    """
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     if method in _WITH_BODY and kind != "application/json":
         raise HTTPException(415, f"content type is {kind[:100] or 'missing'}, expected application/json")

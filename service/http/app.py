@@ -4,7 +4,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, JSONResponse
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field, WithJsonSchema
 
 from models.machine import MachineFile, load_machine
 from rotorwatch import __version__
@@ -52,10 +52,20 @@ def _sizeable(change: float) -> float:
     return change
 
 
-_Change = Annotated[
-    Annotated[float, AfterValidator(_sizeable)] | None,
-    Query(gt=-1, le=10, allow_inf_nan=False, description="relative change to be found, -0.05 for a loss of 5 %"),
+_Sizeable = Annotated[
+    float,
+    Field(gt=-1, le=10, allow_inf_nan=False),
+    AfterValidator(_sizeable),
+    WithJsonSchema(
+        {
+            "type": "number",
+            "exclusiveMinimum": -1,
+            "maximum": 10,
+            "not": {"exclusiveMinimum": -_SMALLEST_CHANGE, "exclusiveMaximum": _SMALLEST_CHANGE},
+        }
+    ),
 ]
+_Change = Annotated[_Sizeable | None, Query(description="relative change to be found, -0.05 for a loss of 5 %")]
 
 
 def create_app(service: ServiceView, guard: Guard) -> FastAPI:

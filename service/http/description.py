@@ -89,7 +89,8 @@ def _simplify(schema: Any) -> None:
     """Make a schema such that programs can be generated from it, and small.
 
     Says of every tuple also what all of its values are, which generators read that do not know `prefixItems`, and
-    leaves out titles that only repeat the name of a field.
+    leaves out titles that only repeat the name of a field, and the null of an argument that may be left out: nobody
+    could send it.
     """
     if isinstance(schema, list):
         for one in schema:
@@ -103,6 +104,10 @@ def _simplify(schema: Any) -> None:
                 field.pop("title", None)
         if isinstance(own, dict) and own.get("description") == schema.get("description"):  # an argument's
             own.pop("description", None)
+        if isinstance(own, dict) and "in" in schema and isinstance(choice := own.get("anyOf"), list):
+            own["anyOf"] = choice = [one for one in choice if one != {"type": "null"}]
+            if len(choice) == 1:
+                own.update(*own.pop("anyOf"))
         if isinstance(first := schema.get("prefixItems"), list):
             different = [one for number, one in enumerate(first) if one not in first[:number]]
             schema["items"] = different[0] if len(different) == 1 else {"anyOf": different}

@@ -12,13 +12,14 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from service.access.guard import Guard
 from service.access.scopes import Caller
-from service.event_feed import AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
+from service.event_feed import CURSOR_PATTERN, AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
 from service.http.views import ServiceView
 from service.problems import problem_responses
 
 __all__ = ["add_event_routes", "stream_example"]
 
 _LONGEST = 20_000
+_FORM = {"pattern": CURSOR_PATTERN}  # described here, refused in words that say more
 
 _Machines = Annotated[
     list[str],
@@ -26,11 +27,20 @@ _Machines = Annotated[
 ]
 _LastEventId = Annotated[
     str | None,
-    Header(alias="Last-Event-ID", max_length=_LONGEST, description="`id` of the last event; goes on right after it"),
+    Header(
+        alias="Last-Event-ID",
+        max_length=_LONGEST,
+        json_schema_extra=_FORM,
+        description="`id` of the last event; goes on right after it",
+    ),
 ]
 _LastEventIdArgument = Annotated[
     str | None,
-    Query(max_length=_LONGEST, description="the same for whoever cannot send the header, which counts if both are"),
+    Query(
+        max_length=_LONGEST,
+        json_schema_extra=_FORM,
+        description="the same for whoever cannot send the header, which counts if both are",
+    ),
 ]
 _From = Annotated[
     Literal["now", "beginning"], Query(alias="from", description="where to begin without the id of a last event")

@@ -163,7 +163,7 @@ def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     app.include_router(router)
 
 
-_NoOrder = Annotated[NoOrder | None, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
+_NoOrder = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
 _Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldest")]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
@@ -231,13 +231,13 @@ def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> N
         return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
 
     @router.post("/{replay_id}/pause", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def pause_replay(replay_id: str, order: _NoOrder = None) -> ReplayJob:
+    def pause_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
         """Pause a paced replay."""
         _ = order
         return _order(desk, replay_id, "pause")
 
     @router.post("/{replay_id}/resume", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
-    def resume_replay(replay_id: str, order: _NoOrder = None) -> ReplayJob:
+    def resume_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
         """Let a paused replay go on."""
         _ = order
         return _order(desk, replay_id, "resume")
