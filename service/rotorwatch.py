@@ -23,6 +23,7 @@ from service.commands.running import (
     LinkOption,
     ListenOption,
     VersionOption,
+    check_address_space,
     exit_codes,
     one_blas_thread,
     raise_file_limit,
@@ -93,6 +94,7 @@ def run(
     [cyan]rotorwatch run --when-full wait[/cyan]
     """
     with exit_codes():
+        check_address_space()
         one_blas_thread()
         raise_file_limit()
         from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
@@ -198,6 +200,7 @@ def demo(
     [cyan]rotorwatch demo --fault c_by --once[/cyan]
     """
     with exit_codes():
+        check_address_space()
         one_blas_thread()
         typer.echo("starting a simulated machine and a monitor (some seconds) ...")
         sys.stdout.flush()

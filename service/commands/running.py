@@ -21,6 +21,7 @@ __all__ = [
     "ListenOption",
     "ToOption",
     "VersionOption",
+    "check_address_space",
     "exit_codes",
     "one_blas_thread",
     "raise_file_limit",
@@ -30,6 +31,11 @@ ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
 
 _FILES = 65_536
+_NO_THREAD = "can't start new thread"
+_MB = 1_000_000
+_ADDRESS_SPACE_MB = 2_000
+_OF_A_MACHINE_MB = 100
+"""Little of it is memory: stacks of threads and what libraries set aside."""
 
 ConnectOption = Annotated[
     list[str] | None,
@@ -101,6 +107,26 @@ def raise_file_limit() -> None:
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
+def check_address_space() -> None:
+    """Refuse to start where a monitor would end, or hang, in the middle of some library that gets no memory.
+
+    Raises
+    ------
+    RotorwatchError
+        Naming the limit and what is needed.
+    """
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit != resource.RLIM_INFINITY and limit < _ADDRESS_SPACE_MB * _MB:
+        raise RotorwatchError(f"the monitor cannot start: {_too_small(limit)}")
+
+
+def _too_small(limit: int) -> str:
+    return (
+        f"the address space of the process is limited to {limit // _MB} MB (ulimit -v), expected at least "
+        f"{_ADDRESS_SPACE_MB} MB for one machine and {_OF_A_MACHINE_MB} MB for each further one"
+    )
+
+
 @contextmanager
 def exit_codes() -> Iterator[None]:
     """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
@@ -111,4 +137,10 @@ def exit_codes() -> Iterator[None]:
         raise typer.Exit(2) from error
     except RotorwatchError as error:
         typer.echo(str(error), err=True)
+        raise typer.Exit(1) from error
+    except (MemoryError, RuntimeError) as error:
+        limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if limit == resource.RLIM_INFINITY or (isinstance(error, RuntimeError) and _NO_THREAD not in str(error)):
+            raise
+        typer.echo(f"no memory is left ({str(error) or type(error).__name__}): {_too_small(limit)}", err=True)
         raise typer.Exit(1) from error

@@ -95,7 +95,8 @@ class HttpServer:
         """Finish present requests and free the address."""
         if self._server is not None and self._thread is not None:
             self._server.should_exit = True
-            self._thread.join(_JOIN_S)
+            if self._thread.is_alive():  # else it could not be started, and that is what is to be told
+                self._thread.join(_JOIN_S)
         self._socket.close()
 
 

@@ -2,6 +2,7 @@
 
 import sqlite3
 import stat
+from dataclasses import astuple
 from pathlib import Path
 
 import pytest
@@ -11,14 +12,14 @@ from models.alarm_names import FAULT
 from service.config import HistorySettings
 from service.rotorwatch import app
 from service.runtime import running as running_here
-from service.store.records import TokenRecord
+from service.store.records import StoredEvent, TokenRecord
 from service.store.retention import Retention
 from service.store.store import Store
 from tests.service.live import endpoint, machine_file, settings, until
 from tests.service.monitored import client
 from tests.service.test_alarm_trouble import Bench, bench, block
-from tests.service.test_store import AUDIT, T0
-from tests.service.test_survives import PATIENT, running
+from tests.service.test_store import AUDIT, T0, alarm_event
+from tests.service.test_survives import PATIENT, do, running
 
 TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
 
@@ -33,6 +34,23 @@ def test_a_monitor_that_could_not_write_the_last_of_it_says_what_is_lost(tmp_pat
         (said,) = [line for line in at.errors().splitlines() if line.startswith("could not be written")]
         assert "demo/lab: the state to go on from" in said
         assert "database is locked" in said
+
+
+def test_a_monitor_whose_latest_step_was_refused_does_not_end_as_if_all_were_well(tmp_path: Path) -> None:
+    with running(tmp_path, endpoint(), machine_file(tmp_path, PATIENT)) as at:
+        at.url()
+        with sqlite3.connect(history_of(tmp_path)) as connection:  # another program took the number of the next event
+            columns = ", ".join(StoredEvent.__dataclass_fields__)
+            marks = ", ".join("?" * len(StoredEvent.__dataclass_fields__))
+            connection.execute(
+                f"INSERT INTO alarm_events (machine_id, {columns}) SELECT machine_id, {marks} FROM machines",  # noqa: S608
+                astuple(alarm_event(0)),
+            )
+        connection.close()
+        do(at, "shelve", "model", "normal", duration_s=3600)
+        assert at.stop() == 1
+        (said,) = [line for line in at.errors().splitlines() if line.startswith("the history refused the latest step")]
+        assert "demo/lab" in said
 
 
 def history_of(folder: Path) -> Path:
