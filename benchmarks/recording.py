@@ -64,7 +64,9 @@ def median_s(work: Callable[[], object], clean: Callable[[], object]) -> float:
 def live(machine: Machine, content: list[RecordedMessage], out: Path) -> tuple[float, int, float]:
     """Record many machines in real time: share of one core, messages not on the disk at the end, MB/s."""
     settings = RecordingSettings(directory=str(out))
-    recorders = [MachineRecorder(machine.model_copy(update={"name": f"m{n}"}), settings) for n in range(MACHINES)]
+    recorders = [
+        MachineRecorder(machine.model_copy(update={"name": f"m{n}"}), settings, lambda _: ()) for n in range(MACHINES)
+    ]
     for recorder in recorders:
         recorder.start()
     begin, cpu, count = time.perf_counter(), time.process_time(), round(LIVE_S * RATE_HZ / BLOCK)
@@ -106,7 +108,7 @@ def main() -> None:
 
         def record() -> None:
             settings = RecordingSettings(directory=str(out), queue_mb=2 * total_mb)
-            recorder = MachineRecorder(machine, settings)
+            recorder = MachineRecorder(machine, settings, lambda _: ())
             recorder.start()
             for message in content:
                 recorder.put(message)

@@ -20,6 +20,7 @@ is noticed on the monotonic clock; the time of day is used for what is recorded 
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 from models.commissioning.installed import install
@@ -205,7 +206,8 @@ class Runtime:
         if self.settings.link.namespace:
             _log.warning("not recorded: what is heard in a namespace is a replay", machine=machine.name)
             return
-        recorder = MachineRecorder(machine, self.settings.recording)
+        committed = partial(self.store.alarms.since, machine.site, machine.name)
+        recorder = MachineRecorder(machine, self.settings.recording, committed)
         undo.callback(recorder.stop)
         recorder.start()
         # Before anything is published for the machine, and undeclared after everything is.

@@ -5,6 +5,7 @@ import sys
 from contextlib import ExitStack
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,7 +17,7 @@ from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
     from models.signals.salvage import Salvage
-    from service.config import RecordingSettings
+    from service.config import HistorySettings, RecordingSettings
     from service.recording.recorder import MachineRecorder
 
 __all__ = ["register"]
@@ -40,7 +41,9 @@ def record(
     ] = None,
     config: Annotated[
         Path | None,
-        typer.Option("--config", metavar="FILE", help="Settings (TOML): machines, and what is kept, \\[recording]."),
+        typer.Option(
+            "--config", metavar="FILE", help="Settings (TOML) of the monitor: machines, \\[recording], \\[history]."
+        ),
     ] = None,
     connect: ConnectOption = None,
     listen: ListenOption = None,
@@ -60,12 +63,12 @@ def record(
     """Record everything that is published under machines' keys until Ctrl-C.
 
     A monitor records by itself if its settings say so; this is for recording without one. Older files are dropped; what
-    lies around an alarm is kept longer.
+    lies around an alarm in the history of a monitor on this computer is kept longer.
 
     [bold]Examples[/bold]
 
-    Beside a monitor on this computer:
-    [cyan]rotorwatch record --machine pump-7.toml --out /data/recordings[/cyan]
+    Beside a monitor on this computer, with its settings:
+    [cyan]rotorwatch record --config plant.toml --out /data/recordings[/cyan]
 
     Two machines, through a router:
     [cyan]rotorwatch record --machine pump-7.toml --machine fan-2.toml --out /data --connect tcp/10.0.0.9:7447[/cyan]
@@ -73,18 +76,24 @@ def record(
     with exit_codes(), ExitStack() as undo:
         one_blas_thread()
         changes = {"rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
-        machines, settings = _settings(config, machine, out, {k: v for k, v in changes.items() if v is not None})
+        machines, settings, history = _settings(
+            config, machine, out, {k: v for k, v in changes.items() if v is not None}
+        )
         from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
         from service.config import LogSettings  # noqa: PLC0415
         from service.logs import configure_logging  # noqa: PLC0415
         from service.recording.recorder import MachineRecorder  # noqa: PLC0415
         from service.stopping import stop_request  # noqa: PLC0415
+        from service.store.alarm_log import committed_events  # noqa: PLC0415
         from service.transport import Link, MachineTap  # noqa: PLC0415
 
         configure_logging(LogSettings())
         ends = tuple(connect or (() if listen else (ENDPOINT,)))
         link_settings = LinkSettings(mode="peer" if listen else "client", listen=tuple(listen or ()), connect=ends)
-        recorders = [MachineRecorder(one, settings) for one in machines]
+        recorders = [
+            MachineRecorder(one, settings, partial(committed_events, history.database, one.site, one.name))
+            for one in machines
+        ]
         for recorder in recorders:
             recorder.prepare()  # a folder that cannot be written is a mistake to be told at once
         stop = undo.enter_context(stop_request())
@@ -162,28 +171,28 @@ class _Statuses:
 
 def _settings(
     config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
-) -> "tuple[list[MachineFile], RecordingSettings]":
-    """Machines and settings: the command line over the settings file."""
+) -> "tuple[list[MachineFile], RecordingSettings, HistorySettings]":
+    """Machines, what is kept, and the history of the monitor: the command line over the settings file."""
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
     from models.mistakes import checked  # noqa: PLC0415
     from service.config import RecordingSettings, load_settings  # noqa: PLC0415
 
-    settings = None if config is None else load_settings(config)
-    if not machines and settings is None:
+    settings = load_settings(config)
+    if not machines and config is None:
         raise MachineFileError("nothing to record: give --machine FILE, or --config FILE with machines in it")
-    fields = {} if settings is None else settings.recording.model_dump()
+    fields = settings.recording.model_dump()
     if out is not None:
         fields["directory"] = str(out)
     recording = checked(RecordingSettings, fields | changes, "command line")
     if recording.directory is None:
         raise MachineFileError("nowhere to record to: give --out DIR, or directory in [recording] of the settings")
-    files = machines or [entry.file for entry in settings.machines] if settings is not None else machines or []
+    files = machines or [entry.file for entry in settings.machines]
     loaded = [load_machine_file(file) for file in files]
     roots = [one.keys.root for one in loaded]
     for root in roots:
         if roots.count(root) > 1:
             raise MachineFileError(f"two of the machine files describe {root}")
-    return loaded, recording
+    return loaded, recording, settings.history
 
 
 def _summed_up(recorders: "list[MachineRecorder]") -> bool:

@@ -15,11 +15,11 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from models.errors import RecordingError
+from models.errors import RecordingError, RotorwatchError
 from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter, writing
 from service.config import RecordingSettings
@@ -27,7 +27,8 @@ from service.logs import Limiter, logger
 from service.recording.backlog import Backlog
 from service.recording.catalogue import PART, SUFFIX, Catalogue, name_of
 from service.recording.leftovers import DAMAGED, leftovers, lock, loss_text, recover_leftover
-from service.recording.retention import AlarmMark, alarm_mark, alarm_marks, decide, write_kept
+from service.recording.retention import AlarmMark, alarm_mark, decide, write_kept
+from service.store.records import StoredEvent
 
 __all__ = ["MachineRecorder", "RecorderStatus"]
 
@@ -96,6 +97,9 @@ class MachineRecorder:
         Whose messages they are.
     settings : RecordingSettings
         With a directory.
+    committed : callable
+        Takes a time of this computer and returns the alarm events that the machine's monitor has recorded since then:
+        what lies around them is kept longer. Called on the recorder's thread; may raise `RotorwatchError`.
     clock : callable
         Monotonic seconds.
     now_ns : callable
@@ -111,6 +115,7 @@ class MachineRecorder:
         self,
         machine: MachineFile,
         settings: RecordingSettings,
+        committed: Callable[[int], Iterable[StoredEvent]],
         clock: Callable[[], float] = time.monotonic,
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
@@ -120,6 +125,7 @@ class MachineRecorder:
         self.settings = settings
         self.directory = Path(settings.directory)
         self.folder = self.directory / machine.site / machine.name
+        self._committed = committed
         self._clock = clock
         self._now_ns = now_ns
         self._log = logger(part="recorder", machine=f"{machine.site}/{machine.name}")
@@ -130,8 +136,8 @@ class MachineRecorder:
         self._unsafe: deque[RecordedMessage] = deque()  # written, in a chunk that is not complete
         self._at_hand = False  # the first of them is being written
         self._descriptor: RecordedMessage | None = None
-        self._marks: dict[str, tuple[AlarmMark, ...]] = {}
-        self._fresh_marks: list[AlarmMark] = []
+        self._marks: tuple[AlarmMark, ...] = ()
+        self._unread = ""
         self._writer: RecordingWriter | None = None
         self._lock: int | None = None
         self._opened_s = self._synced_s = self._tidied_s = clock()
@@ -263,11 +269,8 @@ class MachineRecorder:
         writer = self._writer
         if writer is None:
             writer = self._open(message)
-        keys = self.machine.keys
-        if message.key == keys.descriptor:
+        if message.key == self.machine.keys.descriptor:
             self._descriptor = message
-        elif message.key == keys.alarm_event:
-            self._fresh_marks.append(alarm_mark(message))
         self._unsafe.append(message)
         writer.write(message)
         self._count(writer)
@@ -331,8 +334,6 @@ class MachineRecorder:
         writer.close()
         self._writer = None
         self._files += 1
-        self._marks[writer.path.name] = tuple(self._fresh_marks)
-        self._fresh_marks.clear()
         self._log.info("recording closed", file=writer.path.name, messages=writer.messages, bytes=writer.size_bytes)
 
     def _fail(self, problem: str) -> None:
@@ -350,7 +351,6 @@ class MachineRecorder:
         self._at_hand = False
         self._pending.extendleft(reversed(again))
         self._unsafe.clear()
-        self._fresh_marks.clear()
         if self._lock is not None:  # the folder may not be the same any more
             os.close(self._lock)
             self._lock = None
@@ -394,18 +394,21 @@ class MachineRecorder:
 
     def _retain(self) -> None:
         recordings = self._catalogue.recordings(self.machine.site, self.machine.name)
-        names = {one.path.name for one in recordings if one.complete}
-        known = self._marks
-        event = self.machine.keys.alarm_event
-        self._marks = {n: known[n] if n in known else alarm_marks(self.folder / n, event) for n in names}
-        marks = [*(mark for found in self._marks.values() for mark in found), *self._fresh_marks]
-        decision = decide(recordings, marks, self.settings, self._now_ns())
+        oldest_ns = min((one.start_ns for one in recordings), default=0)
+        try:
+            events = self._committed(oldest_ns - round(self.settings.alarm_after_s * 1e9))
+            self._marks = tuple(map(alarm_mark, events))
+            self._unread = ""
+        except RotorwatchError as error:  # those that are known hold on
+            if str(error) != self._unread:
+                self._log.warning("the history cannot be read: no further alarm keeps recordings", why=str(error))
+            self._unread = str(error)
+        decision = decide(recordings, self._marks, self.settings, self._now_ns())
         kept = {one.path.name: one.kept_because for one in recordings if one.kept_because}
         if decision.kept != kept:
             write_kept(self.folder, decision.kept, self.settings)
         for recording, why in decision.dropped:
             recording.path.unlink(missing_ok=True)
-            self._marks.pop(recording.path.name, None)
             self._log.info("recording dropped", file=recording.path.name, why=why)
 
 

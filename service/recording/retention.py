@@ -2,7 +2,8 @@
 
 Whole files are kept or dropped, the oldest first. A file that reaches into the time around an alarm event falls under
 the limits for alarms, every other one under the ordinary limits. Times are log times: the computer's clock when a
-message arrived. The events are found in the recordings themselves, so that nothing need be remembered elsewhere.
+message arrived, or when the monitor recorded an event. The events are those that a monitor committed to its history;
+what is on the wire anybody may have sent. What was kept once stays so, also if the history is lost.
 
 Only files named as the recorder names them are ever dropped; one that is renamed stays.
 """
@@ -13,24 +14,24 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from models.errors import RecordingError
-from models.signals.recording import RecordedMessage, read_recording, writing
+from models.signals.recording import writing
 from service.config import RecordingSettings
 from service.recording.catalogue import KEPT, Recording, start_of
+from service.store.records import StoredEvent
 
-__all__ = ["AlarmMark", "Decision", "alarm_mark", "alarm_marks", "decide", "write_kept"]
+__all__ = ["AlarmMark", "Decision", "alarm_mark", "decide", "write_kept"]
 
 _NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class AlarmMark:
-    """An alarm event seen by the recorder.
+    """An alarm event that a monitor committed.
 
     Attributes
     ----------
     time_ns : int
-        Log time.
+        When it was recorded, by the computer's clock.
     text : str
         What it was, for people.
     """
@@ -70,7 +71,7 @@ def decide(
         Present time, nanoseconds since 1970-01-01 UTC.
     """
     own = [one for one in recordings if one.complete and start_of(one.path.name) is not None]
-    reasons = {one.id: reason for one in own if (reason := _reason(one, marks, settings))}
+    reasons = {one.id: reason for one in own if (reason := _reason(one, marks, settings) or one.kept_because)}
     ordinary = [one for one in own if one.id not in reasons]
     alarmed = [one for one in own if one.id in reasons]
     dropped = [
@@ -81,29 +82,9 @@ def decide(
     return Decision({one.path.name: reasons[one.id] for one in alarmed if one.id not in gone}, tuple(dropped))
 
 
-def alarm_mark(message: RecordedMessage) -> AlarmMark:
-    """Say what an alarm event is; one that cannot be read counts as an alarm all the same."""
-    try:
-        data = json.loads(message.payload)["data"]
-        text = f"{data['kind']}: {data['text']}"
-    except (ValueError, KeyError, TypeError):
-        text = "alarm event"
-    return AlarmMark(message.log_time_ns, text)
-
-
-def alarm_marks(path: Path, alarm_event: str) -> tuple[AlarmMark, ...]:
-    """Alarm events in a recording; none if it cannot be read.
-
-    Parameters
-    ----------
-    path : Path
-    alarm_event : str
-        Key of the machine's alarm events.
-    """
-    try:
-        return tuple(map(alarm_mark, read_recording(path, keys=[alarm_event])))
-    except RecordingError:
-        return ()
+def alarm_mark(event: StoredEvent) -> AlarmMark:
+    """Say what an alarm event is."""
+    return AlarmMark(event.recorded_ns, f"{event.kind}: {json.loads(event.text)['data']['text']}")
 
 
 def write_kept(folder: Path, kept: dict[str, str], settings: RecordingSettings) -> None:

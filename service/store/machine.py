@@ -6,6 +6,7 @@ from typing import Any
 from sqlalchemy import Row, func, select
 from sqlalchemy.sql.elements import ColumnElement
 
+from service.store.alarm_log import EVENT
 from service.store.backlog import pack, unpack
 from service.store.database import Database
 from service.store.errors import StoreError
@@ -25,7 +26,6 @@ from service.store.writer import Writer
 
 __all__ = ["MachineStore"]
 
-_EVENT = [alarm_events.c[name] for name in StoredEvent.__dataclass_fields__]
 _HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
 
 
@@ -143,7 +143,7 @@ class MachineStore:
             Order, and thus which are returned if there are more.
         """
         log = alarm_events.c
-        query = select(*_EVENT).where(
+        query = select(*EVENT).where(
             log.machine_id == self._claim.machine_id,
             *_between(log.time_ns, since_ns, until_ns),
             *(

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from sqlalchemy import text
 
+from service.store.alarm_log import AlarmLog
 from service.store.audit import AuditLog
 from service.store.database import Database
 from service.store.errors import StoreError
@@ -50,6 +51,7 @@ class Store:
 
     Attributes
     ----------
+    alarms : AlarmLog
     tokens : TokenStore
     audit : AuditLog
     webhooks : WebhookCursors
@@ -83,6 +85,7 @@ class Store:
         self._writer = Writer(self._database, retry_s, waiting_reports, retention.bucket_s * 10**9)
         self._reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
+        self.alarms = AlarmLog(self._database)
         self.tokens = TokenStore(self._database)
         self.audit = AuditLog(self._database)
         self.webhooks = WebhookCursors(self._database)

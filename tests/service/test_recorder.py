@@ -57,7 +57,7 @@ def into(directory: Path, **fields: float) -> RecordingSettings:
 
 @contextmanager
 def recording(directory: Path, **fields: float) -> Iterator[MachineRecorder]:
-    recorder = MachineRecorder(LAB, into(directory, **fields))
+    recorder = MachineRecorder(LAB, into(directory, **fields), lambda _: ())
     recorder.start()
     try:
         yield recorder
@@ -192,7 +192,7 @@ def test_without_an_announced_descriptor_the_machine_file_s_own_is_marked_as_suc
 
 def test_files_are_closed_by_age_also_when_nothing_more_comes(tmp_path: Path) -> None:
     time_s = [0.0]
-    recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), clock=lambda: time_s[0])
+    recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), lambda _: (), clock=lambda: time_s[0])
     recorder.start()
     put(recorder, blocks(3))
     until(lambda: bool(recorder.status().file), "open file")
@@ -216,7 +216,7 @@ def test_a_slow_stream_does_not_wait_in_an_unfinished_chunk(tmp_path: Path) -> N
 
 def test_a_recorder_that_stops_writes_what_waits(tmp_path: Path) -> None:
     content = blocks(3000)
-    recorder = MachineRecorder(LAB, into(tmp_path))
+    recorder = MachineRecorder(LAB, into(tmp_path), lambda _: ())
     put(recorder, content)
     recorder.start()
     recorder.stop()

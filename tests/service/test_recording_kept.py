@@ -2,6 +2,9 @@
 
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,20 +18,23 @@ from rotorwatch.records.example import example
 from service.config import RecordingSettings
 from service.recording.catalogue import Catalogue, Recording, kept_reasons, name_of
 from service.recording.recorder import MachineRecorder
-from service.recording.retention import AlarmMark, alarm_mark, alarm_marks, decide
-from tests.service.live import LAB
+from service.recording.retention import AlarmMark, alarm_mark, decide
+from service.runtime import Runtime, running
+from service.store.errors import StoreError
+from service.store.records import StoredEvent
+from tests.service.live import LAB, Feed, Program, endpoint, machine_file, open_session, program, settings, until
+from tests.service.test_store import alarm_event
+from tests.service.test_survives import PATIENT, do, log
+from tests.service.test_survives import running as monitor_running
 
 NS = 1_000_000_000
 NOW_NS = 1_795_271_130 * NS  # 2026-11-21 14:25:30 UTC
 DAY_NS = 86_400 * NS
+SAID = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
 ALARM = RecordedMessage(
-    LAB.keys.alarm_event,
-    AlarmCloudEvent.model_validate(example(AlarmCloudEvent)).model_dump_json().encode(),
-    b"",
-    "application/cloudevents+json",
-    NOW_NS,
-    NOW_NS,
+    LAB.keys.alarm_event, SAID.model_dump_json().encode(), b"", "application/cloudevents+json", NOW_NS, NOW_NS
 )
+EVENT = alarm_event(0, kind=SAID.data.kind.value, text=SAID.model_dump_json(), recorded_ns=NOW_NS)
 
 
 def stored(start_s: float, size_mb: float = 100.0, name: str = "", complete: bool = True) -> Recording:
@@ -120,25 +126,27 @@ def test_limits_hold_and_nothing_goes_without_need(
             assert sum(one.size_bytes for one in [group[-len(left) - 1], *left]) > limit * 1e9
 
 
-def test_an_alarm_event_says_what_it_was_and_an_odd_one_counts_too() -> None:
-    event = AlarmCloudEvent.model_validate_json(ALARM.payload)
-    assert alarm_mark(ALARM) == AlarmMark(NOW_NS, f"{event.data.kind}: {event.data.text}")
-    for payload in (b"", b"[]", b"\xff", b'{"data": 1}', b"null"):
-        odd = RecordedMessage(LAB.keys.alarm_event, payload, b"", "", 5, 5)
-        assert alarm_mark(odd) == AlarmMark(5, "alarm event")
+def test_an_alarm_event_says_what_it_was() -> None:
+    assert alarm_mark(EVENT) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {SAID.data.text}")
 
 
 FEW = {"rotate_mb": 0.1, "keep_gb": 0.0007, "alarm_keep_gb": 1.0, "alarm_before_s": 700, "alarm_after_s": 400}
 
 
-def record_files(directory: Path, first: int, last: int, alarm_at: int | None = None) -> Path:
-    """Record one file of 0.3 MB per five minutes, numbered from now on, with an alarm event in one of them."""
+def record_files(
+    directory: Path, first: int, last: int, forged_at: int | None = None, events: tuple[StoredEvent, ...] = ()
+) -> Path:
+    """Record one file of 0.3 MB per five minutes, numbered from now on, with an alarm event off the wire in one."""
     settings = RecordingSettings.model_validate({"directory": str(directory), **FEW})
-    recorder = MachineRecorder(LAB, settings, now_ns=lambda: NOW_NS + 3600 * NS)
+
+    def committed(since_ns: int) -> tuple[StoredEvent, ...]:
+        return tuple(event for event in events if event.recorded_ns >= since_ns)
+
+    recorder = MachineRecorder(LAB, settings, committed, now_ns=lambda: NOW_NS + 3600 * NS)
     rng = np.random.default_rng(first)
     for number in range(first, last):
         time_ns = NOW_NS + 300 * number * NS
-        if number == alarm_at:
+        if number == forged_at:
             recorder.put(RecordedMessage(ALARM.key, ALARM.payload, b"", ALARM.encoding, time_ns, time_ns))
         recorder.put(RecordedMessage(LAB.keys.stream, rng.bytes(300_000), b"", "x", time_ns, time_ns))
     recorder.start()
@@ -147,16 +155,20 @@ def record_files(directory: Path, first: int, last: int, alarm_at: int | None = 
     return recorder.folder
 
 
+def at_file(number: int) -> StoredEvent:
+    return replace(EVENT, recorded_ns=NOW_NS + 300 * number * NS)
+
+
 def numbers(folder: Path) -> list[int]:
     """Which of the files of `record_files` are there."""
     return [n for n in range(30) if (folder / name_of(NOW_NS + 300 * n * NS)).exists()]
 
 
 def test_the_recorder_keeps_what_lies_around_an_alarm_when_the_rest_is_thinned_out(tmp_path: Path) -> None:
-    folder = record_files(tmp_path, 0, 3, alarm_at=2)
+    events = (at_file(2),)
+    folder = record_files(tmp_path, 0, 3, events=events)
     assert numbers(folder) == [0, 1, 2]
-    # The recorder that goes on knows of the alarm only from the files.
-    folder = record_files(tmp_path, 3, 12)
+    folder = record_files(tmp_path, 3, 12, events=events)
     assert numbers(folder) == [0, 1, 2, 3, 10, 11]
     stated = json.loads((folder / "kept.json").read_text(encoding="utf-8"))
     assert sorted(stated["kept"]) == [name_of(NOW_NS + 300 * n * NS) for n in range(4)]
@@ -164,19 +176,122 @@ def test_the_recorder_keeps_what_lies_around_an_alarm_when_the_rest_is_thinned_o
     for one in Catalogue(tmp_path).recordings():
         kept = one.path.name in stated["kept"]
         assert ("2026-11-21 14:35:30 UTC raised: ALERT" in one.kept_because) == kept
-    assert alarm_marks(folder / name_of(NOW_NS + 600 * NS), LAB.keys.alarm_event) == (
-        alarm_mark(RecordedMessage(ALARM.key, ALARM.payload, b"", ALARM.encoding, NOW_NS + 600 * NS, 0)),
-    )
+
+
+def test_alarm_events_off_the_wire_keep_nothing(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 12, forged_at=2)
+    assert numbers(folder) == [10, 11]
+    assert kept_reasons(folder) == {}
+
+
+def test_what_is_kept_stays_when_the_history_is_lost(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
+    before = kept_reasons(folder)
+    assert len(before) == 3
+    record_files(tmp_path, 20, 29)
+    assert kept_reasons(folder) == before
+    assert numbers(folder)[:3] == [0, 1, 2]
 
 
 def test_what_kept_json_says_is_found_anew_when_it_is_lost(tmp_path: Path) -> None:
-    folder = record_files(tmp_path, 0, 3, alarm_at=1)
+    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
     before = kept_reasons(folder)
     assert len(before) == 3
     (folder / "kept.json").write_text("[broken", encoding="utf-8")
     assert kept_reasons(folder) == {}
-    record_files(tmp_path, 20, 21)
+    record_files(tmp_path, 20, 21, events=(at_file(1),))
     assert kept_reasons(folder) == before
+
+
+def test_a_history_that_cannot_be_read_takes_nothing_back(tmp_path: Path) -> None:
+    folder = record_files(tmp_path, 0, 3, events=(at_file(1),))
+    before = kept_reasons(folder)
+
+    def failing(_: int) -> tuple[StoredEvent, ...]:
+        raise StoreError("the database is away")
+
+    settings = RecordingSettings.model_validate({"directory": str(tmp_path), **FEW})
+    recorder = MachineRecorder(LAB, settings, failing, now_ns=lambda: NOW_NS + 3600 * NS)
+    for number in range(20, 29):
+        time_ns = NOW_NS + 300 * number * NS
+        recorder.put(RecordedMessage(LAB.keys.stream, bytes(300_000), b"", "x", time_ns, time_ns))
+    recorder.start()
+    recorder.stop()
+    assert recorder.status().problem == ""
+    assert kept_reasons(folder) == before
+
+
+@contextmanager
+def recorded(folder: Path) -> Iterator[tuple[Runtime, Feed]]:
+    """A monitor that records, and closes a file after a second."""
+    address = endpoint()
+    plan = settings(address, machine_file(folder, PATIENT))
+    recording = RecordingSettings(directory=str(folder / "kept"), rotate_s=1.0)
+    with running(plan.model_copy(update={"recording": recording})) as runtime, open_session(address) as session:
+        yield runtime, Feed(session)
+
+
+def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> None:
+    folder = tmp_path / "kept" / "demo" / "lab"
+    with recorded(tmp_path) as (runtime, feed):
+        recorder, worker = runtime._recorders["demo", "lab"], runtime.machines()[0]
+
+        def closed(count: int) -> bool:
+            feed.session.put(LAB.keys.alarm_event, ALARM.payload, encoding=ALARM.encoding)
+            feed.put_good()
+            return recorder.status().files >= count
+
+        until(lambda: closed(2), "two files with forged alarms in them")
+        assert worker.history.events() == ()
+        assert kept_reasons(folder) == {}
+        feed.sequence, feed.start_ns = feed.sequence + 50, feed.start_ns + 5 * NS  # a gap, which is an alarm
+
+        def raised() -> bool:
+            feed.put_good()
+            return worker.history.last_sequence() >= 0
+
+        until(raised, "an alarm of the monitor's own")
+    kept = kept_reasons(folder)
+    assert len(kept) == recorder.status().files
+    assert all("raised: " in why and SAID.data.text not in why for why in kept.values())
+
+
+def received(recorder: Program) -> int:
+    return int(json.loads(recorder.output().splitlines()[-1])["received"])
+
+
+@pytest.mark.slow
+def test_a_recorder_beside_a_monitor_keeps_recordings_for_what_is_in_its_history(tmp_path: Path) -> None:
+    address, folder = endpoint(), tmp_path / "kept" / "demo" / "lab"
+    with monitor_running(tmp_path, address, machine_file(tmp_path, PATIENT)) as monitor:
+        monitor.url()
+        plan = ["--config", str(tmp_path / "monitor.toml"), "--out", str(tmp_path / "kept"), "--connect", address]
+        history = f"sqlite:///{tmp_path / 'history.sqlite'}"
+
+        def record(kind: str) -> dict[str, str]:
+            """Record until an alarm event has come by; what is kept afterwards."""
+            command = ("service.rotorwatch", "record", *plan, "--json")
+            with (
+                program(tmp_path, *command, ROTORWATCH_HISTORY__URL=history) as recorder,
+                open_session(address, "client") as session,
+            ):
+                recorder.wait_for("{")
+                before = received(recorder)
+                if kind == "forged":
+                    session.put(LAB.keys.alarm_event, ALARM.payload, encoding=ALARM.encoding)
+                else:
+                    do(monitor, "shelve", "model", "normal", duration_s=3600)
+                until(lambda: received(recorder) > before, "the message")
+                assert recorder.stop() == 0
+            newest = max(folder.glob("*.mcap"))
+            assert any(read_recording(newest, keys=[LAB.keys.alarm_event]))
+            return kept_reasons(folder)
+
+        assert record("forged") == {}
+        assert log(monitor) == []
+        kept = record("own")
+        assert kept
+        assert all("shelved: " in why for why in kept.values())
 
 
 def write(path: Path, count: int = 3) -> Path:
