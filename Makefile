@@ -1,6 +1,7 @@
 # make demo    set everything up and run the demo (FAULT=c_by, or none; ONCE=1 SEED=7 PACE=20)
 # make test    set everything up and run all checks
-# make quick   tests of the models and the monitor alone, two minutes
+# make quick   tests of the models and the monitor alone, a minute
+# make long    the tests of `make test` on further machines, seeds and realisations
 # make format  let ruff put the code in order
 # make wheels  build both wheels into dist/, and run the demo out of the wheel under every Python there is here
 # make floors  run the demo and the tests below with the lowest versions that pyproject.toml admits
@@ -21,7 +22,7 @@ PACE ?= 10
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: setup demo test quick lint types contracts tests format wheels floors train clean
+.PHONY: setup demo test quick long lint types contracts tests format wheels floors train clean
 
 setup: $(READY)
 
@@ -59,7 +60,10 @@ tests: $(READY)
 	$(BIN)/pytest -n $(WORKERS)
 
 quick: $(READY)
-	$(BIN)/pytest -n $(WORKERS) -m "not slow" $(MODELS_AND_MONITOR)
+	$(BIN)/pytest -n $(WORKERS) -m "not slow and not long" $(MODELS_AND_MONITOR)
+
+long: $(READY)
+	$(BIN)/pytest -n $(WORKERS) -m long
 
 format: $(READY)
 	$(BIN)/ruff format .

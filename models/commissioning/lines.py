@@ -7,7 +7,7 @@ coefficient is the square of the mean second power, of noise twice that.
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import median_filter
+import scipy  # its sub-packages are loaded when they are first used
 
 from models.commissioning.healthy import HealthyRecording
 from models.diagnosis.window import window_statistics
@@ -60,7 +60,7 @@ def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
     frequencies_hz = recording.plan.frequencies_hz
     step_hz = float(frequencies_hz[1] - frequencies_hz[0])
     size = max(5, 2 * round(_NEIGHBOURHOOD_HZ / step_hz / 2) + 1)
-    floor = median_filter(mean, size=(size, 1), mode="nearest")
+    floor = scipy.ndimage.median_filter(mean, size=(size, 1), mode="nearest")
     window = window_statistics(recording.plan, hops, lagged=False)
     total = np.maximum(np.diag(window.correlation[0]), np.finfo(float).tiny)
     speed_hz = window.speed_rad_s / (2 * np.pi)

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import median_filter
-from scipy.stats import theilslopes
+import scipy  # its sub-packages are loaded when they are first used
 
 from models.signals.block import FloatArray
 
@@ -103,7 +102,7 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
     for sweep in sweeps:
         turned = baseband * np.exp(-1j * np.pi * sweep * t_s**2)[:, None]
         seen = np.sum(np.abs(np.fft.fft(turned, _PADDING * count, axis=0)) ** 2, axis=1)
-        ratio = np.where(inside, seen / median_filter(seen, width, mode="nearest"), 0.0)
+        ratio = np.where(inside, seen / scipy.ndimage.median_filter(seen, width, mode="nearest"), 0.0)
         at = int(ratio.argmax())
         if ratio[at] > best[0]:
             best = (float(ratio[at]), float(grid_hz[at]), float(sweep))
@@ -170,7 +169,7 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
     followed = np.append(together, False) | np.insert(together, 0, False)
     if followed.sum() > 1:
         number = np.flatnonzero(followed)
-        slope, start = theilslopes(speed[followed], number)[:2]
+        slope, start = scipy.stats.theilslopes(speed[followed], number)[:2]
         followed[number] = np.abs(speed[followed] / (start + slope * number) - 1) < _COURSE
     if followed.mean() < _FOLLOWED_PART:
         return None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import median_filter
+import scipy  # its sub-packages are loaded when they are first used
 
 from models.signals.block import FloatArray
 
@@ -186,7 +186,7 @@ def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> 
 
 def _usual(intervals: FloatArray) -> FloatArray:
     """Median of the intervals around each one."""
-    return np.asarray(median_filter(intervals, size=min(_NEIGHBOURS, intervals.size), mode="nearest"))
+    return np.asarray(scipy.ndimage.median_filter(intervals, size=min(_NEIGHBOURS, intervals.size), mode="nearest"))
 
 
 def _without_extra(times: FloatArray) -> FloatArray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
@@ -113,7 +113,7 @@ def spectrum_snapshot(
     speed = head["speed_rad_s"]
     rotation_hz = None if speed is None else abs(speed) / (2 * np.pi)
     reach_hz = LEFT_OUT_BINS * spacing_hz
-    low, high = (float(freedom / chi2.ppf(part, freedom)) for part in reversed(_OUTER))
+    low, high = (float(freedom / chdtri(freedom, 1 - part)) for part in reversed(_OUTER))
     return SpectrumSnapshot(
         **head,
         frequencies_hz=tuple(one for one in figures(_grouped(frequencies_hz, group)) if one is not None),

@@ -43,7 +43,7 @@ def draw(rng: np.random.Generator, changed: int, rate: float, smallest: float) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("rate", "windows"), [(0.05, 6_000), (0.01, 20_000)])
+@pytest.mark.parametrize(("rate", "windows"), [(0.05, 6_000), pytest.param(0.01, 20_000, marks=pytest.mark.long)])
 def test_a_healthy_window_is_called_changed_at_the_declared_rate(rate: float, windows: int) -> None:
     rng = np.random.default_rng(SEED)
     called = sum(bool(draw(rng, 0, rate, 0.0)[1].changed) for _ in range(windows))

@@ -126,8 +126,16 @@ def assert_honest(z: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["lab", "heavy", "light"])
-@pytest.mark.parametrize("layout", Layout)
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("lab", Layout.ONE_SOURCE),
+        ("heavy", Layout.INDEPENDENT),
+        *(pytest.param("light", layout, marks=pytest.mark.long) for layout in Layout),
+        pytest.param("lab", Layout.INDEPENDENT, marks=pytest.mark.long),
+        pytest.param("heavy", Layout.ONE_SOURCE, marks=pytest.mark.long),
+    ],
+)
 def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: Layout) -> None:
     faults = {"k_by": -0.2, "c_bz": -0.3, "e": 0.2}
     draw = Draw(load_machine(name), SEED, Purpose.EVALUATION, int(layout), faults=faults, layout=layout)

@@ -6,6 +6,7 @@ import pytest
 from models.diagnosis.networks.paper import (
     PAPER_EQUATIONS,
     PaperDiagnostician,
+    PaperNetwork,
     calibrate_paper,
     full_correlation,
     mean_squared_deviation,
@@ -43,6 +44,11 @@ def training(rig: Machine) -> list[WindowStatistics]:
 @pytest.fixture(scope="module")
 def healthy(rig: Machine) -> list[WindowStatistics]:
     return _windows(rig, range(10, 22))
+
+
+@pytest.fixture(scope="module")
+def networks(rig: Machine, training: list[WindowStatistics]) -> list[PaperNetwork]:
+    return [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
 
 
 def test_full_correlation_is_theory_with_the_unbalance_in_it(rig: Machine) -> None:
@@ -101,8 +107,10 @@ def test_rows_are_the_papers_from_lag_zero(rig: Machine, training: list[WindowSt
 
 
 @pytest.mark.slow
-def test_training_fits_its_own_windows_and_is_repeatable(rig: Machine, training: list[WindowStatistics]) -> None:
-    first = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
+def test_training_fits_its_own_windows_and_is_repeatable(
+    rig: Machine, networks: list[PaperNetwork], training: list[WindowStatistics]
+) -> None:
+    first = networks[0]
     again = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
     assert np.array_equal(first.network.W1, again.network.W1)
     assert np.mean([mean_squared_deviation(first, window, rig) for window in training]) < 0.05
@@ -110,9 +118,8 @@ def test_training_fits_its_own_windows_and_is_repeatable(rig: Machine, training:
 
 @pytest.mark.slow
 def test_diagnostician_names_equations_and_no_sizes(
-    rig: Machine, training: list[WindowStatistics], healthy: list[WindowStatistics]
+    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
-    networks = [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
     limits = calibrate_paper(networks, healthy, rig, false_alarm_rate=0.1)
     paper = PaperDiagnostician(rig, networks, limits)
     # As calibrated: of the twelve windows exactly the largest score is at the limit, none above it.
@@ -129,9 +136,8 @@ def test_diagnostician_names_equations_and_no_sizes(
 
 @pytest.mark.slow
 def test_an_equation_without_its_channels_is_not_evaluated(
-    rig: Machine, training: list[WindowStatistics], healthy: list[WindowStatistics]
+    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
-    networks = [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
     paper = PaperDiagnostician(rig, networks, calibrate_paper(networks, healthy, rig, false_alarm_rate=0.2))
     lab = load_machine("lab")
     diagnosis = paper.diagnose(simulate_window(Draw(lab, _SEED, Purpose.EVALUATION), 0))
@@ -144,8 +150,7 @@ def test_an_equation_without_its_channels_is_not_evaluated(
 
 @pytest.mark.slow
 def test_too_few_windows_for_the_declared_rate_are_refused(
-    rig: Machine, training: list[WindowStatistics], healthy: list[WindowStatistics]
+    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
-    network = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
     with pytest.raises(EstimationError, match="expected at least 99"):
-        calibrate_paper([network], healthy, rig, false_alarm_rate=0.01)
+        calibrate_paper(networks[:1], healthy, rig, false_alarm_rate=0.01)

@@ -144,7 +144,7 @@ class Plant:
 
 @pytest.mark.slow
 @settings(
-    max_examples=8,
+    max_examples=4,
     deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the parts of a story are drawn from its seed

@@ -88,6 +88,7 @@ def _plan(variants: tuple[Variant, ...], calibration: int = 9) -> AblationPlan:
     return AblationPlan(SHORT, BUNDLE, 42, 2, 16, calibration, 0.1, variants, faults)
 
 
+@pytest.mark.long
 def test_a_halved_stiffness_is_found_where_it_is_and_not_elsewhere() -> None:
     linear = Variant("table", "linear", reader=Reader.LINEAR)
     blind = replace(linear, label="MSD", measure=Measure.MSD)

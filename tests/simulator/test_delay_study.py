@@ -48,6 +48,7 @@ def result() -> DelayResult:
     return run_delay_study(plan, 1, lambda *_: None)
 
 
+@pytest.mark.long
 def test_a_large_loss_of_stiffness_is_found_within_two_hops_of_data_and_named(result: DelayResult) -> None:
     streams = [cell for cell in result.cells if cell.source == "stream" and cell.layout == "independent"]
     assert [cell.rate for cell in streams] == ["machine file", "1 % per window"]

@@ -294,6 +294,7 @@ def evaluate(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_quick_evaluation_is_kept_carried_on_and_written_up(tmp_path: Path) -> None:
     out, written = tmp_path / "evaluation", tmp_path / "docs" / "results.md"
     size = ("--quick", "--windows", "2", "--seed", str(SEED), "--out", str(out))

@@ -63,6 +63,7 @@ def test_a_true_change_is_in_the_window() -> None:
     assert np.abs(changed.synchronous[:4] / healthy.synchronous[:4]) == pytest.approx(2, rel=0.35)
 
 
+@pytest.mark.long
 def test_an_interrupted_campaign_carries_on_and_gives_the_same_records(tmp_path: Path) -> None:
     plan = UnknownPlan(("overhung",), (NONE,), seed=5, windows=2, commissionings=1, healthy=4)
     kept = tmp_path / "records.jsonl"

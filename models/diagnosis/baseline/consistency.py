@@ -4,8 +4,7 @@ from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import norm
+from scipy.special import chdtrc, ndtri
 
 from models.diagnosis.baseline.lag_moments import LagMoments
 from models.diagnosis.baseline.relation import RowChange, change_of, learn_row
@@ -70,8 +69,8 @@ class LeftOut:
     @property
     def misfit_z(self) -> float:
         """The misfit as a standard normal variable."""
-        tail = float(chi2_distribution.sf(self.misfit * self.degrees_of_freedom, self.degrees_of_freedom))
-        return float(norm.isf(np.clip(tail, 1e-300, 1 - 1e-16)))
+        tail = float(chdtrc(self.degrees_of_freedom, self.misfit * self.degrees_of_freedom))
+        return -float(ndtri(np.clip(tail, 1e-300, 1 - 1e-16)))
 
 
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import norm
+from scipy.special import chdtrc, ndtri
 
 from models.diagnosis.baseline.excitation import one_source
 from models.diagnosis.baseline.gain import gain_suspicion
@@ -310,6 +309,6 @@ def _misfit(changes: list[RowChange | None]) -> float | None:
     used = [change for change in changes if change is not None]
     if not used:
         return None
-    tail = min(float(chi2_distribution.sf(change.chi2, change.degrees_of_freedom)) for change in used)
+    tail = min(float(chdtrc(change.degrees_of_freedom, change.chi2)) for change in used)
     tail = -math.expm1(len(used) * math.log1p(-min(tail, 1 - 1e-16)))
-    return float(norm.isf(np.clip(tail, 1e-300, 1 - 1e-16)))
+    return -float(ndtri(np.clip(tail, 1e-300, 1 - 1e-16)))

@@ -25,8 +25,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from scipy.stats import f as f_distribution
-from scipy.stats import norm
+from scipy.special import fdtrc, ndtri
 
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -159,7 +158,7 @@ class HealthyShape(BaseModel):
         if not 0 < rate < 1:
             raise ValueError(f"rate is {rate}, expected between 0 and 1")
         own_rate = -math.expm1(math.log1p(-rate) / len(self.channels))
-        limit = float(norm.isf(own_rate))
+        limit = -float(ndtri(own_rate))
         common = self._unlike(window)
         return tuple(self._judged(one, window, common, own_rate, limit) for one in self.channels)
 
@@ -193,8 +192,8 @@ class HealthyShape(BaseModel):
         # a shorter window scatters more; that a longer one scatters less is not relied on
         wider = (1 + 1 / self.windows) * max(1.0, self.window_s / window.duration_s)
         statistic = float(d @ d) / (wider * one.variance)
-        p = float(f_distribution.sf(statistic, one.freedom, one.freedom * (self.windows - 1)))
-        z = float(norm.isf(min(max(p, _LEAST_P), 1 - 1e-16)))
+        p = float(fdtrc(one.freedom, one.freedom * (self.windows - 1), statistic))
+        z = -float(ndtri(min(max(p, _LEAST_P), 1 - 1e-16)))
         figures = f"{z:.1f} standard deviations, limit {limit:.1f}"
         if p < rate:
             sentence = (

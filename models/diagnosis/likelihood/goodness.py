@@ -9,7 +9,7 @@ no such direction explains shows in the total excess of estimated over theoretic
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+from scipy.special import log_ndtr, ndtri
 
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights
@@ -77,10 +77,10 @@ class Goodness:
     @property
     def misfit_z(self) -> float:
         """All tests in one number, standard normal (one-sided) where the model holds: the worst, Šidák-corrected."""
-        worst = max(scipy.stats.norm.logsf(self.excess_z) * -1, *(-_two_sided(one.z) for one in self.alternatives))
+        worst = max(-log_ndtr(-self.excess_z), *(-_two_sided(one.z) for one in self.alternatives))
         tests = self.tests
         log_p = np.log(-np.expm1(tests * np.log1p(-np.exp(-worst)))) if worst < 30 else np.log(tests) - worst
-        return float(scipy.stats.norm.isf(np.exp(max(log_p, -700.0))))
+        return -float(ndtri(np.exp(max(log_p, -700.0))))
 
     @property
     def suspect(self) -> str:
@@ -100,7 +100,7 @@ class Goodness:
 
 
 def _two_sided(z: float) -> float:
-    return float(np.log(2) + scipy.stats.norm.logsf(abs(z)))
+    return float(np.log(2) + log_ndtr(-abs(z)))
 
 
 def goodness_of_fit(

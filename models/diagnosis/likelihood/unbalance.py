@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from models.diagnosis.likelihood.bins import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
@@ -185,7 +185,7 @@ def _foreign(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray
     amplitude = np.maximum(np.hypot(q2[:n], q2[n:]), np.hypot(explained[:n], explained[n:]))
     allowed = total + np.diag(np.tile((_GAIN * amplitude) ** 2 / 2, 2))
     left = q2 - explained
-    chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chi2_distribution.isf(_RATE, 2 * n - 2))
+    chi2, most = float(left @ np.linalg.solve(allowed, left)), float(chdtri(2 * n - 2, _RATE))
     if chi2 <= most:
         return ""
     text, limit = beyond(chi2, round(most, 1))
