@@ -7,8 +7,9 @@ from typing import Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from models.errors import MachineFileError
+from models.signals.endpoint import is_loopback
 
-__all__ = ["AccessSettings", "LimitSettings", "TlsSettings", "check_access", "is_address", "is_loopback"]
+__all__ = ["AccessSettings", "LimitSettings", "TlsSettings", "check_access"]
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
@@ -88,20 +89,6 @@ class AccessSettings(BaseModel):
             client_ca=None if ca is None else folder / ca,
         )
         return self.model_copy(update={"tls": tls})
-
-
-def is_address(name: str) -> bool:
-    """Whether a host is given as an address."""
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
-def is_loopback(host: str) -> bool:
-    """Whether nobody outside this computer reaches what listens on `host`."""
-    return host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def check_access(place: str, access: AccessSettings, host: str) -> None:

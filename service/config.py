@@ -295,6 +295,7 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     )
     check_distinct(place, settings)
     check_access(str(place), settings.access, settings.http.host)
+    settings.link.check_reach(str(place))
     return settings
 
 

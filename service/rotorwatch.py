@@ -145,14 +145,28 @@ def check_config(
 
 
 @app.command()
-def router(listen: ListenOption = None, connect: ConnectOption = None, link: LinkOption = None) -> None:
+def router(
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    link: LinkOption = None,
+    without_grants: Annotated[
+        bool,
+        typer.Option(
+            "--without-grants",
+            help="Whoever reaches the router may do everything. Without this it listens off loopback only with grants.",
+        ),
+    ] = False,
+) -> None:
     """Run a Zenoh router until Ctrl-C, for networks in which monitors and sensors cannot reach each other directly.
 
     Everybody who connects to it must do so as a client: rotorwatch run --connect, rotorsim publish --mode client.
 
     [bold]Example[/bold]
 
-    [cyan]rotorwatch router --listen tcp/0.0.0.0:7447[/cyan]
+    [cyan]rotorwatch router --link router.toml[/cyan]
+
+    On a network where everybody may do everything:
+    [cyan]rotorwatch router --listen tcp/0.0.0.0:7447 --without-grants[/cyan]
     """
     with exit_codes():
         from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
@@ -161,8 +175,9 @@ def router(listen: ListenOption = None, connect: ConnectOption = None, link: Lin
         from service.transport import route  # noqa: PLC0415
 
         settings = LinkSettings(listen=(ENDPOINT,)) if link is None else load_link(link)
-        ends = {name: tuple(given) for name, given in (("listen", listen), ("connect", connect)) if given}
-        settings = settings.model_copy(update=ends)
+        changes: dict[str, Any] = {n: tuple(given) for n, given in (("listen", listen), ("connect", connect)) if given}
+        settings = settings.model_copy(update=changes | ({"without_grants": True} if without_grants else {}))
+        settings.check_reach("command line" if link is None else str(link))
         with stop_request() as stop, route(settings):
             typer.echo(f"router listening on {', '.join(settings.listen)}")
             sys.stdout.flush()
@@ -247,6 +262,7 @@ def _overridden(
         update["queue"] = settings.queue.model_copy(update={"when_full": when_full})
     overridden = settings.model_copy(update=update)
     check_distinct(Path("command line"), overridden)
+    overridden.link.check_reach("command line")
     return overridden
 
 

@@ -1,15 +1,44 @@
 """Zenoh endpoints as people write them, such as ``tcp/127.0.0.1:7447``."""
 
+import ipaddress
 import re
 
 from models.mistakes import did_you_mean
 
-__all__ = ["endpoint_fault"]
+__all__ = ["endpoint_fault", "is_address", "is_local", "is_loopback"]
 
 _OF_HOSTS = ("tcp", "udp", "tls", "quic", "ws")
-_OTHERS = ("unixsock-stream", "unixpipe", "serial", "vsock")
+_WITHIN = ("unixsock-stream", "unixpipe")
+_OTHERS = (*_WITHIN, "serial", "vsock")
 _LOCAL = "127.0.0.1"
 _HIGHEST_PORT = 65535
+
+
+def is_address(name: str) -> bool:
+    """Whether a host is given as an address."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Whether nobody outside this computer reaches what listens on `host`."""
+    return host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether nobody outside this computer reaches what listens on an endpoint.
+
+    Examples
+    --------
+    >>> is_local("tcp/[::1]:7447"), is_local("tcp/10.0.0.5:7447")
+    (True, False)
+    """
+    protocol, _, rest = endpoint.partition("/")
+    host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")
+    return protocol in _WITHIN or (protocol in _OF_HOSTS and is_loopback(host))
 
 
 def endpoint_fault(text: str) -> str | None:

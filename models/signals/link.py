@@ -13,7 +13,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.errors import MachineFileError
-from models.signals.endpoint import endpoint_fault
+from models.signals.endpoint import endpoint_fault, is_local
 from models.signals.link_access import Grant, access_control
 from models.signals.link_files import check_certificate, check_key, read_password, read_user_names
 
@@ -93,6 +93,11 @@ class LinkSettings(BaseModel):
     grants: tuple[Grant, ...] = Field(
         default=(), description="who may do what; with one grant everything is refused that none allows"
     )
+    without_grants: bool = Field(
+        default=False,
+        description="whoever may connect from other computers may do everything; without grants, monitor and router "
+        "listen on no other endpoint than this computer's own unless this is true",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -110,6 +115,27 @@ class LinkSettings(BaseModel):
         for fault in self._faults():
             raise ValueError(fault)
         return self
+
+    def check_reach(self, place: str) -> None:
+        """Check that others than programs on this computer have grants, or may do everything in so many words.
+
+        Parameters
+        ----------
+        place : str
+            Settings file or command line, for the message.
+
+        Raises
+        ------
+        MachineFileError
+            Naming the endpoints that they reach.
+        """
+        far = [end for end in self.listen if endpoint_fault(end) is None and not is_local(end)]
+        if far and not self.grants and not self.without_grants:
+            raise MachineFileError(
+                f"{place}: link.listen is {', '.join(far)}, which other computers reach, and there are no grants: "
+                "whoever connects could send false data and alarms; expected [[link.grants]], an endpoint on 127.0.0.1 "
+                "or without_grants = true in [link] (of a router also --without-grants)"
+            )
 
     def beside(self, folder: Path) -> Self:
         """These settings with files that are named without a whole path taken from a folder, that of the settings."""
@@ -202,6 +228,8 @@ class LinkSettings(BaseModel):
             yield f"connect is {', '.join(self.connect)}: expected [link.tls] with root_certificate"
         if self.grants:
             yield from self._faults_of_grants()
+        if self.grants and self.without_grants:
+            yield "without_grants is true and there are grants, expected one or the other"
 
     def _faults_of_grants(self) -> Iterator[str]:
         if not self.listen:

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
+from models.signals.endpoint import is_loopback
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
@@ -24,7 +25,6 @@ from rotorwatch.records.replays import (
     ReplaySeek,
 )
 from service.access.guard import Guard
-from service.access_settings import is_loopback
 from service.config import MachineEntry, ServiceSettings
 from service.http.recordings import RecordingIndex, found_recording
 from service.problems import problem_responses, responses

@@ -50,6 +50,7 @@ def test_the_shipped_examples_work_together(tmp_path: Path, level: str, request:
     plan = ServiceSettings(
         link=load_link(folder / "monitor.toml"), http=HttpSettings(port=0), machines=(MachineEntry(file="lab"),)
     )
+    load_link(SHIPPED / level / "router.toml").check_reach("shipped")  # as it is: on every network of the computer
     gate = Link(load_link(folder / "router.toml"))
     try:
         with (
