@@ -11,16 +11,29 @@ import numpy as np
 import pytest
 import structlog
 
-from models.alarm_names import CONFLICT, of_the_machine
+from models.alarm_names import CONFLICT, STREAM_LOST, of_the_machine
 from models.commissioning.installed import install
 from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_block, sender_of
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
 from service.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
 from service.inbox import Inbox, RawBlock
 from service.monitor import MachineMonitor
 from service.runtime import running
 from service.transport import Link, route
-from tests.service.live import LAB, Feed, endpoint, open_session, scenario_blocks, service, settings, until
+from tests.service.live import (
+    LAB,
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    service,
+    settings,
+    until,
+)
+from tests.service.monitored import PLACE, client
 from tests.service.test_alarm_trouble import bench
 
 KB = 1024
@@ -224,3 +237,28 @@ def test_blocks_that_say_they_are_replayed_are_not_the_machines() -> None:
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 2, "the machine's own blocks")
         assert worker.health().quality.refused_blocks == {}
+
+
+# Messages in the monitor's own name
+
+
+def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Path) -> None:
+    """Nor does a token that nobody is behind hide that the data have stopped."""
+    address, quick = endpoint(), ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
+    with service(address, machine_file(tmp_path, quick)) as (runtime, worker), open_session(address) as session:
+        token = session.liveliness().declare_token(LAB.keys.publisher_alive)
+        feed, forged = Feed(session), AlarmCloudEvent.model_validate(example(AlarmCloudEvent)).model_dump_json()
+        feed.put_good()
+        until(lambda: worker.health().stream.publisher_alive, "the token")
+        for key in (LAB.keys.alarm_event, LAB.keys.alarm_state, LAB.keys.health, LAB.keys.report):
+            session.put(key, forged)
+        feed.put_good()
+        until(lambda: worker.health().quality.accepted_blocks == 2, "what came after the forgeries")
+        until(lambda: worker.history.last_sequence() == 0, "an alarm of the monitor's own")
+        with client(runtime) as http:
+            (event,) = http.get(f"{PLACE}/alarms/events").json()["events"]
+            health = http.get(f"{PLACE}/health").json()
+            assert http.get(f"{PLACE}/reports").json()["reports"] == []
+        assert (event["data"]["name"], health["state"]) == (STREAM_LOST, "no-data")
+        assert health["stream"]["publisher_alive"]
+        token.undeclare()  # type: ignore[no-untyped-call]
