@@ -11,31 +11,25 @@ block was lost, the monitor came near its last file, wrote more than 100 kB of l
 """
 
 import argparse
-import json
-import os
 import re
 import resource
 import select
 import socket
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import httpx
+from running_monitor import ANSWER_S, PLACE, Monitor, monitor
 
-_PLACE = "demo/lab"
 _GET = "GET {} HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
 _POST = (
-    f"POST /api/v1/machines/{_PLACE}/alarms/k_by/shelve HTTP/1.1\r\nhost: 127.0.0.1\r\n"
+    f"POST /api/v1/machines/{PLACE}/alarms/k_by/shelve HTTP/1.1\r\nhost: 127.0.0.1\r\n"
     "content-type: application/json\r\ncontent-length: 100000\r\n\r\n"
 )
 _LOG_BYTES = 100_000
-_ANSWER_S = 120.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +71,7 @@ class Callers:
             one = socket.socket()
             if not self.attack.reads:
                 one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            one.settimeout(_ANSWER_S)
+            one.settimeout(ANSWER_S)
             try:
                 one.connect(self.address)
                 one.sendall(self.attack.sends.encode())
@@ -125,75 +119,6 @@ class Callers:
         except OSError:
             return True
         return True  # who does not read is only woken by the end
-
-
-@dataclass(slots=True)
-class Monitor:
-    """A running monitor and its machine."""
-
-    process: subprocess.Popen[bytes]
-    url: str
-    log: Path
-
-    def files(self) -> int:
-        """Files that it has open."""
-        return len(os.listdir(f"/proc/{self.process.pid}/fd"))
-
-    def asked(self) -> tuple[int, float]:
-        """Status of ``/healthz``, 0 if there is no answer, and seconds until then."""
-        begin_s, status = time.monotonic(), 0
-        with suppress(httpx.HTTPError):
-            status = httpx.get(f"{self.url}/healthz", trust_env=False, timeout=_ANSWER_S).status_code
-        return status, time.monotonic() - begin_s
-
-    def blocks(self) -> tuple[int, int]:
-        """Blocks accepted, and those refused, dropped or missing."""
-        health = httpx.get(f"{self.url}/api/v1/machines/{_PLACE}/health", trust_env=False, timeout=_ANSWER_S).json()
-        quality = health["quality"]
-        lost = sum(quality["refused_blocks"].values()) + quality["queue_dropped_blocks"] + quality["gaps"]
-        return quality["accepted_blocks"], lost
-
-
-@contextmanager
-def monitor(folder: Path, files: int, timeouts: dict[str, str]) -> Iterator[Monitor]:
-    """A monitor that may open so many files, and a machine that sends to it."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    environment = {
-        **os.environ,
-        **timeouts,
-        "ROTORWATCH_LINK": json.dumps({"listen": [endpoint]}),
-        "ROTORWATCH_HTTP__PORT": "0",
-        "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
-        "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
-        "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
-    }
-    run = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", sys.executable, "-m"]
-    send = [sys.executable, "-m", "simulator.rotorsim", "publish", "--pace", "1", "--connect", endpoint]
-    out, log = folder / "out", folder / "log"
-    with out.open("wb") as output, log.open("wb") as errors:
-        process = subprocess.Popen(
-            [*run, "service.rotorwatch", "run"], stdout=output, stderr=errors, env=environment, stdin=subprocess.DEVNULL
-        )
-        publisher = subprocess.Popen(send, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            found = Monitor(process, _url(process, out, log), log)
-            while found.blocks()[0] < 20:
-                time.sleep(0.1)
-            yield found
-        finally:
-            for one in (publisher, process):
-                one.terminate()
-            for one in (publisher, process):
-                one.wait(60)
-
-
-def _url(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:
-    while process.poll() is None:
-        if (told := re.search(r"HTTP API (http\S+)\s", out.read_text(encoding="utf-8"))) is not None:
-            return told[1]
-        time.sleep(0.1)
-    raise SystemExit(f"the monitor did not start:\n{log.read_text(encoding='utf-8')}")
 
 
 def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit: int, recovery_s: float) -> list[str]:

@@ -19,6 +19,7 @@ __all__ = ["DataSpan", "clock_key", "data_start_ns", "place_of", "span_of"]
 
 _BACK_NS = 5 * 10**9
 _STEADY_NS = 10**9
+_LATEST_NS = 2**63
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,9 +110,9 @@ def _taken(message: RecordedMessage) -> _Taken | None:
     if message.key.endswith("/report"):
         try:
             end_ns = int(json.loads(message.payload)["end_ns"])
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
             return None
-        return _Taken(end_ns - 1, end_ns)
+        return _Taken(end_ns - 1, end_ns) if 0 < end_ns < _LATEST_NS else None
     try:
         block, _ = decode_block(message.payload, message.attachment, message.encoding)
     except WireError:

@@ -16,6 +16,7 @@ from service.plots.request import PlotRequest, draw_plot
 from service.plots.spectrum import read_spectrum, read_waterfall
 from service.plots.stretches import RecordedStream
 from service.replay.control import Control
+from service.replay.data_time import data_start_ns
 from service.replay.player import PlayPlan, play
 from service.replay.source import RecordingSource
 from service.rotorwatch import app
@@ -204,3 +205,9 @@ def test_a_paced_replay_goes_on_where_the_data_begin_again_or_pause_for_hours(
     day = [replace(one, start_ns=one.start_ns + 86_400 * S) for one in blocks[10:20]]
     due_s, _ = played(recording(tmp_path / "night.mcap", [*blocks[:10], *day]))
     assert due_s == pytest.approx([*(n / 20 for n in range(10)), *(n / 20 for n in range(9, 19))])
+
+
+@pytest.mark.parametrize("end", ["1e999", "NaN", "[" * 50_000, "9" * 4000, "-1", '"soon"'])
+def test_a_report_without_a_time_is_left_out(end: str) -> None:
+    odd = RecordedMessage(LAB.keys.report, f'{{"end_ns": {end}}}'.encode(), b"", "", 5, 5)
+    assert data_start_ns(odd) is None

@@ -1,0 +1,105 @@
+"""A monitor in a process of its own on loopback, and a simulated rotor kit that sends to it at pace 1."""
+
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx
+
+__all__ = ["ANSWER_S", "PLACE", "Monitor", "monitor"]
+
+PLACE = "demo/lab"
+ANSWER_S = 120.0
+
+
+@dataclass(slots=True)
+class Monitor:
+    """A running monitor and its machine."""
+
+    process: subprocess.Popen[bytes]
+    publisher: subprocess.Popen[bytes]
+    url: str
+    endpoint: str
+    log: Path
+    published: Path
+
+    def files(self) -> int:
+        """Files that it has open."""
+        return len(os.listdir(f"/proc/{self.process.pid}/fd"))
+
+    def get(self, path: str) -> httpx.Response:
+        """Answer to a request."""
+        return httpx.get(f"{self.url}{path}", trust_env=False, timeout=ANSWER_S)
+
+    def asked(self) -> tuple[int, float]:
+        """Status of ``/healthz``, 0 if there is no answer, and seconds until then."""
+        begin_s, status = time.monotonic(), 0
+        with suppress(httpx.HTTPError):
+            status = self.get("/healthz").status_code
+        return status, time.monotonic() - begin_s
+
+    def blocks(self) -> tuple[int, int]:
+        """Blocks accepted, and those refused, dropped or missing."""
+        quality = self.get(f"/api/v1/machines/{PLACE}/health").json()["quality"]
+        lost = sum(quality["refused_blocks"].values()) + quality["queue_dropped_blocks"] + quality["gaps"]
+        return quality["accepted_blocks"], lost
+
+
+@contextmanager
+def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -> Iterator[Monitor]:
+    """A monitor that may open so many files, and a machine that sends to it.
+
+    Parameters
+    ----------
+    folder : Path
+    files : int
+    settings : dict of str to str
+        Environment variables of the monitor.
+    *publish : str
+        Options of the publisher.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    environment = {
+        **os.environ,
+        "ROTORWATCH_LINK": json.dumps({"listen": [endpoint]}),
+        "ROTORWATCH_HTTP__PORT": "0",
+        "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
+        "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
+        "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
+        **settings,
+    }
+    run = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", sys.executable, "-m"]
+    send = [sys.executable, "-m", "simulator.rotorsim", "publish", "--pace", "1", "--connect", endpoint, *publish]
+    out, log, published = folder / "out", folder / "log", folder / "published"
+    with out.open("wb") as output, log.open("wb") as errors, published.open("wb") as sent:
+        process = subprocess.Popen(
+            [*run, "service.rotorwatch", "run"], stdout=output, stderr=errors, env=environment, stdin=subprocess.DEVNULL
+        )
+        publisher = subprocess.Popen(send, stdout=sent, stderr=subprocess.DEVNULL)
+        try:
+            found = Monitor(process, publisher, _url(process, out, log), endpoint, log, published)
+            while found.blocks()[0] < 20:
+                time.sleep(0.1)
+            yield found
+        finally:
+            for one in (publisher, process):
+                one.terminate()
+            for one in (publisher, process):
+                one.wait(60)
+
+
+def _url(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:
+    while process.poll() is None:
+        if (told := re.search(r"HTTP API (http\S+)\s", out.read_text(encoding="utf-8"))) is not None:
+            return told[1]
+        time.sleep(0.1)
+    raise SystemExit(f"the monitor did not start:\n{log.read_text(encoding='utf-8')}")
