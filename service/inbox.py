@@ -20,6 +20,8 @@ class RawBlock:
     Attributes
     ----------
     payload, attachment, encoding : bytes, bytes, str
+    source : str
+        Of which session's publisher it is, empty if it does not say.
     dropped_before : int
         Messages that arrived before it and were thrown away because the queue was full.
     """
@@ -27,13 +29,20 @@ class RawBlock:
     payload: bytes
     attachment: bytes
     encoding: str
+    source: str = ""
     dropped_before: int = 0
+
+    @property
+    def sender(self) -> tuple[str, str, int | None]:
+        """Who seems to send it."""
+        return (self.source, *sender_of(self.attachment, self.encoding))
 
 
 class Inbox:
     """Bounded queue between the network's thread and the machine's worker.
 
-    What cannot be a block, and what others send than the publisher that is followed, costs that publisher no block.
+    What cannot be a block, and what others send than the publisher that is followed, costs that publisher no block: its
+    own blocks are taken first, and the others' make room for them.
 
     Parameters
     ----------
@@ -62,9 +71,10 @@ class Inbox:
         self._most_bytes = most_bytes
         self._may_be_block = may_be_block
         self._blocks: deque[RawBlock] = deque()
+        self._others: deque[RawBlock] = deque()
         self._bytes = 0
         self._odd: deque[RawBlock] = deque()
-        self._followed: tuple[str, int | None] | None = None
+        self._followed: tuple[str, str, int | None] | None = None
         self._calls: deque[Callable[[], None]] = deque()
         self._changed = threading.Condition()
         self._closed = False
@@ -72,65 +82,66 @@ class Inbox:
 
     @property
     def dropped(self) -> int:
-        """Blocks thrown away because the queue was full."""
+        """Blocks of the publisher that is followed, thrown away because the queue was full."""
         return self._dropped
 
     @property
     def unread(self) -> int:
-        """Messages that could be no blocks, thrown away because too many of them came."""
+        """Messages that could be no blocks, or came from others, thrown away because too many of them came."""
         return self._unread
 
     def __len__(self) -> int:
-        return len(self._blocks) + len(self._odd)
+        return len(self._blocks) + len(self._others) + len(self._odd)
 
     def follow(self, block: RawBlock) -> None:
         """Take note of a block that was used: its publisher is the one that is followed."""
-        self._followed = sender_of(block.attachment, block.encoding)
+        if block.sender == self._followed:
+            return
+        with self._changed:
+            self._followed = block.sender
+            waiting = (*self._blocks, *self._others)
+            self._blocks = deque(one for one in waiting if one.sender == self._followed)
+            self._others = deque(one for one in waiting if one.sender != self._followed)
 
     def put(self, block: RawBlock) -> None:
         """Append a block; after `close` it is ignored."""
         odd = not self._may_be_block(block)
         with self._changed:
+            if self._closed:
+                return
             if odd:
                 if len(self._odd) >= _MOST_ODD:
                     self._unread += 1
-                elif not self._closed:
-                    self._odd.append(block)
-                    self._changed.notify_all()
-                return
-            if self._wait:
-                self._changed.wait_for(lambda: self._closed or not self._is_full)
-            elif self._is_full:
-                made = self._room_for(block)
-                if made is None:
                     return
-                block = made
-            if not self._closed:
-                self._blocks.append(block)
+                self._odd.append(block)
+            else:
+                if self._wait:
+                    self._changed.wait_for(lambda: self._closed or not self._is_full)
+                    if self._closed:
+                        return
+                theirs = self._followed is not None and block.sender != self._followed
+                if self._is_full:
+                    if theirs and self._blocks:
+                        self._unread += 1
+                        return
+                    block = self._with_room(block)
+                (self._others if theirs else self._blocks).append(block)
                 self._bytes += len(block.payload)
-                self._changed.notify_all()
+            self._changed.notify_all()
 
     @property
     def _is_full(self) -> bool:
-        return len(self._blocks) >= self._bound or self._bytes >= self._most_bytes
+        return len(self._blocks) + len(self._others) >= self._bound or self._bytes >= self._most_bytes
 
-    def _is_followed(self, block: RawBlock) -> bool:
-        return self._followed is None or sender_of(block.attachment, block.encoding) == self._followed
-
-    def _room_for(self, block: RawBlock) -> RawBlock | None:
-        """Make room: others go first. The block with what was dropped before it, or None if it has to go itself."""
-        followed = deque(one for one in self._blocks if self._is_followed(one))
-        others = len(self._blocks) - len(followed)
-        if others:
-            self._dropped += others
-            self._blocks = followed
-            self._bytes = sum(len(one.payload) for one in followed)
+    def _with_room(self, block: RawBlock) -> RawBlock:
+        """Make room: others go first. The block with what was dropped before it."""
+        if self._others:
+            self._unread += len(self._others)
+            self._others.clear()
+            self._bytes = sum(len(one.payload) for one in self._blocks)
             return block
-        if not self._is_followed(block):
-            self._dropped += 1
-            return None
-        self._dropped += len(followed)
-        before = len(followed) + sum(one.dropped_before for one in followed)
+        before = len(self._blocks) + sum(one.dropped_before for one in self._blocks)
+        self._dropped += len(self._blocks)
         self._blocks.clear()
         self._bytes = 0
         return replace(block, dropped_before=before)
@@ -151,9 +162,10 @@ class Inbox:
                 return self._calls.popleft()
             if self._closed:
                 return None
-            if not self._blocks:
+            waiting = self._blocks or self._others
+            if not waiting:
                 return self._odd.popleft()
-            block = self._blocks.popleft()
+            block = waiting.popleft()
             self._bytes -= len(block.payload)
             self._changed.notify_all()
             return block
@@ -162,6 +174,6 @@ class Inbox:
         """Wake everybody who waits; blocks that are queued are dropped, calls are still made."""
         with self._changed:
             self._closed = True
-            self._blocks.clear()
-            self._odd.clear()
+            for waiting in (self._blocks, self._others, self._odd):
+                waiting.clear()
             self._changed.notify_all()

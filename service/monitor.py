@@ -10,6 +10,7 @@ of feeding it, and the same blocks give the same reports. What it remembers can 
 into another one, which goes on as if nothing had happened.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -31,7 +32,7 @@ from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Gate, Reason, Verdict
 from models.senders import Senders
 from models.signals.block import NewestBlocks, SampleBlock
-from models.signals.wire import decode_block
+from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState
 from service.alarms.alarm import AlarmEvent, Evidence
@@ -84,6 +85,28 @@ class MachineMonitor:
         self._defect: Exception | None = None
         self._statistics: WindowStatistics | None = None
         self._newest = NewestBlocks(_NEWEST_SAMPLES)
+        self._most_samples = math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
+
+    def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
+        """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
+
+        Takes microseconds and changes nothing: any thread may ask.
+
+        Parameters
+        ----------
+        payload, attachment, encoding : bytes, bytes, str
+            See `models.signals.wire`.
+        """
+        n_channels = len(self.machine.sensors)
+        if not may_be_block(payload, attachment, encoding, n_channels, self._most_samples):
+            return False
+        if encoding.startswith(ARROW_ENCODING):
+            return True
+        try:
+            block, schema_hash = decode_block(payload, attachment, encoding)
+        except WireError:
+            return False
+        return self._gate.form(block, schema_hash) is None
 
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
@@ -109,7 +132,10 @@ class MachineMonitor:
         except WireError as error:
             name = f"{self.machine.site}/{self.machine.name}"
             return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
-        if self._disputed(block, schema_hash):
+        misshapen = self._gate.form(block, schema_hash)
+        if misshapen is not None:  # before anything is made of its run and number
+            return (MonitorReport(self._count(misshapen)),)
+        if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
             verdict = Verdict(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
             return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
@@ -123,10 +149,8 @@ class MachineMonitor:
         self._due.extend(self._arrivals.flush())
         return self._step_due()
 
-    def _disputed(self, block: SampleBlock, schema_hash: str) -> bool:
+    def _disputed(self, block: SampleBlock) -> bool:
         """Whether a block contradicts one that has come; what is known of publishers is brought to the alarm."""
-        if self._gate.form(block, schema_hash) is not None:
-            return False  # refused anyway
         disputed = self._senders.take(block)
         if disputed and not self._arrivals.withdraw(block.run, block.sequence):
             self._window.gap()  # the other version may be in the unfinished hop

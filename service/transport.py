@@ -254,7 +254,7 @@ class MachineLink:
         encoding = str(sample.encoding)
         if sample.kind == zenoh.SampleKind.PUT and not encoding.endswith(REPLAY_MARK):
             attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding))
+            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, _source(sample)))
 
     def _take_miss(self, miss: zenoh.ext.Miss) -> None:
         self._callbacks.on_missed(miss.nb)
@@ -400,6 +400,12 @@ def route(settings: LinkSettings) -> Iterator[None]:
         yield
     finally:
         link.close()
+
+
+def _source(sample: zenoh.Sample) -> str:
+    """The publisher's session and its number there; empty if it numbers nothing."""
+    info = sample.source_info
+    return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
 
 
 def _verbatim(sample: zenoh.Sample) -> RecordedMessage:

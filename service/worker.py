@@ -4,7 +4,6 @@ What a block brought and what the monitor remembers afterwards are committed to 
 anything published.
 """
 
-import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -13,7 +12,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from models.commissioning.installed import Installed
-from models.signals.wire import may_be_block
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, StreamStatus
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
@@ -99,12 +97,11 @@ class MachineWorker:
         on_events: Callable[[], None] = lambda: None,
     ) -> None:
         self.machine = machine = installed.machine
-        n_channels, most_samples = len(machine.sensors), math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
         self.inbox = Inbox(
             queue.blocks,
             queue.when_full,
             round(queue.mb * 1e6),
-            lambda one: may_be_block(one.payload, one.attachment, one.encoding, n_channels, most_samples),
+            lambda one: self._monitor.could_use(one.payload, one.attachment, one.encoding),
         )
         self.history = history
         self.identity = Identity(

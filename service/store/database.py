@@ -6,6 +6,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import CancelledError
 from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -27,6 +28,7 @@ _T = TypeVar("_T")
 
 _ANSWER_S = 60.0  # at least; a query over a long time may take a while
 _JOIN_S = 10.0
+_FINISH_S = 2.0  # for what others have asked for when the history is closed
 _IMMEDIATE = "rotorwatch_immediate"
 _DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_hops", "series", "tokens", "webhook_cursors")
@@ -69,6 +71,7 @@ class Database:
         self.in_memory = self.is_sqlite and self._url.database in {None, "", ":memory:"}
         self.file = None if not self.is_sqlite or self.in_memory else Path(self._url.database or "")
         self.shown = self._url.render_as_string(hide_password=True)
+        self._asking = threading.Lock()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._thread: threading.Thread | None = None
         self._engine: AsyncEngine | None = None
@@ -110,13 +113,21 @@ class Database:
             raise
 
     def stop(self) -> None:
-        """Close all connections and end the thread; a second time is nothing."""
-        if self._loop is None or self._thread is None:
+        """Answer everybody who has asked, close all connections and end the thread; a second time is nothing.
+
+        Raises
+        ------
+        StoreError
+            If the connections cannot be closed.
+        """
+        with self._asking:
+            loop, self._loop = self._loop, None
+        if loop is None or self._thread is None:
             return
         try:
-            self.call(self._disconnect)
+            limit_s = _FINISH_S + max(_ANSWER_S, 10.0 * self.timeout_s)
+            asyncio.run_coroutine_threadsafe(self._guarded(limit_s, self._finish), loop).result()
         finally:
-            loop, self._loop = self._loop, None
             loop.call_soon_threadsafe(loop.stop)
             self._thread.join(_JOIN_S)
             if not self._thread.is_alive():
@@ -130,11 +141,25 @@ class Database:
         StoreError
             If the history is closed, or the database fails or does not answer.
         """
-        loop = self._loop
-        if loop is None:
-            raise StoreError(f"{self.shown}: the history is closed")
         limit_s = max(_ANSWER_S, 10.0 * self.timeout_s)
-        return asyncio.run_coroutine_threadsafe(self._guarded(limit_s, function, *args, **kwargs), loop).result()
+        with self._asking:  # after this nobody stops the loop without answering
+            if self._loop is None:
+                raise StoreError(f"{self.shown}: the history is closed")
+            asked = asyncio.run_coroutine_threadsafe(self._guarded(limit_s, function, *args, **kwargs), self._loop)
+        try:
+            return asked.result()
+        except CancelledError as error:
+            raise StoreError(f"{self.shown}: the history was closed") from error
+
+    async def _finish(self) -> None:
+        """End what is going on, cancelling what takes too long, and disconnect."""
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        if others:
+            _, late = await asyncio.wait(others, timeout=_FINISH_S)
+            for task in late:
+                task.cancel()
+            await asyncio.gather(*late, return_exceptions=True)
+        await self._disconnect()
 
     async def _guarded(
         self, limit_s: float | None, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs

@@ -3,6 +3,7 @@
 import json
 import struct
 import threading
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,9 @@ import structlog
 
 from models.alarm_names import CONFLICT, STREAM_LOST, of_the_machine
 from models.commissioning.installed import install
+from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
-from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_block, sender_of
+from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_arrow, encode_block, sender_of
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from service.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
@@ -123,12 +125,61 @@ def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
     assert {name for name in raised(monitor) if of_the_machine(name)} == set()
 
 
+def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:
+    """What can be no block of the machine, although its run, number and time are those of one near by."""
+    sequences = [good.sequence + ahead for ahead in (0, 1, 2, -1, int(rng.integers(40)))]
+    sequence = max(0, [*sequences, 2**63, 2**64 - 1][rng.integers(7)])
+    start_ns = good.start_ns + (min(sequence, good.sequence + 50) - good.sequence) * 10**8
+    wrong: list[dict[str, object]] = [
+        {"rate_hz": 1000.0},
+        {"samples": np.full_like(good.samples, np.nan)},
+        {"samples": good.samples[:1]},
+        {"samples": good.samples[:, :3]},
+        {"start_ns": -1},
+    ]
+    place = {"sequence": sequence, "start_ns": start_ns, "run": int(rng.integers(1, 3))}
+    return replace(good, **(place | wrong[rng.integers(5)]))  # type: ignore[arg-type]  # fields of any kind
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_can_be_no_block_costs_none(seed: int) -> None:
+    monitor, rng = MachineMonitor(install(LAB, None)), np.random.default_rng(seed)
+    ours = scenario_blocks(30.0)
+    for one in ours:
+        if rng.random() < 0.5:
+            forged = encode_block(misshapen(one, rng), "")
+            assert not monitor.could_use(*forged)
+            monitor.step_payload(*forged)
+        assert monitor.could_use(*encode_block(one, ""))
+        monitor.step_payload(*encode_block(one, ""))
+    monitor.flush()
+    quality = monitor.health().quality
+    assert (quality.accepted, quality.gaps) == (len(ours), 0)
+    assert not monitor.health().alarms
+
+
+@pytest.mark.parametrize("encode", [encode_block, encode_arrow])
+def test_what_may_be_a_block_of_the_machine_is_known_by_its_form(
+    encode: Callable[..., tuple[bytes, bytes, str]],
+) -> None:
+    monitor = MachineMonitor(install(LAB, None))
+    (block,) = scenario_blocks(0.1)
+    assert monitor.could_use(*encode(block, ""))
+    assert monitor.could_use(*encode(block, LAB.descriptor.schema_hash))
+    assert not monitor.could_use(
+        *encode(replace(block, samples=np.tile(block.samples, (100, 1)).astype(np.float32)), "")
+    )
+    payload, attachment, encoding = encode(block, "")
+    assert not monitor.could_use(payload, attachment, "text/plain")
+    assert not monitor.could_use(payload[1:], attachment, encoding)
+
+
 # Floods
 
 
-def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING) -> RawBlock:
+def raw(run: int, size: int = 4, encoding: str = BLOCK_ENCODING, source: str = "") -> RawBlock:
     header = struct.pack("<qQdBBHI", 0, 0, 2000.0, 1, 1, run, size // 4)
-    return RawBlock(b"\0" * size, header, encoding)
+    return RawBlock(b"\0" * size, header, encoding, source)
 
 
 def test_what_cannot_be_a_block_costs_no_place() -> None:
@@ -144,16 +195,28 @@ def test_what_cannot_be_a_block_costs_no_place() -> None:
     assert len(inbox) < 100  # a few are looked at
 
 
-def test_another_publisher_costs_the_one_that_is_followed_no_block() -> None:
+@pytest.mark.parametrize("same_run", [False, True])
+def test_another_publisher_costs_the_one_that_is_followed_no_block(same_run: bool) -> None:
     inbox = Inbox(20, "drop")
-    good = [raw(1) for _ in range(15)]
+    good = [raw(1, source="ours") for _ in range(15)]
     inbox.follow(good[0])
     for one in good:
         for run in range(2, 50):
-            inbox.put(raw(run))
+            inbox.put(raw(1 if same_run else run, source="theirs"))
         inbox.put(one)
-    kept = [one for one in (inbox.get() for _ in range(len(inbox))) if isinstance(one, RawBlock)]
-    assert [one for one in kept if sender_of(one.attachment, one.encoding)[1] == 1] == good
+    assert inbox.dropped == 0  # of the publisher that is followed
+    assert [inbox.get() for _ in range(15)] == good  # first
+    assert len(inbox) + inbox.unread == 15 * 48
+
+
+def test_a_block_that_was_used_is_followed_by_what_waits_of_its_publisher() -> None:
+    inbox = Inbox(20, "drop")
+    inbox.follow(raw(1))
+    for run in (2, 3, 2, 3):
+        inbox.put(raw(run))
+    inbox.follow(raw(3))
+    order = [inbox.get() for _ in range(4)]
+    assert [sender_of(one.attachment, one.encoding)[1] for one in order if isinstance(one, RawBlock)] == [3, 3, 2, 2]
 
 
 def test_a_queue_is_bounded_in_bytes_too() -> None:
@@ -170,6 +233,7 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
     with service(address, bound=100) as (_, worker), open_session(address) as session:
         feed, stop = Feed(session), threading.Event()
         bad = [b"", b"rubbish", b"\0" * 7200]
+        misfits = [encode_block(misshapen(feed.block(), np.random.default_rng(seed)), "") for seed in range(50)]
         sent = [0]
 
         def flood() -> None:
@@ -179,6 +243,8 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
                         sent[0] += 1
                         kind = (BLOCK_ENCODING, ARROW_ENCODING, "text/plain")[sent[0] % 3]
                         other.put(LAB.keys.stream, bad[sent[0] % 3], attachment=b"x" * 32, encoding=kind)
+                        payload, attachment, encoding = misfits[sent[0] % 50]
+                        other.put(LAB.keys.stream, payload, attachment=attachment, encoding=encoding)
 
         thread = threading.Thread(target=flood)
         thread.start()

@@ -1,5 +1,6 @@
 """The database fails and comes back: nothing is lost, nothing is there twice, the order is kept."""
 
+import asyncio
 import select
 import socket
 import socketserver
@@ -7,12 +8,14 @@ import sqlite3
 import tempfile
 import threading
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
+from service.store.database import Database
 from service.store.errors import StoreError
 from service.store.machine import MachineStore
 from service.store.records import Step
@@ -243,3 +246,37 @@ def test_locks_are_taken_again_after_the_database_was_away(parts: Parts) -> None
         until(lambda: lab.waiting == 0, "recovery")
         with opened(url) as other, pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
             other.machine("demo", "lab")
+
+
+def test_whoever_asks_while_the_history_is_closed_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.store.database._FINISH_S", 0.05)
+    database = Database(f"sqlite:///{tmp_path / 'history.sqlite'}", QUICK_S)
+    database.start()
+    answers: list[str] = []
+
+    async def read() -> None:
+        async with database.reading() as connection:
+            await connection.execute(text("SELECT 1"))
+
+    async def last() -> None:
+        async with database.reading():
+            await asyncio.sleep(3600.0)
+
+    def ask(function: Callable[[], Coroutine[None, None, None]]) -> None:
+        try:
+            while True:
+                database.call(function)
+        except StoreError as error:
+            answers.append(str(error))
+
+    before = threading.active_count()
+    threads = [threading.Thread(target=ask, args=(one,), daemon=True) for one in (last, *[read] * 4)]
+    for thread in threads:
+        thread.start()
+    until(lambda: threading.active_count() > before + len(threads), "connections in use")  # each has a thread
+    database.stop()
+    for thread in threads:
+        thread.join(60.0)
+    assert len(answers) == 5
+    assert all("closed" in answer for answer in answers)
+    until(lambda: threading.active_count() < before, "the end of all connections")

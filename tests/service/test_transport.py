@@ -95,6 +95,26 @@ def test_a_monitor_that_does_not_keep_up_counts_every_block_it_drops() -> None:
         assert inbox.dropped == 1000
 
 
+def test_blocks_of_two_sessions_are_told_apart() -> None:
+    taken: list[RawBlock] = []
+    address = endpoint()
+    with machine_link(address, taken.append), open_session(address) as session, open_session(address) as other:
+        publishers = [
+            zenoh.ext.declare_advanced_publisher(
+                one,
+                KEYS.stream,
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=0.2, sporadic_heartbeat=None),
+            )
+            for one in (session, other)
+        ]
+        for number in range(6):
+            publishers[number % 2].put(bytes([number % 2]))
+        until(lambda: len(taken) == 6, "all blocks")
+        sources = [{block.source for block in taken if block.payload == bytes([number])} for number in (0, 1)]
+        assert [len(source) for source in sources] == [1, 1]
+        assert sources[0] != sources[1]
+
+
 def test_waiting_slows_the_publisher_down_and_loses_nothing() -> None:
     address = endpoint()
     stream = scenario_blocks(60.0)
