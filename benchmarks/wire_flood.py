@@ -64,7 +64,7 @@ BESIDE: dict[str, Callable[[int], Message]] = {
     "descriptors": lambda n: Message(n, "", "put", _KEYS.descriptor, b'{"site": "%d"}' % n),
     "heartbeats": lambda n: Message(n, "", "put", f"{_KEYS.stream}/@adv/pub/{n + 1:x}/1/_", bytes(4)),
     "alarm events": lambda n: Message(n, "", "put", _KEYS.alarm_event, b"[" * 1000),
-    "tokens of a publisher": lambda n: Message(n, "", "declare", _KEYS.publisher_alive),
+    "publishers that come and go": lambda n: Message(n, "", "declare", _KEYS.publisher_alive),
     "questions for health": lambda n: Message(n, "", "ask", _KEYS.health),
     "questions for the alarm log": lambda n: Message(n, "", "ask", _KEYS.alarm_event),
 }
@@ -80,7 +80,7 @@ def _made(kind: str, number: int) -> Message:
 def send(endpoint: str, kind: str, rate: float, seconds: float) -> None:
     """Send as told, and print how many messages a second it were."""
     made = [_made(kind, number) for number in range(_MADE)]
-    sender = Sender(endpoint)
+    sender = Sender(endpoint, tokens=0)
     time.sleep(1.0)
     sent, begin_s = 0, time.monotonic()
     while (now_s := time.monotonic() - begin_s) < seconds:

@@ -42,7 +42,6 @@ from service.transport import Link
 
 _SECOND, _THIRD = "demo/second", "demo/third"
 _AT_ONCE = 500
-_TOKENS = 8
 _GROWTH_MB, _HEALTH_BYTES, _LOG_BYTES_PER_S = 50.0, 100_000, 2_000.0
 _ERRORS = re.compile(r"Traceback|\[(error|critical)|panicked|Exception|something was lost", re.IGNORECASE)
 _ON_THE_WAY = 10
@@ -74,11 +73,12 @@ class Outcome:
 
 
 class Sender:
-    """Does on the network what messages say."""
+    """Does on the network what messages say; the latest tokens stay."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, tokens: int = 8) -> None:
         self._link = Link(LinkSettings(connect=(endpoint,)))
         self.session = self._link.session
+        self._most_tokens = tokens
         self._tokens: deque[zenoh.LivelinessToken] = deque()
         self.answers = self.unsendable = 0
 
@@ -94,7 +94,7 @@ class Sender:
                 self.session.delete(one.key, attachment=one.attachment, congestion_control=wait)
             elif one.act == "declare":
                 self._tokens.append(self.session.liveliness().declare_token(one.key))
-                if len(self._tokens) > _TOKENS:
+                if len(self._tokens) > self._most_tokens:
                     self._tokens.popleft().undeclare()  # type: ignore[no-untyped-call]
             else:
                 selector = f"{one.key}?{one.encoding}" if one.encoding else one.key

@@ -197,8 +197,8 @@ class MachineWorker:
 
     def publisher(self, alive: bool) -> None:
         """Take note of a publisher that came or went."""
-        if alive != self._publisher_alive:
-            self._log.info("publisher is there" if alive else "publisher is gone")
+        if alive != self._publisher_alive and (withheld := self._limiter.admit(f"publisher {alive}")) is not None:
+            self._log.info("publisher is there" if alive else "publisher is gone", withheld=withheld)
         self._publisher_alive = alive
         if not alive:
             self._mismatch = ()

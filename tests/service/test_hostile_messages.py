@@ -71,6 +71,14 @@ def test_a_flood_of_descriptors_is_logged_now_and_then(tmp_path: Path) -> None:
         assert len([line for line in lines if "differences" in line]) <= 2
 
 
+def test_publishers_that_come_and_go_are_logged_now_and_then(tmp_path: Path) -> None:
+    with bench(tmp_path) as at, structlog.testing.capture_logs() as lines:
+        for number in range(200):
+            at.worker.publisher(number % 2 == 0)
+            at.worker.replay(number % 2 == 0)
+        assert 1 <= len(lines) <= 4
+
+
 def test_health_stays_small_whatever_is_sent() -> None:
     address = endpoint()
     with service(address) as (_, worker), open_session(address) as session:
