@@ -6,14 +6,12 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 
 import pytest
 from sqlalchemy import create_engine, event, make_url, text
 from sqlalchemy.exc import DBAPIError
 
-from service.store.alarm_log import committed_events
 from service.store.errors import StoreError
 from service.store.machine import MachineStore
 from service.store.records import (
@@ -182,24 +180,6 @@ def test_events_are_found_by_everything_they_are_asked_by(lab: MachineStore) -> 
     assert lab.events(limit=2, newest_first=True, before=5) == (events[4], events[3])
     with pytest.raises(StoreError, match="0 entries were asked for"):
         lab.events(limit=0)
-
-
-def test_who_may_not_write_reads_what_was_committed(store: Store, url: str) -> None:
-    lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
-    events = tuple(alarm_event(number) for number in range(4))
-    lab.commit(Step(events=events))
-    pump.commit(Step(events=events[:1]))
-    for read in (store.alarms.since, partial(committed_events, url)):
-        assert read("demo", "lab", events[1].recorded_ns) == events[1:]
-        assert read("demo", "pump", 0) == events[:1]
-        assert read("demo", "fan", 0) == ()
-
-
-def test_a_history_that_is_only_looked_into_is_not_made(tmp_path: Path) -> None:
-    file = tmp_path / "history.sqlite"
-    with pytest.raises(StoreError, match="unable to open"):
-        committed_events(f"sqlite:///{file}", "demo", "lab", 0)
-    assert not file.exists()
 
 
 def test_reports_stand_in_the_order_of_arrival_when_a_clock_was_set_back(lab: MachineStore) -> None:
