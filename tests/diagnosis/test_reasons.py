@@ -98,6 +98,26 @@ def test_a_rotor_in_noisy_sensors_is_read(window: WindowStatistics) -> None:
     assert reason_of(replace(window, spectrum=window.spectrum + np.diag(noise))) == ""
 
 
+def test_beside_a_misfit_the_rotor_must_be_seen(window: WindowStatistics) -> None:
+    """Sensors hear ten times their motion, each for itself, and in a part of the band more of it."""
+    noise = 100 * np.diag(np.einsum("fii->i", window.spectrum).real / len(window.spectrum))
+    more = np.where(np.abs(window.frequencies_hz - 70) < 5, 3.0, 1.0)[:, None, None]
+    gain = np.where(np.arange(len(window.states)) == 0, 1.1, 1.0)
+    seen, drowned, hidden = (
+        LikelihoodFit(MACHINE).diagnose(one)
+        for one in (
+            replace(window, spectrum=window.spectrum * np.outer(gain, gain)),
+            replace(window, spectrum=window.spectrum + noise),
+            replace(window, spectrum=window.spectrum + noise * more),
+        )
+    )
+    assert seen.misfit_z is not None
+    assert seen.misfit_z > 4
+    assert not seen.unexplained
+    assert not drowned.unexplained  # nothing contradicts the rotor: its parameters are only vague
+    assert_beyond(hidden.unexplained)
+
+
 def test_a_vague_reading_says_how_vague(window: WindowStatistics) -> None:
     for error in (0.2001, 0.204, 0.5, 3.0):
         vague = Diagnosis("likelihood", (ParameterReading("k_by", "likelihood", 0.1, error),))

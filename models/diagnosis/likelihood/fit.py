@@ -15,22 +15,27 @@ import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.diagnosis.likelihood.bins import BinGroups, group_bins
+from models.diagnosis.likelihood.explained import MOST_MISFIT, unexplained_at, unseen
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import goodness_of_fit
 from models.diagnosis.likelihood.integrated import integrated
 from models.diagnosis.likelihood.motions import Motions
-from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Workspace
+from models.diagnosis.likelihood.scoring import (
+    FisherScoring,
+    Maximum,
+    Weights,
+    Whitened,
+    Workspace,
+)
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
-from models.diagnosis.limits import beyond
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
 from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import FloatArray
 
 __all__ = ["LikelihoodFit"]
@@ -42,19 +47,9 @@ _COARSE, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN = 3.0, 25, 1.0, 30.0
 """A cold search finds its region on groups three times as wide."""
 _GROUPS = 150
 """The band over the widest group."""
-_MOST_LOG_RATIO = float(np.log(5))
-"""No stiffness or damping is believed to have changed by more than a factor of five within the model."""
-_MOST_EXCESS = 100.0
-"""Mean squared excess over its expectation, beyond which there is nothing to follow: the next search starts cold."""
-_MOST_DEVIATION = 0.2
-"""Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
-Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17."""
-_MOST_NOISE = 0.3
-"""Share of the motion that the theory takes for noise of the sensors though displacement and velocity show it alike,
-up to which a rotor can be seen behind it: a spectrum without resonances is taken for coloured noise, and what is left
-of it fits any rotor."""
-_UNEQUAL = 5.0
-"""How many times more noise one sensor of a pair may have than the other."""
+_PATIENCE, _HOPELESS = 30, 2.0
+"""Steps after which a cold search is given up where it is still so many times further off than is evaluated. In
+windows that the theory explains most searches have ended by then."""
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12
@@ -184,7 +179,7 @@ class LikelihoodFit:
         speed = self._speed(window)
         excluded = _near_rotation(window.frequencies_hz, speed)
         power = self._checked_power(window, ~excluded)
-        nowhere = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
+        no_maximum = f"{self._machine.name}: the likelihood has no maximum for this window: {_OUTSIDE}"
         try:
             # Trial points may lie far out; what comes of them is checked, not warned of.
             with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -192,17 +187,22 @@ class LikelihoodFit:
             covariance = np.asarray(np.linalg.inv(found.information), dtype=np.float64)
         except np.linalg.LinAlgError as error:
             self.reset()
-            raise UnexplainedError(nowhere) from error
+            raise UnexplainedError(no_maximum) from error
         if not (np.all(np.isfinite(found.theta)) and np.all(np.diag(covariance) > 0)):
             self.reset()
-            raise UnexplainedError(nowhere)
+            raise UnexplainedError(no_maximum)
         self._last, self._strength = found.theta, weights.strength
         states = model.groups.average(window.spectrum)
-        unexplained = self._check_explained(model, weights, found, states)
+        why, nowhere = unexplained_at(model, weights, found.whitened, states)
+        unexplained = self._stated(why)
+        if nowhere:
+            raise UnexplainedError(unexplained)
+        goodness = goodness_of_fit(self._machine, model, weights, found, states)
+        if not unexplained and goodness.misfit_z > MOST_MISFIT:
+            unexplained = self._stated(unseen(model, weights, found, goodness.misfit_z))
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
-        goodness = goodness_of_fit(self._machine, model, weights, found, states)
         read = self._read(window, model, found.whitened.point, structural, speed)
         return replace(
             read,
@@ -340,7 +340,12 @@ class LikelihoodFit:
         near = first.maximise(start, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN).theta
         theta = search.centre.copy()
         theta[: coarse.colour_at.stop], theta[model.level_at] = near[: coarse.colour_at.stop], near[coarse.level_at]
-        return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN)
+        states = groups.average(window.spectrum)
+
+        def is_hopeless(steps: int, reached: Whitened) -> bool:
+            return steps == _PATIENCE and bool(unexplained_at(model, search.weights, reached, states, _HOPELESS)[0])
+
+        return model, search, search.maximise(theta, _COLD_STEPS, _NEAR, _GAIN, hopeless=is_hopeless)
 
     def _search(
         self, model: SpectralModel, window: WindowStatistics, speed: float, strength: float | None = None
@@ -375,52 +380,12 @@ class LikelihoodFit:
         explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
         return float(explained**-0.5)
 
-    def _check_explained(self, model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray) -> str:
-        """Say why nothing at this maximum means anything; empty if it does.
-
-        Raises
-        ------
-        UnexplainedError
-            If nothing within the model comes near the window, so that there is no maximum to speak of.
-        """
-        why, far = _deviation(model, weights, found, states)
-        structural = found.theta[: len(STRUCTURAL)]
-        worst = int(np.argmax(np.abs(structural)))
-        if not why and abs(structural[worst]) > _MOST_LOG_RATIO:
-            ratio = math.exp(min(structural[worst], math.log(1e6)))
-            most = math.exp(math.copysign(_MOST_LOG_RATIO, structural[worst]))
-            text, limit = beyond(max(ratio, 1e-6), most)
-            side = "at least" if most < 1 else "at most"
-            name = PARAMETER_TEXT[STRUCTURAL[worst]]
-            why = f"{name} would be {text} times nominal, evaluated is {side} {limit} times"
+    def _stated(self, why: str) -> str:
+        """Why a window is unexplained, as a sentence; empty if it is explained."""
         if not why:
             return ""
         self.reset()  # perhaps the search has followed another maximum: the next window is searched anew
-        reason = f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
-        if far or abs(structural[worst]) > _MOST_LOG_RATIO:
-            raise UnexplainedError(reason)
-        return reason
-
-
-def _deviation(model: SpectralModel, weights: Weights, found: Maximum, states: ComplexArray) -> tuple[str, bool]:
-    """What a maximum leaves unexplained, or explains by noise, if that is too much; and whether it is far too much."""
-    excess, point, bins = found.whitened.excess, found.whitened.point, model.groups.bins
-    squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2
-    deviation = max(0.0, float(np.mean(squared - 1 / weights.averages))) ** 0.5
-    far = bool(np.mean(weights.averages * squared) > _MOST_EXCESS)
-    if far or deviation > _MOST_DEVIATION:
-        text, limit = beyond(100 * deviation, 100 * _MOST_DEVIATION)
-        return f"its spectra deviate from it by {text} % (rms, sampling aside), evaluated is at most {limit} %", far
-    # Noise is a sensor's own: what both sensors of a motion show is motion, and this one the theory does not explain.
-    shared = np.maximum(model.noise(point.theta) - _UNEQUAL * model.motions.rest(states, model.centre), 0)
-    share = float(np.mean(bins @ shared / (bins @ np.einsum("fii->fi", point.S).real)))
-    if share > _MOST_NOISE:
-        text, limit = beyond(100 * share, 100 * _MOST_NOISE)
-        return (
-            f"{text} % of what pairs of sensors show alike would be noise of each, evaluated is at most {limit} %",
-            False,
-        )
-    return "", False
+        return f"{self._machine.name}: the theory does not explain this window: {why}; {_OUTSIDE}"
 
 
 def _searched(search: FisherScoring, line: Linearised) -> Maximum | None:

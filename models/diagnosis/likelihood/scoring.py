@@ -1,5 +1,6 @@
 """Fisher scoring: the search for the maximum of one window's Whittle likelihood."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -219,6 +220,7 @@ class FisherScoring:
         near: float,
         gain: float,
         derivatives: Derivatives | None = None,
+        hopeless: Callable[[int, Whitened], bool] | None = None,
     ) -> Maximum:
         """Search from a starting point.
 
@@ -231,6 +233,8 @@ class FisherScoring:
             gain less than `gain` in log-likelihood.
         derivatives : Derivatives, optional
             Those at `theta` if an earlier search has ended there.
+        hopeless : callable, optional
+            Whether to give up, from the steps tried and where they have led.
 
         Raises
         ------
@@ -249,7 +253,7 @@ class FisherScoring:
             covariance: FloatArray = np.asarray(np.linalg.inv(information), dtype=np.float64)
             full_step = np.asarray(covariance @ gradient, dtype=np.float64)
             is_near = np.all(full_step[diagnosed] ** 2 < near**2 * np.diag(covariance)[diagnosed])
-            if steps == most_steps or damping > 1e8:
+            if steps == most_steps or damping > 1e8 or (hopeless is not None and hopeless(steps, whitened)):
                 break
             if is_near and gradient @ full_step / 2 < gain:
                 if not model.shapes or looks == _LOOKS or not self._learn_strength(theta, covariance):

@@ -21,8 +21,10 @@ Taken as white when it is not, it pulled the damping of the heavy machine down b
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from models.diagnosis.likelihood.bins import BinGroups
 from models.diagnosis.likelihood.motions import Motions
@@ -134,6 +136,8 @@ class SpectralModel:
         polynomials = [np.polynomial.legendre.Legendre.basis(j + 1)(x) for j in range(shapes)]
         self._b = np.reshape(polynomials, (shapes, x.size)).T
         self._w = 2 * np.pi * groups.nodes_hz
+        # Neighbouring groups share nodes, and all are filled up to one number: half of them where damping is light.
+        self._distinct_w, self._place = np.unique(self._w, return_inverse=True)
         self.centre = 2 * np.pi * groups.centre_hz
         self._factor = motions.factor(self._w, self.centre[:, None])
         self.cutoff_at = len(STRUCTURAL)
@@ -186,19 +190,17 @@ class SpectralModel:
 
     def at(self, theta: FloatArray, speed_rad_s: float, C: FloatArray | None = None) -> ModelPoint:
         """Expected spectra at a parameter point, or with another level matrix than its own."""
-        shape = self._w.shape
-        w = self._w.ravel()
-        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, w)
+        H = self.receptance(theta[: self.cutoff_at], speed_rad_s, self._distinct_w)[self._place]
         colour = np.exp(0.5 * self._b @ theta[self.shape_at].reshape(self.shapes, 6))
         unit = self.force_unit * colour[:, None, None, :]
         gain = low_pass(self.groups.nodes_hz, *self.filter(theta)) * self.groups.weights
-        seen = H[:, self.motions.dofs].reshape(*shape, self.n, 6) * self._factor[..., None]
+        seen = H[:, :, self.motions.dofs] * self._factor[..., None]
         G = seen * unit * np.sqrt(gain)[:, :, None, None]
         C = self.levels(theta) if C is None else C
         S = _summed(G @ C, G)
         diagonal = np.arange(self.n)
         S[:, diagonal, diagonal] += self.noise(theta)
-        return ModelPoint(theta, S, G, H.reshape(*shape, 6, 6) * unit, colour, C, speed_rad_s)
+        return ModelPoint(theta, S, G, H * unit, colour, C, speed_rad_s)
 
     def filter(self, theta: FloatArray) -> tuple[float, float]:
         """Cutoff (Hz) and order of the low-pass."""
@@ -313,18 +315,22 @@ def factor_of(C: FloatArray) -> FloatArray:
 
 def packed(matrices: ComplexArray) -> FloatArray:
     """Hermitian matrices as real vectors with the same inner product tr(A B), shape (…, n²)."""
-    n = matrices.shape[-1]
-    diagonal, (rows, columns) = np.arange(n), np.triu_indices(n, 1)
+    diagonal, rows, columns = _upper(matrices.shape[-1])
     upper = np.sqrt(2) * matrices[..., rows, columns]
     return np.concatenate([matrices[..., diagonal, diagonal].real, upper.real, upper.imag], axis=-1)
 
 
 def twice_packed(matrices: ComplexArray) -> FloatArray:
     """X + Xᴴ of square matrices X, packed."""
-    n = matrices.shape[-1]
-    diagonal, (rows, columns) = np.arange(n), np.triu_indices(n, 1)
+    diagonal, rows, columns = _upper(matrices.shape[-1])
     upper = np.sqrt(2) * (matrices[..., rows, columns] + matrices[..., columns, rows].conj())
     return np.concatenate([2 * matrices[..., diagonal, diagonal].real, upper.real, upper.imag], axis=-1)
+
+
+@lru_cache
+def _upper(n: int) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Diagonal, rows and columns of what is above it."""
+    return np.arange(n), *np.triu_indices(n, 1)
 
 
 def _summed(left: ComplexArray, right: ComplexArray) -> ComplexArray:
