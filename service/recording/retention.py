@@ -83,8 +83,12 @@ def decide(
 
 
 def alarm_mark(event: StoredEvent) -> AlarmMark:
-    """Say what an alarm event is."""
-    return AlarmMark(event.recorded_ns, f"{event.kind}: {json.loads(event.text)['data']['text']}")
+    """Say what an alarm event is; one whose text cannot be read counts as an alarm all the same."""
+    try:
+        said = json.loads(event.text)["data"]["text"]
+    except (ValueError, KeyError, TypeError):
+        said = event.alarm
+    return AlarmMark(event.recorded_ns, f"{event.kind}: {said}")
 
 
 def write_kept(folder: Path, kept: dict[str, str], settings: RecordingSettings) -> None:

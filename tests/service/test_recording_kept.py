@@ -126,8 +126,10 @@ def test_limits_hold_and_nothing_goes_without_need(
             assert sum(one.size_bytes for one in [group[-len(left) - 1], *left]) > limit * 1e9
 
 
-def test_an_alarm_event_says_what_it_was() -> None:
+def test_an_alarm_event_says_what_it_was_and_an_odd_one_counts_too() -> None:
     assert alarm_mark(EVENT) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {SAID.data.text}")
+    for text in ("", "[]", '{"data": 1}', "null"):
+        assert alarm_mark(replace(EVENT, text=text)) == AlarmMark(EVENT.recorded_ns, f"{SAID.data.kind}: {EVENT.alarm}")
 
 
 FEW = {"rotate_mb": 0.1, "keep_gb": 0.0007, "alarm_keep_gb": 1.0, "alarm_before_s": 700, "alarm_after_s": 400}
