@@ -79,7 +79,7 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         if service.feed.closed:
             raise HTTPException(503, "the service is being stopped")
         logs = _logs(service, machine)
-        cursor = _cursor(logs, header or last_event_id or "", from_)
+        cursor = _cursor(logs, (header or "", last_event_id or ""), from_)
 
         async def admitted() -> bool:
             try:
@@ -102,14 +102,18 @@ def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, AlarmLog]:
     return {place: log for place, log in there.items() if place in wanted or not wanted}
 
 
-def _cursor(logs: Mapping[str, AlarmLog], text: str, begin: str) -> Cursor:
-    """Where to begin in each log; a machine that the text does not name is new to the listener, who gets it all."""
-    if not text:
-        return {place: log.last_sequence() if begin == "now" else -1 for place, log in logs.items()}
+def _cursor(logs: Mapping[str, AlarmLog], texts: tuple[str, ...], begin: str) -> Cursor:
+    """Where to begin in each log; a machine that the first text does not name is new to the listener, who gets it all.
+
+    Texts after the first that is there must be understood, and do not count.
+    """
     try:
-        heard = parsed_cursor(text)
+        given = [parsed_cursor(text) for text in texts if text]
     except CursorError as error:
         raise HTTPException(422, f"Last-Event-ID: {error}") from error
+    if not given:
+        return {place: log.last_sequence() if begin == "now" else -1 for place, log in logs.items()}
+    heard = given[0]
     for place, log in logs.items():
         if heard.get(place, -1) > log.last_sequence():
             raise HTTPException(

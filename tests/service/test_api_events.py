@@ -196,6 +196,7 @@ def test_health_is_told_at_once_and_when_it_changes(shared: Runtime) -> None:
     [
         ("?machine=demo/pump", "", 404, "no machine demo/pump; there are: demo/lab, demo/heavy"),
         ("?last_event_id=17", "", 422, "Last-Event-ID: cursor: '17' is not site/machine=sequence"),
+        ("?last_event_id=17", "demo/lab=0", 422, "Last-Event-ID: cursor: '17' is not site/machine=sequence"),
         ("", "demo/lab=1,demo/lab=2", 422, "Last-Event-ID: cursor: 'demo/lab=2' is not"),
         ("", "demo/lab=one", 422, "Last-Event-ID: cursor: 'demo/lab=one' is not"),
         ("", "demo/lab=1000000", 409, "Last-Event-ID: demo/lab=1000000, but the log of demo/lab ends at"),
