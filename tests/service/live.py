@@ -234,17 +234,22 @@ class Program:
 
 @contextmanager
 def program(
-    folder: Path, *arguments: str, cwd: Path = ROOT, alone: dict[str, str] | None = None, **environment: str
+    folder: Path,
+    *arguments: str,
+    cwd: Path = ROOT,
+    alone: dict[str, str] | None = None,
+    within: tuple[str, ...] = (),
+    **environment: str,
 ) -> Iterator[Program]:
     """Run ``python -m ARGUMENTS`` from the checkout, or elsewhere in an environment of its own, `alone`.
 
-    It is gone when the block is left.
+    The words `within` come before the command. It is gone when the block is left.
     """
     number = len(list(folder.glob("*.out")))
     out, err = folder / f"{number}.out", folder / f"{number}.err"
     with out.open("wb") as out_file, err.open("wb") as err_file:
         process = subprocess.Popen(
-            [sys.executable, "-m", *arguments],
+            [*within, sys.executable, "-m", *arguments],
             cwd=cwd,
             stdin=subprocess.DEVNULL,
             stdout=out_file,

@@ -1,0 +1,23 @@
+"""A few rows of the table of faults, so that none of it rots; ``python -m tests.faults`` carries out all of them."""
+
+import pytest
+
+from tests.faults.measure import carried_out
+from tests.faults.page import PAGE
+from tests.faults.scenarios import ROWS, Row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", [row for row in ROWS if row.is_cheap], ids=lambda row: row.name)
+def test_a_fault_costs_no_more_than_the_table_says(row: Row) -> None:
+    outcome = carried_out(row, seed=11)
+    assert outcome.wrong == ()
+    assert outcome.orders > 0
+    assert outcome.recovered_s
+
+
+def test_the_page_has_every_row_as_the_table_has_it() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    for row in ROWS:
+        assert f"| {row.name} | {row.done} | {row.lost} | {row.stated} | {row.recovery} |" in page
+        assert page.count(f"| {row.name} |") == 2
