@@ -1,6 +1,7 @@
 """Carries out every row with some seeds, and writes the page: ``python -m tests.faults`` (half an hour)."""
 
 import argparse
+import os
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -20,11 +21,13 @@ def main() -> int:
     rows = [row for row in ROWS if any(text.lower() in row.name.lower() for text in given.rows)]
     if given.write and len(rows) != len(ROWS):
         parser.error("--write needs all rows")
+    loads = [os.getloadavg()[0]]
     found: dict[str, list[Outcome]] = {row.name: [] for row in rows}
 
     def run(row: Row, seed: int) -> None:
         outcome = carried_out(row, seed)
         found[row.name].append(outcome)
+        loads.append(os.getloadavg()[0])
         sys.stdout.write(f"{row.name} (seed {seed}): {outcome}\n")
         sys.stdout.flush()
 
@@ -34,7 +37,7 @@ def main() -> int:
     wrong = [f"{name}: {text}" for name, outcomes in found.items() for one in outcomes for text in one.wrong]
     sys.stdout.write("".join(f"{line}\n" for line in wrong) or "everything was as the table says\n")
     if given.write:
-        PAGE.write_text(written(found, given.seeds), encoding="utf-8")
+        PAGE.write_text(written(found, given.seeds, loads), encoding="utf-8")
     return 1 if wrong else 0
 
 

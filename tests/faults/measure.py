@@ -65,8 +65,7 @@ def _outcome(at: Plant) -> Outcome:
     unheard = [one for one in heard if one not in log]
     doubled = len(log) - len({one[1:] for one in log})
     faults = {
-        f"{at.missing_s:g} s of data are missing ({'; '.join(at.gaps)})": at.missing_s
-        > (at.away_s + _SLACK_S if at.away_s else 0.0),
+        f"{at.missing_s:g} s of data are missing": at.missing_s > (at.away_s + _SLACK_S if at.away_s else 0.0),
         f"{at.dropped} blocks were dropped": at.dropped and not at.away_s,
         f"{unaccounted} blocks are unaccounted for": unaccounted,
         f"{len(lost)} orders are lost": lost and not at.orders_may_be_lost,

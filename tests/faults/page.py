@@ -19,8 +19,9 @@ operator shelved an alarm and ended that again, several times a second, and note
 listener on the network noted every alarm event.
 
 This page is written by the run: `python -m tests.faults --write` ({rows} faults, seeds {seeds}, {runs} runs; the
-moments differ from seed to seed). The figures are of that run, the least and the most; times include the start of
-programs, which takes seconds on a busy computer.
+moments differ from seed to seed). The figures are of that run, the least and the most. Times include the start of
+programs: three seconds where there is nothing else to do. During this run {least:.0f} to {most:.0f} programs at a
+time wanted to compute on the two cores (load average), so it took far longer.
 
 """
 
@@ -67,7 +68,7 @@ def _row(row: Row, outcomes: Sequence[Outcome]) -> str:
     return f"| {row.name} | {missing} | {lost} of {orders} | {stated} | {recovered} |\n"
 
 
-def written(found: Mapping[str, Sequence[Outcome]], seeds: Sequence[int]) -> str:
+def written(found: Mapping[str, Sequence[Outcome]], seeds: Sequence[int], loads: Sequence[float]) -> str:
     """Make the page.
 
     Parameters
@@ -75,17 +76,19 @@ def written(found: Mapping[str, Sequence[Outcome]], seeds: Sequence[int]) -> str
     found : mapping of str to sequence of Outcome
         Outcomes of every row, by its name.
     seeds : sequence of int
+    loads : sequence of float
+        Load averages of the computer in the course of it.
     """
     outcomes = [one for each in found.values() for one in each]
     compared = [one.unaccounted for one in outcomes if one.unaccounted is not None]
     said = "".join(
-        f"- Not as in the first table in {sum(bool(one.wrong) for one in each)} of {len(each)} runs: {name}: "
+        f"- **Not as in the first table**, in {sum(bool(one.wrong) for one in each)} of {len(each)} runs of *{name}*: "
         f"{'; '.join(text for one in each for text in one.wrong)}.\n"
         for name, each in found.items()
         if any(one.wrong for one in each)
     )
     seeds_text = ", ".join(map(str, seeds))
-    text = _HEAD.format(rows=len(ROWS), seeds=seeds_text, runs=len(outcomes))
+    text = _HEAD.format(rows=len(ROWS), seeds=seeds_text, runs=len(outcomes), least=min(loads), most=max(loads))
     text += "| what happens | how it was done | what may be lost | what the monitor says | over when |\n"
     text += "|---|---|---|---|---|\n"
     text += "".join(f"| {row.name} | {row.done} | {row.lost} | {row.stated} | {row.recovery} |\n" for row in ROWS)

@@ -32,7 +32,7 @@ __all__ = ["BLOCK_S", "Event", "Plant", "Seen", "locked", "pause", "plant"]
 BLOCK_S = 0.2
 _PLACE = "/api/v1/machines/demo/lab"
 _SHELVED = "EI"  # an alarm that nothing here raises
-_LONGEST_S = 90.0
+_LONGEST_S = 180.0
 _LOOK_S = 0.05
 _DISK = "mkdir -p {0} && mount -t tmpfs -o size={1} tmpfs {0} && exec"
 
@@ -90,7 +90,6 @@ class Plant:
     heard: list[Event] = field(default_factory=list)
     missing_s: float = 0.0
     dropped: int = 0
-    gaps: list[str] = field(default_factory=list)
     stated_s: list[float] = field(default_factory=list)
     recovered_s: list[float] = field(default_factory=list)
     away_s: float = 0.0
@@ -206,8 +205,6 @@ class Plant:
         """Add up what the monitor that runs has counted."""
         self.look()
         if self._last is not None and self.monitor is not None:
-            if self._last.quality.last_gap:
-                self.gaps.append(self._last.quality.last_gap)
             self.missing_s += self._last.quality.missing_s
             self.dropped += self._last.quality.queue_dropped_blocks
             self._last = None

@@ -138,7 +138,7 @@ def _clock_set(offset_s: float) -> Callable[[Plant], None]:
 
 
 def _two_publishers(plant: Plant) -> None:
-    plant.pace = 5.0
+    plant.pace = 10.0
     plant.publish("--start", "2026-01-01T00:00:00Z")
     plant.flowing()
     second = plant.publish("--start", "2026-01-01T00:00:00Z", run=2)
@@ -479,7 +479,7 @@ ROWS = (
     ),
     Row(
         "Two publishers send on one machine's key",
-        "a second publisher with another run number, at the same times; five times faster than real time",
+        "a second publisher with another run number, at the same times; ten times faster than real time",
         "blocks of either, while both send; what is missing is then counted more than once",
         "alarm `data-conflict`, which names both runs",
         "the alarm has cleared, 300 s of data after the second one has stopped",
