@@ -3,6 +3,7 @@
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from subprocess import SubprocessError
 
 from tests.faults.plant import BLOCK_S, Plant, plant
 from tests.faults.scenarios import Row
@@ -51,7 +52,7 @@ def carried_out(row: Row, seed: int) -> Outcome:
                 row.run(at)
                 at.wait_for_orders(1)
                 return _outcome(at)
-        except (AssertionError, OSError) as error:
+        except (AssertionError, OSError, SubprocessError) as error:
             return Outcome(0.0, None, 0, 0, 0, (), (), (str(error) or repr(error),))
 
 

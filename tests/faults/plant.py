@@ -165,7 +165,7 @@ class Plant:
         self.note()
         ended, self.monitor = self.running, None
         ended.process.send_signal(number)
-        return ended.process.wait(60)
+        return ended.process.wait(_LONGEST_S)
 
     # What is seen
 

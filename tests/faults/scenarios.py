@@ -1,28 +1,13 @@
 """What is broken on purpose, what that may cost, and what has to be said of it: one row for each fault."""
 
-import os
-import resource
-import signal
-import sqlite3
-import threading
-import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
-from models.alarm_names import CLOCK, CONFLICT, FAULT, STREAM_LOST
-from rotorwatch.records.health import HealthState
-from service.store.retention import Retention
-from service.store.store import Store
-from tests.faults.plant import Plant, Seen, locked, pause
-from tests.service.hooked import Got, hook, settings_for
-from tests.service.live import Feed, endpoint, open_session, program, scenario_blocks, until
+from tests.faults import faults
+from tests.faults.plant import Plant
 
 __all__ = ["ROWS", "Row"]
 
-_PAGE = 8192
-_FED_S = 0.1  # length of the blocks of `scenario_blocks`
 _NOTHING = "nothing"
 
 
@@ -53,381 +38,6 @@ class Row:
     is_cheap: bool = False
 
 
-def _silent(seen: Seen) -> bool:
-    return seen.raised(STREAM_LOST) and seen.health.state is HealthState.NO_DATA
-
-
-def _publisher_killed(plant: Plant) -> None:
-    first = plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
-    first.kill()
-    plant.broken()
-    plant.stated(_silent, "stream lost")
-    plant.publish(run=2)
-    plant.mended()
-    plant.recovered()
-    plant.away_s = 60.0  # nobody measured meanwhile
-
-
-def _publisher_stands(plant: Plant) -> None:
-    publisher = plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
-    pause(publisher)
-    plant.broken()
-    plant.stated(_silent, "stream lost")
-    os.kill(publisher.process.pid, signal.SIGCONT)
-    plant.mended()
-    plant.recovered()
-
-
-def _restarted_at(offset_s: float) -> Callable[[Plant], None]:
-    def run(plant: Plant) -> None:
-        start = "2026-01-01T12:00:00Z"
-        first = plant.publish("--start", start)
-        plant.flowing()
-        plant.rest(0.5, 2.0)
-        first.stop()
-        hour = 12 + round(offset_s / 3600)
-        plant.publish("--start", f"2026-01-01T{hour:02}:00:00Z", run=2)
-        plant.broken()
-        plant.stated(lambda seen: "publisher restarted" in seen.health.quality.last_gap, "restart of the publisher")
-        plant.mended()
-        plant.recovered(lambda seen: seen.well and not seen.raised(CLOCK))
-        plant.away_s = abs(offset_s) + 60.0
-
-    return run
-
-
-def _clock_set(offset_s: float) -> Callable[[Plant], None]:
-    def run(plant: Plant) -> None:
-        stop = threading.Event()
-        offset_ns = [0]
-        with open_session(plant.address) as session:
-            feed = Feed(session)
-
-            def publish() -> None:
-                begin_s = time.monotonic()
-                for number, block in enumerate(scenario_blocks(120.0)):
-                    if stop.wait(max(0.0, begin_s + number * _FED_S - time.monotonic())):
-                        return
-                    feed.put(type(block)(
-                        block.start_ns + offset_ns[0], block.sequence, block.run, block.rate_hz, block.samples
-                    ))  # fmt: skip
-
-            publisher = threading.Thread(target=publish)
-            publisher.start()
-            try:
-                plant.flowing()
-                plant.rest(0.5, 2.0)
-                offset_ns[0] = round(offset_s * 1e9)
-                plant.broken()
-                plant.stated(lambda seen: any(one.name == CLOCK for one in seen.health.alarms), "clock that was set")
-                plant.mended()
-                plant.recovered(lambda seen: seen.well and seen.raised(CLOCK))
-                seen = plant.look()
-                assert seen is not None
-                plant.missing_s += sum(seen.health.quality.refused_blocks.values()) * _FED_S
-            finally:
-                stop.set()
-                publisher.join()
-        plant.away_s = 10 * _FED_S  # until the clock is believed
-
-    return run
-
-
-def _two_publishers(plant: Plant) -> None:
-    plant.pace = 10.0
-    plant.publish("--start", "2026-01-01T00:00:00Z")
-    plant.flowing()
-    second = plant.publish("--start", "2026-01-01T00:00:00Z", run=2)
-    plant.broken()
-    plant.stated(lambda seen: seen.raised(CONFLICT), "two publishers")
-    plant.rest(2.0, 4.0)
-    second.stop()
-    plant.mended()
-    plant.recovered(lambda seen: seen.flowing and not seen.raised(CONFLICT))
-    plant.away_s = 1e6
-
-
-def _through_router(plant: Plant) -> None:
-    plant.connects = True
-    plant.start_router()
-
-
-def _link_cut(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
-    assert plant.router is not None
-    plant.router.kill()
-    plant.broken()
-    plant.stated(_silent, "stream lost")
-    plant.start_router()
-    plant.mended()
-    plant.recovered()
-
-
-def _monitor_killed(plant: Plant) -> None:
-    plant.publish()
-    for _ in range(3):
-        plant.flowing(5)
-        plant.wait_for_orders()
-        plant.rest(0.5, 4.0)
-        plant.end()
-        plant.broken()
-        plant.start()
-        plant.stated(lambda seen: seen.health.restart.startswith("went on where it stood"), "restart")
-        plant.recovered()
-
-
-def _monitor_stopped(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
-    plant.broken()
-    assert plant.end(signal.SIGTERM) == 0
-    plant.start()
-    plant.stated(lambda seen: seen.health.restart.startswith("went on where it stood"), "restart")
-    plant.recovered()
-
-
-def _monitor_stands(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    pause(plant.running)
-    plant.rest(6.0, 8.0)
-    os.kill(plant.running.process.pid, signal.SIGCONT)
-    plant.mended()
-    plant.recovered()
-    plant.rest(1.0, 1.5)
-
-
-def _second_monitor(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.broken()
-    with program(
-        plant.folder, "service.rotorwatch", "run", "--machine", "lab", "--listen", endpoint(), "--http-port", "0",
-        ROTORWATCH_HISTORY__URL=f"sqlite:///{plant.history}",
-    ) as second:  # fmt: skip
-        assert second.process.wait(60) == 1
-        assert "another monitor writes the history of demo/lab" in second.errors()
-    plant.stated_now()
-    plant.mended()
-    plant.recovered()
-
-
-def _unwritable(seen: Seen) -> bool:
-    return not seen.ready and "the history cannot be written" in seen.why_not
-
-
-def _locked(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
-    with locked(plant.history):
-        plant.broken()
-        plant.stated(_unwritable, "history that cannot be written")
-        plant.rest(1.0, 3.0)
-    plant.mended()
-    plant.recovered()
-
-
-def _locked_to_the_end(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    with locked(plant.history):
-        plant.broken()
-        plant.stated(_unwritable, "history that cannot be written")
-        ended = plant.running
-        assert plant.end(signal.SIGTERM) == 1
-        assert "could not be written before the end, and is lost: demo/lab" in ended.errors()
-    plant.orders_may_be_lost = True
-    plant.mended()
-    plant.start()
-    plant.recovered()
-
-
-def _small_disk(plant: Plant) -> None:
-    plant.disk = "40m"  # the history and the log beside it need ten
-
-
-def _disk_full(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.rest(0.5, 2.0)
-    filler = plant.history.with_name("filler")
-    with filler.open("wb", buffering=0) as file, suppress(OSError):
-        while True:
-            file.write(bytes(4096))
-    plant.broken()
-    plant.stated(_unwritable, "full disk")
-    plant.rest(2.0, 4.0)
-    filler.unlink()
-    plant.mended()
-    plant.recovered()
-
-
-def _torn_write(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
-    pid = plant.running.process.pid
-    log = Path(f"{plant.history}-wal")
-    limit = log.stat().st_size + int(plant.rng.integers(100, 3 * _PAGE))
-    resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-    plant.broken()
-    plant.stated(_unwritable, "failing write")
-    plant.end()
-    plant.orders_may_be_lost = True
-    plant.mended()
-    plant.start()
-    plant.recovered()
-
-
-def _deleted(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
-    plant.history.unlink()
-    plant.broken()
-    plant.stated(lambda seen: any(one.name == FAULT for one in seen.health.alarms), "deleted history")
-    plant.mended()
-    plant.recovered(lambda seen: _goes_on(seen) and seen.ready)
-    plant.wait_for_orders()
-    assert plant.history.exists()
-
-
-def _replaced(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
-    other = plant.folder / "other"
-    store = Store(f"sqlite:///{other}", Retention())
-    store.open()
-    store.close()
-    other.rename(plant.history)
-    plant.broken()
-    plant.stated(lambda seen: "another file was put in its place" in seen.why_not, "replaced history")
-    plant.orders_may_be_lost = True
-    plant.mended()
-    plant.recovered(_goes_on)
-    plant.wait_for_orders()
-
-
-def _goes_on(seen: Seen) -> bool:
-    """Monitored and written; that something is gone is said until the monitor is started again."""
-    return seen.flowing and not seen.readiness.history_trouble
-
-
-def _overwrite(file: Path, begin: int) -> None:
-    with file.open("r+b") as data:
-        size = data.seek(0, os.SEEK_END)
-        data.seek(begin)
-        data.write(b"\xa5" * max(0, size - begin))
-
-
-def _damaged_in_use(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
-    _overwrite(plant.history, 0)
-    _overwrite(Path(f"{plant.history}-wal"), 0)
-    plant.broken()
-    plant.stated(lambda seen: "damaged" in seen.why_not, "damaged history")
-    plant.orders_may_be_lost = True
-    plant.mended()
-    plant.recovered(_goes_on)
-    plant.wait_for_orders()
-    assert len(list(plant.history.parent.glob("h.sqlite.damaged-*"))) >= 1
-
-
-def _damaged_at_start(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
-    assert plant.end(signal.SIGTERM) == 0
-    with sqlite3.connect(plant.history) as connection:
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")  # what is overwritten holds everything
-    connection.close()
-    _overwrite(plant.history, _PAGE)
-    plant.broken()
-    plant.start()
-    plant.stated(lambda seen: "damaged" in seen.why_not, "damaged history")
-    plant.orders_may_be_lost = True
-    plant.mended()
-    plant.recovered(_goes_on)
-    plant.away_s = 60.0
-    assert len(list(plant.history.parent.glob("h.sqlite.damaged-*"))) >= 1
-
-
-def _refused_step(plant: Plant) -> None:
-    def reports(value: str) -> None:
-        with sqlite3.connect(plant.history, timeout=60.0) as connection:
-            connection.execute(f"UPDATE machines SET reports = {value} WHERE name = 'lab'")  # noqa: S608  # ours
-        connection.close()
-
-    plant.publish()
-    plant.flowing(60)
-    reports("'many'")
-    plant.broken()
-    plant.stated(lambda seen: "the history does not take what happens" in seen.why_not, "refused step")
-    plant.rest(1.0, 3.0)
-    reports("1000")
-    plant.mended()
-    plant.recovered()
-
-
-def _receiver(plant: Plant) -> None:
-    plant.receiver = plant.undo.enter_context(hook())
-    settings = settings_for(plant.receiver, plant.folder)
-    plant.settings = (
-        f'[[webhooks]]\nname = "pager"\nurl = "{settings.url}"\nsecret_file = "hook.secret"\nlongest_pause_s = 1.0\n'
-    )
-
-
-def _receiver_away(plant: Plant) -> None:
-    receiver, taken = plant.receiver, list[str]()
-    assert receiver is not None
-
-    def take(got: Got) -> tuple[int, Mapping[str, str]]:
-        taken.append(got.id)
-        return 204, {}
-
-    receiver.answer = take
-    plant.publish()
-    plant.flowing()
-    plant.wait_for_orders()
-    receiver.answer = lambda _: (503, {})
-    plant.broken()
-    plant.stated(lambda seen: any("503" in one for one in seen.readiness.failing_webhooks), "failing webhook")
-    plant.wait_for_orders(4)
-    receiver.answer = take
-    plant.mended()
-    plant.recovered(lambda seen: seen.well and not seen.readiness.failing_webhooks)
-    told = [one[0] for one in plant.log()]
-    until(lambda: len(taken) >= len(told), "every event")
-    assert taken[: len(told)] == told
-
-
-def _flood(plant: Plant) -> None:
-    plant.publish()
-    plant.flowing()
-    with open_session(plant.address) as session:
-        feed = Feed(session)
-        plant.broken()
-        until_s = time.monotonic() + plant.rng.uniform(8.0, 10.0)
-        while time.monotonic() < until_s:
-            for _ in range(100):
-                feed.put_raw(plant.rng.bytes(200), b"", "application/octet-stream")
-            if not plant.stated_s and (seen := plant.look()) and sum(seen.health.quality.refused_blocks.values()):
-                plant.stated_now()
-        plant.mended()
-    plant.recovered(lambda seen: seen.well and sum(seen.health.quality.refused_blocks.values()) > 1000)
-
-
 ROWS = (
     Row(
         "The publisher is killed and started again",
@@ -435,7 +45,7 @@ ROWS = (
         "what nobody measured meanwhile",
         "alarm `stream-lost`, state `no-data`",
         "data come, the alarm has cleared",
-        _publisher_killed,
+        faults.publisher_killed,
     ),
     Row(
         "The publisher stands still",
@@ -443,7 +53,7 @@ ROWS = (
         _NOTHING,
         "alarm `stream-lost`, state `no-data`",
         "data come, the alarm has cleared",
-        _publisher_stands,
+        faults.publisher_stands,
     ),
     Row(
         "The publisher is started again an hour later by its clock",
@@ -451,7 +61,7 @@ ROWS = (
         "what nobody measured meanwhile, by the data's own clock",
         "`last_gap` in health: publisher restarted; no alarm on the clock",
         "data come, no alarm stands",
-        _restarted_at(3600.0),
+        faults.restarted_at(3600.0),
     ),
     Row(
         "The publisher is started again an hour earlier by its clock",
@@ -459,7 +69,7 @@ ROWS = (
         "what nobody measured meanwhile",
         "`last_gap` in health: publisher restarted; no alarm on the clock",
         "data come, no alarm stands",
-        _restarted_at(-3600.0),
+        faults.restarted_at(-3600.0),
     ),
     Row(
         "The publisher's clock is set forward",
@@ -467,7 +77,7 @@ ROWS = (
         "nine blocks, until the new time is believed (`resync_blocks`)",
         "alarm `data-clock`",
         "data are evaluated at the new time",
-        _clock_set(3600.0),
+        faults.clock_set(3600.0),
     ),
     Row(
         "The publisher's clock is set back",
@@ -475,7 +85,7 @@ ROWS = (
         "nine blocks, until the new time is believed (`resync_blocks`)",
         "alarm `data-clock`",
         "data are evaluated at the new time",
-        _clock_set(-3600.0),
+        faults.clock_set(-3600.0),
     ),
     Row(
         "Two publishers send on one machine's key",
@@ -483,7 +93,7 @@ ROWS = (
         "blocks of either, while both send; what is missing is then counted more than once",
         "alarm `data-conflict`, which names both runs",
         "the alarm has cleared, 300 s of data after the second one has stopped",
-        _two_publishers,
+        faults.two_publishers,
     ),
     Row(
         "The network link is cut",
@@ -491,8 +101,8 @@ ROWS = (
         "nothing, as long as the publisher's cache (300 blocks, here 60 s) holds what was not sent",
         "alarm `stream-lost`, state `no-data`",
         "data come, the alarm has cleared",
-        _link_cut,
-        _through_router,
+        faults.link_cut,
+        faults.through_router,
     ),
     Row(
         "The monitor is killed, three times",
@@ -500,7 +110,7 @@ ROWS = (
         "nothing that the publisher's cache still holds",
         "`restart` in health: went on where it stood",
         "data come, and what was sent meanwhile has come out of the publisher's cache",
-        _monitor_killed,
+        faults.monitor_killed,
     ),
     Row(
         "The monitor is stopped in order",
@@ -508,7 +118,7 @@ ROWS = (
         "nothing that the publisher's cache still holds",
         "exit code 0; `restart` in health: went on where it stood",
         "data come, and what was sent meanwhile has come out of the publisher's cache",
-        _monitor_stopped,
+        faults.monitor_stopped,
     ),
     Row(
         "The monitor stands still",
@@ -516,7 +126,7 @@ ROWS = (
         _NOTHING,
         "nothing: no stream is called lost",
         "what was sent meanwhile is evaluated",
-        _monitor_stands,
+        faults.monitor_stands,
     ),
     Row(
         "A second monitor of the same machine and history is started",
@@ -524,7 +134,7 @@ ROWS = (
         _NOTHING,
         "the second one ends with exit code 1 and says why",
         "the first one has noticed nothing",
-        _second_monitor,
+        faults.second_monitor,
     ),
     Row(
         "The history is locked by another program",
@@ -532,7 +142,7 @@ ROWS = (
         _NOTHING,
         "`/readyz` 503: the history cannot be written, what happens waits in memory",
         "`/readyz` 200",
-        _locked,
+        faults.history_locked,
         is_cheap=True,
     ),
     Row(
@@ -541,7 +151,7 @@ ROWS = (
         "what happened since the lock was taken: operators' actions and reports",
         "`/readyz` 503; exit code 1, and what is lost in words",
         "started again, the monitor goes on from before",
-        _locked_to_the_end,
+        faults.locked_to_the_end,
     ),
     Row(
         "The disk is full",
@@ -549,8 +159,8 @@ ROWS = (
         _NOTHING,
         "`/readyz` 503: the history cannot be written, what happens waits in memory",
         "`/readyz` 200",
-        _disk_full,
-        _small_disk,
+        faults.disk_full,
+        faults.small_disk,
     ),
     Row(
         "A write fails in the middle of a commit, and the monitor is killed",
@@ -558,7 +168,7 @@ ROWS = (
         "what happened since the write failed",
         "`/readyz` 503: the history cannot be written, what happens waits in memory",
         "started again, the monitor goes on from the last whole commit",
-        _torn_write,
+        faults.torn_write,
     ),
     Row(
         "The history is deleted",
@@ -566,7 +176,7 @@ ROWS = (
         _NOTHING,
         "alarm `monitor-fault`, and in the log that the history goes on in a new file with all it held",
         "the file is there again, `/readyz` 200",
-        _deleted,
+        faults.deleted,
         is_cheap=True,
     ),
     Row(
@@ -575,7 +185,7 @@ ROWS = (
         "what was in the former file; numbers of alarm events go on",
         "alarm `monitor-fault`; `/readyz` 503 until the monitor is started again",
         "data are evaluated and written",
-        _replaced,
+        faults.replaced,
     ),
     Row(
         "The history is damaged while it is in use",
@@ -583,7 +193,7 @@ ROWS = (
         "what was in the file, which is kept aside",
         "alarm `monitor-fault`; `/readyz` 503 until the monitor is started again",
         "data are evaluated and written",
-        _damaged_in_use,
+        faults.damaged_in_use,
     ),
     Row(
         "The history is damaged at the start",
@@ -591,7 +201,7 @@ ROWS = (
         "what was in the file, which is kept aside",
         "`/readyz` 503 until the monitor is started again; alarm `monitor-fault`",
         "data are evaluated and written",
-        _damaged_at_start,
+        faults.damaged_at_start,
     ),
     Row(
         "The history refuses the steps of one machine",
@@ -599,7 +209,7 @@ ROWS = (
         _NOTHING,
         "`/readyz` 503: the history does not take what happens",
         "`/readyz` 200",
-        _refused_step,
+        faults.refused_step,
     ),
     Row(
         "A webhook's receiver is away",
@@ -607,8 +217,8 @@ ROWS = (
         _NOTHING,
         "`failing_webhooks` in `/readyz`, which stays 200",
         "every event has arrived, in order",
-        _receiver_away,
-        _receiver,
+        faults.receiver_away,
+        faults.receiver,
     ),
     Row(
         "A flood of bad messages",
@@ -616,6 +226,6 @@ ROWS = (
         _NOTHING,
         "`refused_blocks` in health",
         "all good blocks were evaluated",
-        _flood,
+        faults.flood,
     ),
 )
