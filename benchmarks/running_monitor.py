@@ -78,7 +78,8 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
         **settings,
     }
     run = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", sys.executable, "-m"]
-    send = [sys.executable, "-m", "simulator.rotorsim", "publish", "--pace", "1", "--connect", endpoint, *publish]
+    send = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", endpoint]
+    send += ["--wait-for-subscriber", "120", *publish]
     out, log, published = folder / "out", folder / "log", folder / "published"
     with out.open("wb") as output, log.open("wb") as errors, published.open("wb") as sent:
         process = subprocess.Popen(
