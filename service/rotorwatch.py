@@ -27,6 +27,7 @@ from service.commands.running import (
     exit_codes,
     one_blas_thread,
     raise_file_limit,
+    share_memory_arenas,
 )
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
@@ -97,6 +98,7 @@ def run(
         check_address_space()
         one_blas_thread()
         raise_file_limit()
+        share_memory_arenas()
         from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
         from service.logs import configure_logging  # noqa: PLC0415
         from service.runtime import running  # noqa: PLC0415  # must see the variables set above

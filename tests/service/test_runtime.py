@@ -1,6 +1,9 @@
 """The running service: what it says equals what the monitor says offline, silence, errors, start and stop."""
 
 import json
+import platform
+import subprocess
+import sys
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -30,6 +33,7 @@ from simulator.scenario import parse_fault
 from tests.service.live import (
     IN_MEMORY,
     OPEN,
+    ROOT,
     Feed,
     endpoint,
     machine_file,
@@ -263,3 +267,35 @@ def test_health_over_http_is_the_health_on_the_topic() -> None:
         ).json()
         on_topic = json.loads(topics.texts("/health")[-1])
         assert over_http == on_topic
+
+
+_ARENAS = """
+import sys, threading
+from pathlib import Path
+from service.commands.running import share_memory_arenas
+def size_mb():
+    return int(Path("/proc/self/statm").read_text().split()[0]) * 4096 / 1e6
+if sys.argv[1] == "shared":
+    share_memory_arenas()
+threading.stack_size(2**20)
+before_mb, barrier, done = size_mb(), threading.Barrier(9), threading.Event()
+def work():
+    held = [bytearray(50_000) for _ in range(10)]
+    barrier.wait()
+    done.wait()
+threads = [threading.Thread(target=work) for _ in range(8)]
+for thread in threads:
+    thread.start()
+barrier.wait()
+print(size_mb() - before_mb)
+done.set()
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no arenas")
+def test_threads_keep_no_memory_of_their_own() -> None:
+    grown_mb = {}
+    for how in ("own", "shared"):
+        run = subprocess.run([sys.executable, "-c", _ARENAS, how], cwd=ROOT, capture_output=True, text=True, check=True)
+        grown_mb[how] = float(run.stdout)
+    assert grown_mb["shared"] < 100 < 200 < grown_mb["own"]  # an arena takes 64 MB of the address space
