@@ -55,6 +55,11 @@ class MachineMonitor:
     ----------
     installed : Installed
         The machine file, and what was trained and commissioned for the machine.
+
+    Attributes
+    ----------
+    used : bool
+        Whether the latest message was itself used at once, and not one that waited for it.
     """
 
     def __init__(self, installed: Installed) -> None:
@@ -85,6 +90,8 @@ class MachineMonitor:
         self._defect: Exception | None = None
         self._statistics: WindowStatistics | None = None
         self._newest = NewestBlocks(_NEWEST_SAMPLES)
+        self._used: SampleBlock | None = None
+        self.used = False
         self._most_samples = math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
 
     def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
@@ -127,6 +134,7 @@ class MachineMonitor:
             Undecodable bytes are a refusal like any other.
         """
         self._dropped += dropped_before
+        self.used = False
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
@@ -142,7 +150,9 @@ class MachineMonitor:
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
         self._due.extend(self._arrivals.take(block, schema_hash))
-        return self._step_due()
+        done = self._step_due()
+        self.used = self._used is block
+        return done
 
     def flush(self) -> tuple[MonitorReport, ...]:
         """Take the blocks that wait for earlier ones: those will not come any more."""
@@ -187,6 +197,7 @@ class MachineMonitor:
         if not verdict.accepted:
             self._dropped += dropped
             return MonitorReport(verdict)
+        self._used = block
         windows: list[WindowReport] = []
         try:
             for end_ns in self._hops(block, verdict, dropped):

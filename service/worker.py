@@ -382,7 +382,7 @@ class MachineWorker:
         reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
         tally = self.tally
         self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
-        if reports and reports[-1].verdict.accepted:
+        if self._monitor.used:
             self.inbox.follow(block)
         self._conclude_reports(reports)
 

@@ -182,6 +182,20 @@ def test_what_may_be_a_block_of_the_machine_is_known_by_its_form(
     assert not monitor.could_use(payload[1:], attachment, encoding)
 
 
+def test_a_forged_block_that_lets_true_ones_go_on_is_not_the_one_that_was_used() -> None:
+    monitor, ours = MachineMonitor(install(LAB, None)), scenario_blocks(3.0)
+    for one in ours[:5]:
+        monitor.step_payload(*encode_block(one, ""))
+        assert monitor.used
+    for one in ours[6:26]:  # wait for the missing one
+        monitor.step_payload(*encode_block(one, ""))
+        assert not monitor.used
+    forged = replace(ours[0], sequence=90_000)
+    reports = monitor.step_payload(*encode_block(forged, ""))
+    assert any(report.verdict.accepted for report in reports)
+    assert not monitor.used
+
+
 # Floods
 
 
