@@ -14,6 +14,7 @@ A repetition changes nothing but the count of refused blocks, whenever it comes:
 stream, also those of earlier runs and from before a clock was set, and those it did not believe.
 """
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,9 +23,10 @@ from enum import StrEnum
 import numpy as np
 
 from models.checkpoint import checked
-from models.errors import CheckpointError
+from models.errors import CheckpointError, WireError
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
+from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 
 __all__ = ["EARLIER_COURSES", "Course", "Gate", "Reason", "Verdict"]
 
@@ -142,6 +144,7 @@ class Gate:
         self._n_channels = len(machine.sensors)
         self._names = tuple(channel.name for channel in machine.sensors)
         self._schema_hash = machine.descriptor.schema_hash
+        self._most_samples = math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
         self._tolerance_ns = round(machine.ingest.time_tolerance_s * 1e9)
         self._expected: Course | None = None
         self._candidate: Course | None = None
@@ -152,6 +155,26 @@ class Gate:
     def courses(self) -> tuple[Course, ...]:
         """What was accepted, the present course last; empty before the first block."""
         return (*self._earlier, *(() if self._expected is None else (self._expected,)))
+
+    def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
+        """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
+
+        Takes microseconds and changes nothing: any thread may ask.
+
+        Parameters
+        ----------
+        payload, attachment, encoding : bytes, bytes, str
+            See `models.signals.wire`.
+        """
+        if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
+            return False
+        if encoding.startswith(ARROW_ENCODING):
+            return True
+        try:
+            block, schema_hash = decode_block(payload, attachment, encoding)
+        except WireError:
+            return False
+        return self.form(block, schema_hash) is None
 
     def judge(self, block: SampleBlock, schema_hash: str = "") -> Verdict:
         """Accept or refuse a block.

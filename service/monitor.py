@@ -10,8 +10,7 @@ of feeding it, and the same blocks give the same reports. What it remembers can 
 into another one, which goes on as if nothing had happened.
 """
 
-import math
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 
@@ -32,7 +31,7 @@ from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Gate, Reason, Verdict
 from models.senders import Senders
 from models.signals.block import NewestBlocks, SampleBlock
-from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
+from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState
 from service.alarms.alarm import AlarmEvent, Evidence
@@ -78,7 +77,6 @@ class MachineMonitor:
         self._alarms = AlarmBook(machine.alarms)
         self._data_path = DataPathAlarms(self._alarms, machine)
         self._quality = DataQuality()
-        self._refused: Counter[str] = Counter()
         self._latest: WindowReport | None = None
         self._calm = HealthState.WARMING
         self._end_ns: int | None = None
@@ -92,28 +90,7 @@ class MachineMonitor:
         self._newest = NewestBlocks(_NEWEST_SAMPLES)
         self._used: SampleBlock | None = None
         self.used = False
-        self._most_samples = math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
-
-    def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
-        """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
-
-        Takes microseconds and changes nothing: any thread may ask.
-
-        Parameters
-        ----------
-        payload, attachment, encoding : bytes, bytes, str
-            See `models.signals.wire`.
-        """
-        n_channels = len(self.machine.sensors)
-        if not may_be_block(payload, attachment, encoding, n_channels, self._most_samples):
-            return False
-        if encoding.startswith(ARROW_ENCODING):
-            return True
-        try:
-            block, schema_hash = decode_block(payload, attachment, encoding)
-        except WireError:
-            return False
-        return self._gate.form(block, schema_hash) is None
+        self.could_use = self._gate.could_use
 
     def step_payload(
         self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
@@ -395,21 +372,7 @@ class MachineMonitor:
         return self._count(verdict)
 
     def _count(self, verdict: Verdict) -> Verdict:
-        quality = self._quality
-        if verdict.reason is not None:
-            self._refused[verdict.reason] += 1
-            self._quality = replace(quality, refused=tuple(sorted(self._refused.items())), last_refusal=verdict.text)
-        elif verdict.continuous:
-            self._quality = replace(quality, accepted=quality.accepted + 1)
-        else:
-            missing_s = quality.missing_s + verdict.gap_s
-            self._quality = replace(
-                quality,
-                accepted=quality.accepted + 1,
-                gaps=quality.gaps + 1,
-                missing_s=missing_s,
-                last_gap=verdict.text,
-            )
+        self._quality = self._quality.counted(verdict)
         return verdict
 
     def _evaluate(self, end_ns: int) -> WindowReport:

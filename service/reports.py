@@ -1,6 +1,6 @@
 """What a monitor says: of one window, of one block, of the machine; and what it remembers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.readings import EquationReading, ParameterReading
@@ -41,6 +41,18 @@ class DataQuality:
     missing_s: float = 0.0
     last_refusal: str = ""
     last_gap: str = ""
+
+    def counted(self, verdict: Verdict) -> "DataQuality":
+        """Return the same after one more block."""
+        if verdict.reason is not None:
+            refused = dict(self.refused)
+            refused[verdict.reason] = refused.get(verdict.reason, 0) + 1
+            return replace(self, refused=tuple(sorted(refused.items())), last_refusal=verdict.text)
+        accepted = self.accepted + 1
+        if verdict.continuous:
+            return replace(self, accepted=accepted)
+        missing_s = self.missing_s + verdict.gap_s
+        return replace(self, accepted=accepted, gaps=self.gaps + 1, missing_s=missing_s, last_gap=verdict.text)
 
 
 @dataclass(frozen=True, slots=True)
