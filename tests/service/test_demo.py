@@ -70,7 +70,16 @@ def check_lines(output: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("fault", "seed"), [("k_by", 101), ("c_by", 102), ("k_bz", 103), ("c_bz", 104), ("e", 105)])
+@pytest.mark.parametrize(
+    ("fault", "seed"),
+    [
+        ("k_by", 101),
+        *(
+            pytest.param(*one, marks=pytest.mark.long)
+            for one in (("c_by", 102), ("k_bz", 103), ("c_bz", 104), ("e", 105))
+        ),
+    ],
+)
 def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int, tmp_path: Path) -> None:
     process = demo(tmp_path / "tmp", "--fault", fault, "--seed", str(seed), "--once")
     output, _ = process.communicate(timeout=600)
@@ -123,8 +132,8 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
     ("number", "whose", "code"),
     [
         (signal.SIGINT, "demo", 130),
-        (signal.SIGTERM, "demo", 130),
-        (signal.SIGKILL, "demo", -signal.SIGKILL),
+        pytest.param(signal.SIGTERM, "demo", 130, marks=pytest.mark.long),
+        pytest.param(signal.SIGKILL, "demo", -signal.SIGKILL, marks=pytest.mark.long),
         (signal.SIGKILL, "monitor", 1),
     ],
 )

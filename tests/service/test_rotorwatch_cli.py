@@ -110,28 +110,10 @@ def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Pat
         assert started.process.wait(180) == 0
 
 
-def test_used_addresses_are_run_time_errors_that_name_them() -> None:
-    address = endpoint()
-    with service(address) as (runtime, _):
-        zenoh = run("run", "--machine", "lab", "--listen", address, "--http-port", "0")
-        port = runtime.http_url.rsplit(":", 1)[1]
-        http = run("run", "--machine", "lab", "--listen", endpoint(), "--http-port", port)
-    for found, named in ((zenoh, address), (http, f"127.0.0.1 port {port}: ")):
-        assert found.returncode == 1
-        assert named in found.stderr
-        assert found.stdout == ""
-        assert "Traceback" not in found.stderr
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         (("run", "--config", "missing.toml"), "missing.toml"),
-        (("run", "--machine", "pump"), "pump"),
-        (("run", "--machine", "lab@nowhere"), "nowhere"),
-        (("run", "--machine", "heavy@lab"), "lab"),
-        (("run", "--machine", "lab", "--machine", "lab"), "command line: machines: lab and lab both describe"),
-        (("watch", "--machine", "lab"), "--machine is 'lab', expected SITE/MACHINE"),
         (("check-config", "missing.toml"), "missing.toml"),
     ],
 )

@@ -61,6 +61,7 @@ def test_the_healthy_disc_moves_as_much_stochastically_as_at_1x(plan: StudyPlan)
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_the_study_counts_every_window_and_writes_numbers_figures_and_page(plan: StudyPlan, tmp_path: Path) -> None:
     done: dict[str, tuple[int, int]] = {}
     study = run_study(plan, 1, lambda label, n, total: done.__setitem__(label, (n, total)))
