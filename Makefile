@@ -21,6 +21,8 @@ SEED ?= 1
 PACE ?= 10
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Tests start many programs; what they import is compiled once.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: setup demo test quick long lint types contracts tests format wheels floors train clean
 

@@ -82,7 +82,7 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("layout", Layout)
+@pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
 def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
     """Size and direction of 24 windows: rms of z within 1 + 4/√48, but for a tenth."""
     z = []

@@ -17,7 +17,7 @@ from simulator.scenario import load_scenario
 from tests.service.live import endpoint, until
 
 ROOT = Path(__file__).parents[2]
-HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "600"))
+HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "200"))
 
 
 def start(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:

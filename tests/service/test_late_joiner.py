@@ -16,7 +16,7 @@ from service.store.retention import Retention
 from service.store.store import Store
 from tests.service.live import ROOT, endpoint, until
 
-KILLS = int(os.environ.get("ROTORWATCH_KILLS", "40"))
+KILLS = int(os.environ.get("ROTORWATCH_KILLS", "12"))
 MONITOR_KILLS = 3
 
 

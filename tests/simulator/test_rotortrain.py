@@ -23,7 +23,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_train_writes_a_bundle_that_fits_the_machine_and_evaluate_reads_it(tmp_path: Path) -> None:
+def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
     out = tmp_path / "bundle"
     size = ("--windows", "20", "--draws", "2000")
     done = run("train", "--machine", "lab", "--out", str(out), *size, "--seed", "4", "--processes", "2")
@@ -32,11 +32,16 @@ def test_train_writes_a_bundle_that_fits_the_machine_and_evaluate_reads_it(tmp_p
     assert "written to" in done.stdout
     bundle = load_bundle(out, load_machine("lab"))
     assert bundle.manifest.training.training_windows == 20
+    assert bundle.amortised is not None
+
+
+@pytest.mark.long
+def test_evaluate_reads_a_bundle(tmp_path: Path) -> None:
     results = tmp_path / "evaluation"
-    done = run("evaluate", "-m", "lab", "-b", str(out), "--windows", "2", "--fault", "0.25", "--out", str(results))
+    done = run("evaluate", "-m", "lab", "-b", "lab", "--windows", "2", "--fault", "0.25", "--out", str(results))
     assert done.returncode == 0, done.stderr
     (summary,) = read_summaries(results)
-    assert summary.campaign.bundle == bundle.identity
+    assert summary.campaign.bundle == load_bundle("lab", load_machine("lab")).identity
     assert {cell.topic for cell in summary.cells} == {Topic.HEALTHY, Topic.SMALL}
     independent = summary.of(Topic.SMALL, layout=Layout.INDEPENDENT)[0].opinions["likelihood"]
     one = independent.parameter("k_by")
