@@ -12,6 +12,7 @@ from models.machine import load_machine
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluate_command import read_summaries
 from simulator.campaigns.evaluation_cells import Topic
+from tests.service.live import machine_file
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,13 +25,14 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
-    out = tmp_path / "bundle"
+    """With windows of a third of the usual length: most of the time goes into simulating them."""
+    out, file = tmp_path / "bundle", machine_file(tmp_path, ("length_s = 60.0", "length_s = 20.0"))
     size = ("--windows", "20", "--draws", "2000")
-    done = run("train", "--machine", "lab", "--out", str(out), *size, "--seed", "4", "--processes", "2")
+    done = run("train", "--machine", file, "--out", str(out), *size, "--seed", "4", "--processes", "2")
     assert done.returncode == 0, done.stderr
     assert "(28) bearing" in done.stdout
     assert "written to" in done.stdout
-    bundle = load_bundle(out, load_machine("lab"))
+    bundle = load_bundle(out, load_machine(file))
     assert bundle.manifest.training.training_windows == 20
     assert bundle.amortised is not None
 
