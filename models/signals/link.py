@@ -68,6 +68,9 @@ class LinkSettings(BaseModel):
     listen: tuple[str, ...] = Field(default=(), description='endpoints to listen on, as "tcp/127.0.0.1:7447"')
     connect: tuple[str, ...] = Field(default=(), description='endpoints to connect to, as "tcp/127.0.0.1:7447"')
     shared_memory: bool = Field(default=False, description="let Zenoh move payloads through shared memory")
+    max_message_mb: float = Field(
+        default=16.0, gt=0, le=1000, description="most megabytes of a message; larger ones are dropped unread"
+    )
     namespace: str = Field(
         default="",
         pattern=NAMESPACE_PATTERN,
@@ -167,6 +170,8 @@ class LinkSettings(BaseModel):
             "scouting/gossip/enabled": "false",
             "timestamping/enabled": "true",
             "transport/shared_memory/enabled": json.dumps(self.shared_memory),
+            # Up to 256 messages wait in each of Zenoh's queues, and by itself it takes a gigabyte each.
+            "transport/link/rx/max_message_size": str(round(self.max_message_mb * 1e6)),
         }
         if self.namespace:
             items["namespace"] = json.dumps(self.namespace)

@@ -4,13 +4,14 @@ import json
 import struct
 import threading
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import structlog
+import zenoh
 
 from models.alarm_names import CONFLICT, STREAM_LOST, of_the_machine
 from models.commissioning.installed import install
@@ -284,6 +285,19 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
 
 
 # Replays
+
+
+def test_a_message_larger_than_any_block_is_not_taken_and_ends_no_link() -> None:
+    address, key = endpoint(), LAB.keys.stream
+    sizes: list[int] = []
+    with closing(Link(LinkSettings(listen=(address,), max_message_mb=2.0))) as link, ExitStack() as stack:
+        link.session.declare_subscriber(key, lambda sample: sizes.append(len(sample.payload)))
+        sender = stack.enter_context(open_session(address))
+        for size in (4_000_000, 1_900_000, 3_000_000):
+            sender.put(key, bytes(size), congestion_control=zenoh.CongestionControl.BLOCK)
+        sender.put(key, b"last", congestion_control=zenoh.CongestionControl.BLOCK)
+        until(lambda: 4 in sizes, "the last message")
+    assert sizes == [1_900_000, 4]
 
 
 @pytest.mark.parametrize("first", ["monitor", "token"])
