@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from subprocess import SubprocessError
 
-from tests.faults.plant import BLOCK_S, Plant, plant
+from tests.faults.rig import BLOCK_S, Plant, plant
 from tests.faults.scenarios import Row
 
 __all__ = ["Outcome", "carried_out"]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tests.faults import faults
-from tests.faults.plant import Plant
+from tests.faults.rig import Plant
 
 __all__ = ["ROWS", "Row"]
 

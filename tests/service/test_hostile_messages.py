@@ -90,7 +90,7 @@ def test_health_stays_small_whatever_is_sent() -> None:
         payload, header = b"\0" * 7200, b"\0" * 32
         feed.put_raw(payload, header, f"{BLOCK_ENCODING};" + "z" * 200)
         feed.put(feed.block(), "h" * 200)
-        session.put(LAB.keys.descriptor, empty_channels(300_000))
+        session.put(LAB.keys.descriptor, empty_channels(300_000), congestion_control=zenoh.CongestionControl.BLOCK)
         until(lambda: sum(worker.health().quality.refused_blocks.values()) == 4, "refusals")
         until(lambda: worker.health().stream.descriptor_mismatch != (), "the descriptor")
         assert len(worker.health().model_dump_json()) < 100 * KB

@@ -117,7 +117,7 @@ def test_a_service_with_a_defect_is_not_ready_and_says_of_which_machine(
         (reason,) = answer.json()["reasons"]
         assert reason.startswith("demo/lab: ")
         assert DEFECT in reason
-        assert worker.errors == worker.tally.windows - 11  # windows that were full
+        until(lambda: worker.errors == worker.tally.windows - 11, "an error for each window that was full")
 
 
 def test_what_the_history_refuses_of_one_machine_is_that_machines(
