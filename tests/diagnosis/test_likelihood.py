@@ -147,7 +147,7 @@ def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: La
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("excitation", [Excitation.FOURTH_ORDER, Excitation.HUMP])
+@pytest.mark.parametrize("excitation", [Excitation.FOURTH_ORDER, pytest.param(Excitation.HUMP, marks=pytest.mark.long)])
 def test_excitation_the_model_was_not_told_about(excitation: Excitation) -> None:
     draw = Draw(load_machine("lab"), SEED, Purpose.EVALUATION, 2, layout=Layout.INDEPENDENT, excitation=excitation)
     z, diagnoses = read(draw, range(16), {})

@@ -73,7 +73,7 @@ def check_lines(output: str) -> None:
 @pytest.mark.parametrize(
     ("fault", "seed"),
     [
-        ("k_by", 101),
+        pytest.param("k_by", 101, marks=pytest.mark.long),
         *(
             pytest.param(*one, marks=pytest.mark.long)
             for one in (("c_by", 102), ("k_bz", 103), ("c_bz", 104), ("e", 105))

@@ -204,6 +204,7 @@ def goal(summary: Summary, beginning: str) -> Goal:
     return found
 
 
+@pytest.mark.long
 def test_goals_are_met_where_errors_are_as_stated_and_missed_where_they_are_not() -> None:
     honest, wide = of_everything(n=200), of_everything(n=200, scale=1.6)
     spread = "likelihood: spread of k_by, independent sources"
@@ -239,6 +240,7 @@ def test_false_alarms_are_judged_by_their_interval() -> None:
     assert judged(20).measured.endswith("20 of 400)")
 
 
+@pytest.mark.long
 def test_the_page_has_every_table_and_figure_and_says_what_was_missed(tmp_path: Path) -> None:
     summaries = [of_everything(n=8, machine="light"), of_everything(n=8, scale=3)]
     figures = tmp_path / "figures"

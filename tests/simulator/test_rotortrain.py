@@ -12,6 +12,7 @@ from models.machine import load_machine
 from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluate_command import read_summaries
 from simulator.campaigns.evaluation_cells import Topic
+from simulator.campaigns.train_command import train_for
 from tests.service.live import machine_file
 
 ROOT = Path(__file__).parents[2]
@@ -24,6 +25,17 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+def test_training_writes_a_bundle_that_the_machine_takes(tmp_path: Path) -> None:
+    """As the command does it, with fewer windows than it admits."""
+    machine = load_machine(machine_file(tmp_path, ("length_s = 60.0", "length_s = 20.0")))
+    train_for(machine, tmp_path / "bundle", 6, 200, 4, 1)
+    bundle = load_bundle(tmp_path / "bundle", machine)
+    assert bundle.amortised is not None
+    assert {one.equation.number for one in bundle.networks} == {"28", "29", "30", "31"}
+
+
+@pytest.mark.slow
+@pytest.mark.long
 def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
     """With windows of a third of the usual length: most of the time goes into simulating them."""
     out, file = tmp_path / "bundle", machine_file(tmp_path, ("length_s = 60.0", "length_s = 20.0"))

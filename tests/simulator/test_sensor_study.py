@@ -14,6 +14,7 @@ SEED = 88
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_faults_are_found_and_not_taken_for_the_machines() -> None:
     plan = SensorPlan(("lab",), (KnowledgeLevel.FULL,), SEED, windows=2, healthy=2)
     records = run_sensors(plan, 1, lambda *_: None)
