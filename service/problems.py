@@ -210,9 +210,7 @@ class _LastResort:
 
         try:
             await self._app(scope, receive, watched)
-        except Exception:
-            # Nothing narrower: refusals and invalid requests were answered further in, what arrives here is an error
-            # in any code behind any path. Each must be a 500 in problem details that tells nothing of the inside.
+        except Exception:  # an error of any kind behind any path must be a 500 that tells nothing of the inside
             request = Request(scope, receive)
             _log.exception("request failed", path=request.url.path)
             if begun:

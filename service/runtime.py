@@ -300,9 +300,7 @@ class _Supervisor:
                     pulse.beat()
                     worker.tick()
                     self._look(number, worker, link)
-                except Exception:
-                    # Nothing narrower: an error of any kind, Zenoh's while publishing or one in making up the health,
-                    # would end this thread, and with it the notice of silence for every machine.
+                except Exception:  # of any kind: it would end the thread that notices the silence of every machine
                     _log.exception("health could not be published", machine=worker.machine.name)
             if self._stop.wait(_TICK_S):
                 return

@@ -146,9 +146,7 @@ class Link:
         def call(argument: _T) -> None:
             try:
                 callback(argument)
-            except Exception:
-                # Nothing narrower: this is the last frame of ours on Zenoh's thread, and Zenoh prints what escapes a
-                # callback and goes on, so an error of any kind would be missing from log and count.
+            except Exception:  # the last frame of ours: Zenoh prints what escapes, and log and count would miss it
                 self._errors += 1
                 _log.exception("error in a callback")
 

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import exit_codes
+from service.commands.running import HistoryOption, exit_codes
 
 if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
     from service.config import HistorySettings
@@ -26,11 +26,6 @@ if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
 __all__ = ["creation_hint", "register"]
 
 _PAGE = 500
-
-_ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts."),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -52,7 +47,7 @@ def create(
     days: Annotated[
         int | None, typer.Option("--days", metavar="DAYS", help="How long it holds; until it is revoked if left out.")
     ] = None,
-    config: _ConfigOption = None,
+    config: HistoryOption = None,
 ) -> None:
     """Create a token and show it, once: only a hash of it is kept.
 
@@ -107,7 +102,7 @@ def creation_hint(config: Path | None, history: "HistorySettings") -> str:
     return f"{said}: {prefix}{shlex.join(command)}"
 
 
-def list_(config: _ConfigOption = None) -> None:
+def list_(config: HistoryOption = None) -> None:
     """Show every token there ever was, and which hold.
 
     [bold]Example[/bold]
@@ -138,7 +133,7 @@ def list_(config: _ConfigOption = None) -> None:
 
 def revoke(
     token: Annotated[str, typer.Argument(metavar="ID", help="Public part of the token, from: rotorwatch token list.")],
-    config: _ConfigOption = None,
+    config: HistoryOption = None,
 ) -> None:
     """Revoke a token: it is refused from the next request on.
 
@@ -170,7 +165,7 @@ def audit(
     ] = None,
     actor: Annotated[str | None, typer.Option("--actor", metavar="NAME", help="Only what this user did.")] = None,
     limit: Annotated[int, typer.Option("--limit", min=1, max=100_000, help="At most this many, the newest.")] = 50,
-    config: _ConfigOption = None,
+    config: HistoryOption = None,
 ) -> None:
     """Show who did what over HTTP, and who was refused; newest first, times in UTC.
 

@@ -6,17 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import exit_codes
+from service.commands.running import HistoryOption, exit_codes
 
 if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
     from service.store.database import Database
 
 __all__ = ["register"]
-
-_ConfigOption = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts."),
-]
 
 
 def register(app: typer.Typer) -> None:
@@ -28,7 +23,7 @@ def register(app: typer.Typer) -> None:
     app.add_typer(history, name="history")
 
 
-def check(config: _ConfigOption = None) -> None:
+def check(config: HistoryOption = None) -> None:
     """Look through the whole file, also while a monitor runs; exit code 1 if it is damaged.
 
     [bold]Example[/bold]
@@ -48,7 +43,7 @@ def check(config: _ConfigOption = None) -> None:
 
 
 def backup(
-    copy: Annotated[Path, typer.Argument(metavar="FILE", help="New file.")], config: _ConfigOption = None
+    copy: Annotated[Path, typer.Argument(metavar="FILE", help="New file.")], config: HistoryOption = None
 ) -> None:
     """Copy the history, also while a monitor runs, and check the copy.
 
@@ -68,7 +63,7 @@ def backup(
 
 def restore(
     backup_file: Annotated[Path, typer.Argument(metavar="FILE", help="From: rotorwatch history backup.")],
-    config: _ConfigOption = None,
+    config: HistoryOption = None,
 ) -> None:
     """Put a backup in the place of the history; the monitor must be stopped. The former file is kept.
 

@@ -18,6 +18,7 @@ __all__ = [
     "Commands",
     "ConnectOption",
     "FromOption",
+    "HistoryOption",
     "LinkOption",
     "ListenOption",
     "ToOption",
@@ -40,6 +41,10 @@ _ADDRESS_SPACE_MB = 2_000
 _OF_A_MACHINE_MB = 100
 """Little of it is memory: stacks of threads and what libraries set aside."""
 
+HistoryOption = Annotated[
+    Path | None,
+    typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts."),
+]
 ConnectOption = Annotated[
     list[str] | None,
     typer.Option("--connect", metavar="ENDPOINT", help="Zenoh endpoint to connect to, as a client. Repeatable."),

@@ -25,7 +25,7 @@ from models.machine import Machine
 from models.physics.matrices import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 
-__all__ = ["FeatureVector", "Peer", "SubspaceModes", "hotelling_limit", "reference_modes", "score_limit"]
+__all__ = ["FeatureVector", "Peer", "SubspaceModes", "reference_modes", "score_limit"]
 
 _MORE_ORDERS = 16
 """Model orders from twice the number of modes to this many above it, as in a stabilisation diagram; the median over
@@ -87,14 +87,6 @@ def score_limit(healthy_scores: FloatArray, false_alarm_rate: float) -> float:
             f"{int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1}"
         )
     return float(np.sort(healthy_scores)[rank - 1])
-
-
-def hotelling_limit(n_windows: int, n_features: int, false_alarm_rate: float) -> float:
-    """Limit of T² for Gaussian features, mean and covariance estimated from n windows (F distribution)."""
-    n, p = n_windows, n_features
-    if n <= p:
-        raise EstimationError(f"{n} healthy windows for {p} features, expected more windows than features")
-    return float(p * (n - 1) * (n + 1) / (n * (n - p)) * scipy.stats.f.isf(false_alarm_rate, p, n - p))
 
 
 def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:

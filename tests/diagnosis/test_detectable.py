@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.verdict.calibration import month_thresholds, window_thresholds
-from models.diagnosis.verdict.detectable import detectable_changes, length_for
+from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
 from models.diagnosis.verdict.isolation import isolate
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
@@ -59,16 +59,14 @@ def test_loss_and_gain_are_ratios_of_each_other() -> None:
 
 def test_length_and_change_are_inverse() -> None:
     stretch, thresholds = healthy(2), window_thresholds(1e-3, 6)
-    for i, found in enumerate(detectable_changes(stretch, thresholds, 60.0)):
-        error = stretch.estimate()[1][i, i] ** 0.5
-        for change in (found.loss, found.gain):
-            assert length_for(found.name, change, error, 60.0, thresholds) == pytest.approx(60.0)
-        assert length_for("e", 0.05, error, 60.0, thresholds) == pytest.approx(
-            4 * length_for("e", 0.10, error, 60.0, thresholds)
-        )
+    found = {one.name: one for one in detectable_changes(stretch, thresholds, 60.0)}
+    for one in found.values():
+        for change in (one.loss, one.gain):
+            assert length_to_find(one, change) == pytest.approx(60.0)
+    assert length_to_find(found["e"], 0.05) == pytest.approx(4 * length_to_find(found["e"], 0.10))
 
 
 @pytest.mark.parametrize("change", [0.0, -1.0, -2.0])
 def test_changes_that_cannot_be_are_refused(change: float) -> None:
     with pytest.raises(ValueError, match="expected above -1 and not 0"):
-        length_for("k_by", change, 0.01, 60.0, window_thresholds(0.01, 6))
+        length_to_find(detectable_changes(healthy(3), window_thresholds(0.01, 6), 60.0)[0], change)

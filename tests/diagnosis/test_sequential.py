@@ -7,11 +7,12 @@ import pytest
 
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.delay import GaussianHops, detection_delays
-from models.diagnosis.verdict.detectable import length_for
+from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
-from models.diagnosis.verdict.stretch import Stretch, to_scale
+from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
+from tests.diagnosis.test_isolation import window
 
 SEED = 88_300
 SETTINGS = SequentialSettings(hop_s=5.0, window_hops=12)
@@ -48,10 +49,11 @@ def gaussian(seed: int, settings: SequentialSettings = SETTINGS) -> GaussianHops
 
 def fixed_length_s(name: str, change: float) -> float:
     """Data that a test of one fixed length needs at the same rate, with 95 % power."""
-    length_s = 60.0
+    length_s, stretch = 60.0, stretch_of(window(np.zeros(len(PARAMETERS)), COVARIANCE), 0, 60_000_000_000)
     for _ in range(50):
         thresholds = month_thresholds(1.0, 5.0, max(1, round(length_s / 5.0)), len(PARAMETERS))
-        length_s = length_for(name, change, float(ERRORS[PARAMETERS.index(name)]), 60.0, thresholds)
+        (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
+        length_s = length_to_find(found, change)
     return length_s
 
 

@@ -138,6 +138,12 @@ def link_cut(plant: Plant) -> None:
     plant.recovered()
 
 
+def start_again(plant: Plant) -> None:
+    plant.start()
+    plant.stated(lambda seen: seen.health.restart.startswith("went on where it stood"), "restart")
+    plant.recovered()
+
+
 def monitor_killed(plant: Plant) -> None:
     plant.publish()
     for _ in range(3):
@@ -146,9 +152,7 @@ def monitor_killed(plant: Plant) -> None:
         plant.rest(0.5, 4.0)
         plant.end()
         plant.broken()
-        plant.start()
-        plant.stated(lambda seen: seen.health.restart.startswith("went on where it stood"), "restart")
-        plant.recovered()
+        start_again(plant)
 
 
 def monitor_stopped(plant: Plant) -> None:
@@ -157,9 +161,7 @@ def monitor_stopped(plant: Plant) -> None:
     plant.rest(0.5, 2.0)
     plant.broken()
     assert plant.end(signal.SIGTERM) == 0
-    plant.start()
-    plant.stated(lambda seen: seen.health.restart.startswith("went on where it stood"), "restart")
-    plant.recovered()
+    start_again(plant)
 
 
 def monitor_stands(plant: Plant) -> None:

@@ -171,6 +171,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]
         yield runtime.http_url, token(runtime, name="reader of the page")
 
 
+# The page's commands are for a terminal with curl; a fresh machine has Python, git and make alone.
 @pytest.mark.skipif(shutil.which("curl") is None, reason="curl is not installed")
 def test_commands_in_the_page_work(served: tuple[str, str], tmp_path: Path) -> None:
     url, text = served

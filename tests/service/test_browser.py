@@ -34,7 +34,7 @@ SCREENSHOTS = os.environ.get("ROTORWATCH_SCREENSHOTS")
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     path = os.environ.get("ROTORWATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
-    if path is None:
+    if path is None:  # a fresh machine has none, and it takes an administrator to install one
         pytest.skip(f"no browser: ROTORWATCH_CHROMIUM is not set, and none of {', '.join(NAMES)} is there")
     with (
         sync_playwright() as playwright,

@@ -289,8 +289,7 @@ def test_a_full_disk_is_told_and_recording_resumes_without_loss(tmp_path: Path) 
     mount = f"mkdir -p {tmp_path}/kept && mount -t tmpfs -o size=8m tmpfs {tmp_path}/kept && exec"
     probe = ["unshare", "-rm", "sh", "-c", f"{mount} true"]
     if shutil.which("unshare") is None or subprocess.run(probe, check=False).returncode:
-        # Mounting without privileges needs user namespaces, which a container may forbid; the file size limit above is
-        # tested everywhere.
+        # A container may forbid user namespaces; the limit on file sizes above is tested everywhere.
         pytest.skip("no file system can be mounted here")
     listen = endpoint()
     with recorder_program(tmp_path, listen, "unshare", "-rm", "sh", "-c", f'{mount} "$0" "$@"') as recorder:

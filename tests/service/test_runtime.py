@@ -292,6 +292,7 @@ done.set()
 """
 
 
+# What is tested is a setting of glibc; elsewhere it changes nothing.
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other C libraries have no arenas")
 def test_threads_keep_no_memory_of_their_own() -> None:
     grown_mb = {}

@@ -20,7 +20,7 @@ SHIPPED = ROOT / "deploy" / "zenoh"
 @pytest.fixture(scope="module")
 def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made with the commands of the documentation."""
-    if shutil.which("openssl") is None:
+    if shutil.which("openssl") is None:  # a fresh machine has Python, git and make alone
         pytest.skip("openssl is not installed: the documented commands cannot be tried")
     page = (ROOT / "docs" / "zenoh-security.md").read_text(encoding="utf-8")
     (commands,) = re.findall(r"```sh\n(.*?)```", page, re.DOTALL)

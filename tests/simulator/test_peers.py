@@ -9,7 +9,7 @@ from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
 from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
-from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, hotelling_limit, reference_modes, score_limit
+from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, reference_modes, score_limit
 from simulator.stream import blocks
 
 LAB = load_machine("lab")
@@ -72,11 +72,12 @@ def test_limits_keep_the_declared_rate() -> None:
 
 
 def test_hotellings_limit_is_that_of_gaussian_features() -> None:
-    """2000 draws of 30 learned windows and one further one; seed 9."""
+    """2000 draws of n = 30 learned windows and one further one, p = 8 features; seed 9."""
     rng = np.random.default_rng(9)
     peer = SubspaceModes(LAB)
     count = 0
-    limit = hotelling_limit(30, 8, 0.05)
+    n, p = 30, 8
+    limit = p * (n - 1) * (n + 1) / (n * (n - p)) * scipy.stats.f.isf(0.05, p, n - p)
     for _ in range(2000):
         drawn = rng.standard_normal((31, 8))
         peer.fit(drawn[:30])

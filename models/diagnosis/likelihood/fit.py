@@ -20,13 +20,7 @@ from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import goodness_of_fit
 from models.diagnosis.likelihood.integrated import integrated
 from models.diagnosis.likelihood.motions import Motions
-from models.diagnosis.likelihood.scoring import (
-    FisherScoring,
-    Maximum,
-    Weights,
-    Whitened,
-    Workspace,
-)
+from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened, Workspace
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
 from models.diagnosis.likelihood.start import starting_point
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop

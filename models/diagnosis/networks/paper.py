@@ -278,12 +278,6 @@ class PaperDiagnostician:
         """Numbers of the equations whose MSD exceeds its healthy limit."""
         return tuple(reading.equation for reading in diagnosis.equations if self._exceeds(reading))
 
-    def flagged_parameters(self, diagnosis: Diagnosis) -> tuple[str, ...]:
-        """Own parameters of the flagged equations: where the paper's method locates the fault."""
-        flagged = self.flagged_equations(diagnosis)
-        equations = [trained.equation for trained in self._networks if trained.equation.number in flagged]
-        return tuple(name for equation in equations for name in equation.parameters)
-
     def _with_means(self) -> list[tuple[PaperNetwork, float]]:
         return list(zip(self._networks, self._healthy.mean, strict=True))
 

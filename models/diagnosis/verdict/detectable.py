@@ -1,6 +1,5 @@
 """Minimum detectable change: what this machine, with this excitation, would have to show to be noticed."""
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +8,7 @@ from scipy.special import ndtri
 from models.diagnosis.verdict.calibration import Thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, to_scale
 
-__all__ = ["DetectableChange", "detectable_changes", "length_for", "length_to_find"]
+__all__ = ["DetectableChange", "detectable_changes", "length_to_find"]
 
 _POWER = 0.95
 
@@ -54,51 +53,13 @@ def detectable_changes(
     power : float
         Probability of finding the change.
     """
-    variances = np.diag(stretch.estimate()[1]).tolist()
+    distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
     return tuple(
-        _detectable(name, math.sqrt(variance), length_s, thresholds, power)
-        for name, variance in zip(stretch.names, variances, strict=True)
+        DetectableChange(
+            name, max(-1.0, from_scale(name, -distance * error)), from_scale(name, distance * error), length_s
+        )
+        for name, error in zip(stretch.names, errors, strict=True)
     )
-
-
-def _detectable(
-    name: str, standard_error: float, length_s: float, thresholds: Thresholds, power: float
-) -> DetectableChange:
-    size = (thresholds.first + float(ndtri(power))) * standard_error
-    return DetectableChange(name, max(-1.0, from_scale(name, -size)), from_scale(name, size), length_s)
-
-
-def length_for(
-    name: str, change: float, standard_error: float, length_s: float, thresholds: Thresholds, power: float = _POWER
-) -> float:
-    """Data it takes to find a change of one parameter whose standard error is known.
-
-    Parameters
-    ----------
-    name : str
-        Parameter.
-    change : float
-        Relative change that is to be found, not 0 and above -1.
-    standard_error : float
-        Of the parameter in the scale of its errors, on data of `length_s`.
-    length_s : float
-        Length that `standard_error` belongs to, s.
-    thresholds : Thresholds
-        From the declared rate.
-    power : float
-        Probability of finding it.
-
-    Returns
-    -------
-    float
-        Length, s.
-
-    Raises
-    ------
-    ValueError
-        If the change is 0 or -1 and below.
-    """
-    return length_to_find(_detectable(name, standard_error, length_s, thresholds, power), change)
 
 
 def length_to_find(found: DetectableChange, change: float) -> float:
