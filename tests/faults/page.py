@@ -21,7 +21,7 @@ listener on the network noted every alarm event.
 This page is written by the run: `python -m tests.faults --write` ({rows} faults, seeds {seeds}, {runs} runs; the
 moments differ from seed to seed). The figures are of that run, the least and the most. Times include the start of
 programs, each of which computes for a few seconds. During this run {least:.0f} to {most:.0f} programs at a
-time wanted to compute on the two cores (load average), so it took far longer.
+time wanted to compute on the two cores (load average).
 
 """
 
