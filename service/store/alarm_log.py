@@ -55,7 +55,7 @@ def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[
         If there is no such history, or it cannot be read.
     """
     database = Database(url, _TIMEOUT_S)
-    database.start(as_it_is=True)
+    database.start(read_only=True)
     try:
         return AlarmLog(database).since(site, name, recorded_ns)
     finally:

@@ -82,14 +82,14 @@ class Database:
         # SQLite has one writer at a time. In memory there is one connection in all, which readers share.
         self._one_writer = asyncio.Lock()
 
-    def start(self, set_aside: bool = False, *, as_it_is: bool = False) -> None:
+    def start(self, set_aside: bool = False, *, read_only: bool = False) -> None:
         """Start the thread, connect, and bring the tables up to date.
 
         Parameters
         ----------
         set_aside : bool
             Whether a file that is damaged is renamed and a new one begun; otherwise it is an error.
-        as_it_is : bool
+        read_only : bool
             Neither make the file nor touch the tables, to look into a history that another program writes.
 
         Raises
@@ -103,7 +103,7 @@ class Database:
         self._thread = threading.Thread(target=self._loop.run_forever, name="history", daemon=True)
         self._thread.start()
         try:
-            if as_it_is:
+            if read_only:
                 self._engine = self._make_engine()
                 return
             # Without a limit: bringing the tables of a large history up to date may take minutes.
