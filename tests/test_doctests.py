@@ -1,0 +1,23 @@
+"""What docstrings show is what happens.
+
+Only modules with an example are imported: as tests of pytest's, all of them would be loaded by each worker.
+"""
+
+import doctest
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SHOWING = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for room in ("models", "rotorwatch", "service", "simulator")
+    for path in sorted((ROOT / room).rglob("*.py"))
+    if ">>> " in path.read_text(encoding="utf-8")
+]
+
+
+@pytest.mark.parametrize("name", SHOWING)
+def test_examples_show_what_happens(name: str) -> None:
+    assert not doctest.testmod(import_module(name)).failed
