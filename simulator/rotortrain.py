@@ -70,7 +70,7 @@ def train(
     Example: rotortrain train --machine lab --out lab-bundle
     """
     with _running():
-        from simulator.campaigns.train_command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
+        from simulator.training.command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
 
         train_bundle(machine, out, windows, draws, seed, processes)
 

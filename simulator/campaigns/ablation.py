@@ -38,9 +38,9 @@ from simulator.campaigns.ablation_variants import (
     linear_fit,
     variant_equation,
 )
-from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
 from simulator.campaigns.opinions import opinion_of
 from simulator.campaigns.rates import Rate
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 __all__ = ["FAULTS", "Ablation", "AblationPlan", "AblationRow", "run_ablation"]
 

@@ -8,10 +8,10 @@ from models.diagnosis.networks.bundle import load_bundle
 from models.errors import EstimationError
 from models.machine import load_machine
 from simulator.campaigns.ablation import Ablation, AblationPlan, AblationRow, run_ablation
-from simulator.campaigns.draws import Layout
-from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.written import writing
+from simulator.training.draws import Layout
+from simulator.training.progress import labelled_bars
 
 __all__ = ["ablate_networks", "ablation_tables"]
 

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 
 from models.machine import load_machine
 from simulator.campaigns.delay_study import DelayCell, DelayPlan, DelayResult, run_delay_study
-from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.study_plots import COLOURS, STYLE, save_figure
 from simulator.campaigns.written import read_to_redraw, writing
+from simulator.training.progress import labelled_bars
 
 __all__ = ["delay_table", "draw_delays", "time_detection"]
 

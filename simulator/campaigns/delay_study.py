@@ -27,10 +27,10 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.campaigns.evaluation import true_condition
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 __all__ = [
     "CHANGES",

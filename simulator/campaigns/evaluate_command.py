@@ -15,16 +15,16 @@ from models.diagnosis.networks.bundle import load_bundle
 from models.errors import RecordingError
 from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Anomaly, Excitation
 from simulator.campaigns.evaluation import RATES, WindowRecord, evaluate_cells, read_records
 from simulator.campaigns.evaluation_cells import EvaluationCell, Topic, cells_for
 from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, anomaly_text, excitation_text, goals, percent
 from simulator.campaigns.evaluation_summary import Campaign, Summary, summarise
-from simulator.campaigns.progress import bars
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.results_page import page as results_page
 from simulator.campaigns.results_plots import draw_results
 from simulator.campaigns.written import read_numbers, writing
+from simulator.training.draws import Anomaly, Excitation
+from simulator.training.progress import bars
 
 __all__ = ["evaluate", "read_summaries", "write_page"]
 

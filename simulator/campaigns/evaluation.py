@@ -28,12 +28,12 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.excitation import source_spectrum
 from models.physics.matrices import STATE_INDEX
-from simulator.campaigns.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
 from simulator.campaigns.evaluation_cells import EvaluationCell, Topic
 from simulator.campaigns.opinions import diagnosticians
 from simulator.integrator import theoretical_rms
 from simulator.scenario import Scenario
 from simulator.timeline import Condition
+from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
 
 __all__ = ["RATES", "Opinion", "WindowRecord", "evaluate_cells", "read_records", "true_condition"]
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Anomaly, Excitation, Layout
+from simulator.training.draws import Anomaly, Excitation, Layout
 
 __all__ = ["PAPER_CONDITIONS", "EvaluationCell", "Topic", "cells_for"]
 

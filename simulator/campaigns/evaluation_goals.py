@@ -10,7 +10,6 @@ from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.calibration import window_thresholds
 from models.diagnosis.verdict.stretch import to_scale
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Anomaly, Excitation, Layout
 from simulator.campaigns.evaluation import RATES
 from simulator.campaigns.evaluation_cells import Topic
 from simulator.campaigns.evaluation_summary import (
@@ -22,6 +21,7 @@ from simulator.campaigns.evaluation_summary import (
     pooled,
 )
 from simulator.campaigns.rates import Rate
+from simulator.training.draws import Anomaly, Excitation, Layout
 
 __all__ = [
     "LAYOUT_TEXT",

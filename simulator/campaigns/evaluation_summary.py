@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict
 from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
-from simulator.campaigns.draws import Anomaly, Excitation, Layout
 from simulator.campaigns.evaluation import RATES, Opinion, WindowRecord
 from simulator.campaigns.evaluation_cells import Topic
 from simulator.campaigns.rates import Rate
+from simulator.training.draws import Anomaly, Excitation, Layout
 
 __all__ = [
     "Campaign",

@@ -20,13 +20,13 @@ from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.campaigns.opinions import diagnosticians, named_parameters, opinion_of
 from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, score_limit
 from simulator.campaigns.pool import done_in
 from simulator.campaigns.rates import Rate
 from simulator.scenario import Event
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 __all__ = ["CHANGES", "SETTINGS", "Comparison", "ComparisonCell", "ComparisonPlan", "MethodRates", "Setting", "compare"]
 

@@ -11,9 +11,9 @@ from rich.table import Table
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
 from simulator.campaigns.peers_campaign import SETTINGS, Comparison, ComparisonCell, ComparisonPlan, compare
-from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.study_plots import COLOURS, MARKERS, METHOD_TEXT, STYLE, save_figure
 from simulator.campaigns.written import writing
+from simulator.training.progress import labelled_bars
 
 __all__ = ["compare_peers", "draw_comparison"]
 

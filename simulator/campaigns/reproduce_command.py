@@ -6,12 +6,12 @@ import typer
 
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
-from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.study import Study, run_study
 from simulator.campaigns.study_page import study_page
 from simulator.campaigns.study_plots import draw_study
 from simulator.campaigns.study_windows import CUTOFFS_HZ, NOISE_LEVELS, StudyPlan
 from simulator.campaigns.written import read_to_redraw, writing
+from simulator.training.progress import labelled_bars
 
 __all__ = ["read_study", "reproduce_study", "write_study"]
 

@@ -9,13 +9,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Anomaly, Layout
 from simulator.campaigns.evaluation import RATES
 from simulator.campaigns.evaluation_cells import Topic
 from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, anomaly_text, excitation_text
 from simulator.campaigns.evaluation_summary import CellSummary, Interval, ParameterSummary, Summary, pooled
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.study_plots import COLOURS, MARKERS, METHOD_TEXT, STYLE, save_figure
+from simulator.training.draws import Anomaly, Layout
 
 __all__ = ["FIGURES", "draw_results", "figure_name", "shows"]
 

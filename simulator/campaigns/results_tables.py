@@ -4,7 +4,6 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluation import RATES
 from simulator.campaigns.evaluation_cells import Topic
 from simulator.campaigns.evaluation_goals import (
@@ -17,6 +16,7 @@ from simulator.campaigns.evaluation_goals import (
 )
 from simulator.campaigns.evaluation_summary import CellSummary, Interval, ParameterSummary, Summary, pooled
 from simulator.campaigns.results_plots import figure_name, shows
+from simulator.training.draws import Layout
 
 __all__ = ["machine_section", "paragraph", "table"]
 

@@ -8,12 +8,12 @@ import typer
 from models.commissioning.knowledge import KnowledgeLevel
 from models.errors import MachineFileError
 from simulator.campaigns.evaluation_goals import percent, rate_text
-from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.results_tables import paragraph, table
 from simulator.campaigns.sensor_study import FAULTS, SensorCell, SensorPlan, run_sensors, sensor_cells
 from simulator.campaigns.unknown_page import placed
 from simulator.campaigns.unknown_subjects import SHIPPED
 from simulator.campaigns.written import writing
+from simulator.training.progress import labelled_bars
 
 __all__ = ["break_sensors"]
 

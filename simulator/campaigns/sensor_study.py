@@ -21,7 +21,6 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.matrices import STATE_INDEX
 from models.signals.channels import Channel, Quantity, state_name
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
 from simulator.campaigns.pool import done_in
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.unknown_study import commissioned
@@ -29,6 +28,7 @@ from simulator.campaigns.unknown_subjects import subject_named
 from simulator.integrator import theoretical_rms
 from simulator.scenario import Event, Scenario
 from simulator.timeline import compile_timeline
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
 
 __all__ = ["FAULTS", "SensorCell", "SensorPlan", "SensorRecord", "run_sensors", "sensor_cells"]
 

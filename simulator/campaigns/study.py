@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict
 
 from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperHealthy, calibrate_paper
 from models.diagnosis.networks.paper_training import train_paper_network
-from simulator.campaigns.draws import Purpose, with_tilt
 from simulator.campaigns.pool import done_in
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.study_windows import (
@@ -28,6 +27,7 @@ from simulator.campaigns.study_windows import (
     own_equations,
     simulate,
 )
+from simulator.training.draws import Purpose, with_tilt
 
 __all__ = ["REALISATIONS", "Realisation", "Study", "StudyCell", "run_study"]
 

@@ -17,10 +17,10 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine
 from models.physics.lyapunov import stochastic_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
-from simulator.campaigns.draws import Purpose, with_tilt
 from simulator.campaigns.opinions import diagnosticians, named_parameters, opinion_of
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.stream import blocks
+from simulator.training.draws import Purpose, with_tilt
 
 __all__ = [
     "CONDITIONS",

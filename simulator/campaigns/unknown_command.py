@@ -7,12 +7,12 @@ import typer
 
 from models.commissioning.knowledge import KnowledgeLevel
 from models.errors import MachineFileError
-from simulator.campaigns.progress import labelled_bars
 from simulator.campaigns.unknown_page import placed, unknown_section
 from simulator.campaigns.unknown_study import UnknownPlan, read_unknown, run_unknown
 from simulator.campaigns.unknown_subjects import SUBJECTS, subject_named
 from simulator.campaigns.unknown_summary import summarize_unknown
 from simulator.campaigns.written import writing
+from simulator.training.progress import labelled_bars
 
 __all__ = ["watch_unknown"]
 

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 from models.commissioning.knowledge import KnowledgeLevel
-from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluation_goals import LAYOUT_TEXT, percent, rate_text
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.results_tables import paragraph, table
 from simulator.campaigns.unknown_summary import CellSummary, UnknownSummary, pooled
+from simulator.training.draws import Layout
 
 __all__ = ["BEGIN", "END", "placed", "unknown_section"]
 

@@ -26,8 +26,8 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, RecordingError
 from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray
-from simulator.campaigns.draws import Layout
 from simulator.campaigns.unknown_subjects import Later, subject_named
+from simulator.training.draws import Layout
 
 __all__ = ["CELLS", "UnknownPlan", "UnknownRecord", "commissioned", "read_unknown", "run_unknown"]
 

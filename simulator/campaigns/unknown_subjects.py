@@ -17,11 +17,11 @@ from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.window import WindowStatistics
 from models.machine import ConditionRange, Machine, MachineFile, load_machine
 from models.physics.parameters import KnownRotor
-from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
 from simulator.finite_elements.machines import ROTORS, rotor_named
 from simulator.finite_elements.observed import WindowSizes, machine_of, plan, sampled, windows_of
 from simulator.finite_elements.rotor import BeamRotor
 from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 __all__ = ["SHIPPED", "SUBJECTS", "Later", "Subject", "subject_named"]
 

@@ -7,9 +7,9 @@ from pydantic import BaseModel, ConfigDict
 
 from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.readings import Z95
-from simulator.campaigns.draws import Layout
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.unknown_study import CELLS, UnknownPlan, UnknownRecord
+from simulator.training.draws import Layout
 
 __all__ = ["CellSummary", "Reading", "UnknownSummary", "pooled", "summarize_unknown"]
 

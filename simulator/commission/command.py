@@ -12,9 +12,9 @@ from models.commissioning.commissioned import FILE, Commissioned, RecordingEntry
 from models.commissioning.healthy import HealthyRecording, read_healthy
 from models.errors import BundleError, MachineFileError
 from models.machine import MachineFile, load_machine_file
-from simulator.campaigns.progress import labelled_bars
 from simulator.commission.console import print_report
 from simulator.commission.page import write_report
+from simulator.training.progress import labelled_bars
 
 __all__ = ["commission_machine"]
 
@@ -80,7 +80,7 @@ def commission_machine(
     page = write_report(out, made.report, recordings, machine=machine, commissioned=made.commissioned)
     print_report(made.report)
     if made.commissioned is not None and made.machine is not None and networks:
-        from simulator.campaigns.train_command import train_for  # noqa: PLC0415  # needs torch, nothing else here does
+        from simulator.training.command import train_for  # noqa: PLC0415  # needs torch, nothing else here does
 
         train_for(made.machine, out, n_windows, n_draws, seed, processes)
     typer.echo(f"report: {page}")

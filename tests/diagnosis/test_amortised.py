@@ -15,9 +15,9 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window, with_tilt
-from simulator.campaigns.feature_draws import FeatureDraws, batches
-from simulator.campaigns.spectral_draws import LOG_RATIO, SpectralDraws
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt
+from simulator.training.feature_draws import FeatureDraws, batches
+from simulator.training.spectral_draws import LOG_RATIO, SpectralDraws
 
 SEED = 7_700_041
 LAB = load_machine("lab")

@@ -19,7 +19,7 @@ from models.diagnosis.networks.relation import EquationNetwork, read_equation
 from models.diagnosis.networks.relation_training import calibrate, train_network
 from models.errors import BundleError
 from models.machine import Machine, load_machine
-from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window, with_tilt
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt
 
 SEED = 7_700_003
 LAB = load_machine("lab")

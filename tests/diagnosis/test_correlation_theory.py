@@ -9,9 +9,9 @@ from models.machine import load_machine
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.scenario import Scenario
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 MACHINE = load_machine("lab")
 SEED = 7_700_004

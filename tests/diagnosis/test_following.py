@@ -14,9 +14,9 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import UnexplainedError
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.scenario import Event
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 from tests.service.foreign import Foreign, as_blocks, foreign
 
 LAB = load_machine("lab")

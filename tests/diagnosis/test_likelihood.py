@@ -16,7 +16,7 @@ from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
-from simulator.campaigns.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
+from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
 
 SEED = 7_700_001
 """Of this file's windows alone: neither training, calibration nor the shipped scenarios use it."""

@@ -20,7 +20,7 @@ from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_correlation, synchronous_response
 from models.physics.matrices import STATE_INDEX
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition, simulate_window, with_tilt
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_window, with_tilt
 
 _SEED = 4711
 

@@ -18,7 +18,7 @@ from models.errors import EstimationError, UnexplainedError
 from models.machine import load_machine
 from models.physics.possible import impossible
 from service.residuals import KnownMachineEvaluator
-from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 MACHINE = load_machine("lab")
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"

@@ -10,7 +10,7 @@ from models.diagnosis.readings import ParameterReading
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine
-from simulator.campaigns.draws import Draw, Layout, Purpose, simulate_window
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 SEED = 7_700_021
 MACHINE = load_machine("lab")

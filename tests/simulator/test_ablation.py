@@ -23,7 +23,7 @@ from simulator.campaigns.ablation_variants import (
     linear_fit,
     variant_equation,
 )
-from simulator.campaigns.draws import Draw, Purpose, simulate_window
+from simulator.training.draws import Draw, Purpose, simulate_window
 
 LAB = load_machine("lab")
 BUNDLE = load_bundle("lab", LAB)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from models.physics.parameters import PARAMETERS
-from simulator.campaigns.draws import Anomaly, Excitation, Layout
 from simulator.campaigns.evaluate_command import read_summaries
 from simulator.campaigns.evaluation import Opinion, WindowRecord, read_records
 from simulator.campaigns.evaluation_cells import Topic, cells_for
@@ -19,6 +18,7 @@ from simulator.campaigns.evaluation_summary import Campaign, Interval, Summary, 
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.results_page import page
 from simulator.campaigns.results_plots import FIGURES, draw_results, figure_name
+from simulator.training.draws import Anomaly, Excitation, Layout
 
 SEED = 99
 

@@ -8,9 +8,9 @@ from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition
 from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, reference_modes, score_limit
 from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 LAB = load_machine("lab")
 

@@ -9,10 +9,10 @@ from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.window import WindowStatistics
 from models.errors import RecordingError
 from models.machine import load_machine
-from simulator.campaigns.draws import Purpose
 from simulator.campaigns.reproduce_command import read_study, write_study
 from simulator.campaigns.study import run_study
 from simulator.campaigns.study_windows import CONDITIONS, EQUATIONS, Run, StudyPlan, own_equations, simulate
+from simulator.training.draws import Purpose
 
 
 @pytest.fixture(scope="module")

@@ -9,10 +9,10 @@ import pytest
 
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
-from simulator.campaigns.draws import Layout
 from simulator.campaigns.evaluate_command import read_summaries
 from simulator.campaigns.evaluation_cells import Topic
-from simulator.campaigns.train_command import train_for
+from simulator.training.command import train_for
+from simulator.training.draws import Layout
 from tests.service.live import machine_file
 
 ROOT = Path(__file__).parents[2]

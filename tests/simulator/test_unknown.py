@@ -9,7 +9,6 @@ from typer.testing import CliRunner
 
 from models.commissioning.knowledge import KnowledgeLevel, knowledge_of
 from models.errors import RecordingError
-from simulator.campaigns.draws import Layout
 from simulator.campaigns.rates import Rate
 from simulator.campaigns.unknown_command import watch_unknown
 from simulator.campaigns.unknown_page import BEGIN, END, placed, unknown_section
@@ -17,6 +16,7 @@ from simulator.campaigns.unknown_study import CELLS, UnknownPlan, UnknownRecord,
 from simulator.campaigns.unknown_subjects import SHIPPED, SUBJECTS, Later, subject_named
 from simulator.campaigns.unknown_summary import summarize_unknown
 from simulator.rotortrain import app
+from simulator.training.draws import Layout
 
 NONE = KnowledgeLevel.NONE
 

@@ -9,7 +9,7 @@ frequencies come out as in `models.diagnosis.moments`. A thousand times faster t
 training step see windows never seen before.
 
 The real thing remains the judge: calibration and evaluation use windows simulated in time
-(`simulator.campaigns.draws`).
+(`simulator.training.draws`).
 
 References
 ----------

@@ -12,8 +12,8 @@ import numpy as np
 
 from models.diagnosis.networks.features import Float32Array, ForceFeatures, principal_directions
 from models.machine import Machine
-from simulator.campaigns.draws import Purpose
-from simulator.campaigns.spectral_draws import DrawnConditions, SpectralDraws
+from simulator.training.draws import Purpose
+from simulator.training.spectral_draws import DrawnConditions, SpectralDraws
 
 __all__ = ["Batch", "FeatureDraws", "batches"]
 

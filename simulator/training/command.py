@@ -23,10 +23,10 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
 from models.physics.parameters import PARAMETERS
 from rotorwatch import __version__
-from simulator.campaigns.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
-from simulator.campaigns.feature_draws import FeatureDraws, batches
-from simulator.campaigns.progress import bars
-from simulator.campaigns.spectral_draws import LOG_RATIO
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
+from simulator.training.feature_draws import FeatureDraws, batches
+from simulator.training.progress import bars
+from simulator.training.spectral_draws import LOG_RATIO
 
 __all__ = ["train_bundle", "train_for"]
 

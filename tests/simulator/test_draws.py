@@ -6,11 +6,11 @@ import pytest
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from simulator.campaigns.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition
 from simulator.integrator import rotor_in
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
 from simulator.timeline import compile_timeline
+from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition
 
 LAB = load_machine("lab")
 

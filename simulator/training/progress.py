@@ -1,4 +1,4 @@
-"""Progress bars of the campaigns' commands, on stderr: stdout is for results."""
+"""Progress bars of training, commissioning and the studies, on stderr: stdout is for results."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
