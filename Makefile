@@ -38,7 +38,7 @@ $(RUN): pyproject.toml constraints.txt
 
 $(READY): $(RUN)
 	@echo "installing what training and the checks need ..."
-	@$(INSTALL) '.[train,dev,peers,io,postgres]'
+	@$(INSTALL) '.[train,dev,io,postgres]'
 	@touch $@
 
 demo: $(RUN)
@@ -89,7 +89,7 @@ floors:
 	@rm -rf $(FLOORS) && $(PYTHON) -m venv $(FLOORS)
 	@$(FLOORS)/bin/python -m pip install --quiet --disable-pip-version-check 'uv>=0.9'
 	@$(FLOORS)/bin/uv pip compile --quiet --python $(FLOORS)/bin/python --resolution lowest-direct --output-file $(FLOORS)/floors.txt \
-	  $(patsubst %,--extra %,plots io postgres peers dev) pyproject.toml
+	  $(patsubst %,--extra %,plots io postgres dev) pyproject.toml
 	@$(FLOORS)/bin/uv pip install --quiet --python $(FLOORS)/bin/python --requirement $(FLOORS)/floors.txt
 	@$(FLOORS)/bin/uv pip install --quiet --python $(FLOORS)/bin/python --no-deps --editable .
 	$(FLOORS)/bin/rotorwatch demo --once --pace 20

@@ -1,4 +1,4 @@
-"""`rotortrain` as a program: training, evaluation, messages, and what start-up imports."""
+"""`rotortrain` as a program: training, messages, and what start-up imports."""
 
 import os
 import subprocess
@@ -9,10 +9,7 @@ import pytest
 
 from models.diagnosis.networks.bundle import load_bundle
 from models.machine import load_machine
-from simulator.campaigns.evaluate_command import read_summaries
-from simulator.campaigns.evaluation_cells import Topic
 from simulator.training.command import train_for
-from simulator.training.draws import Layout
 from tests.service.live import machine_file
 
 ROOT = Path(__file__).parents[2]
@@ -49,27 +46,10 @@ def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
     assert bundle.amortised is not None
 
 
-@pytest.mark.long
-def test_evaluate_reads_a_bundle(tmp_path: Path) -> None:
-    results = tmp_path / "evaluation"
-    done = run("evaluate", "-m", "lab", "-b", "lab", "--windows", "2", "--fault", "0.25", "--out", str(results))
-    assert done.returncode == 0, done.stderr
-    (summary,) = read_summaries(results)
-    assert summary.campaign.bundle == load_bundle("lab", load_machine("lab")).identity
-    assert {cell.topic for cell in summary.cells} == {Topic.HEALTHY, Topic.SMALL}
-    independent = summary.of(Topic.SMALL, layout=Layout.INDEPENDENT)[0].opinions["likelihood"]
-    one = independent.parameter("k_by")
-    assert one is not None
-    assert one.median == pytest.approx(-0.02, abs=0.03)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("train", "--machine", "none.toml", "--out", "x"), "none.toml: no such machine file"),
-        (("evaluate", "--machine", "lab", "--bundle", "nowhere", "--out", "x"), "nowhere: not a bundle"),
-        (("evaluate", "--machine", "heavy", "--bundle", "lab", "--out", "x"), "trained for another machine"),
-        (("evaluate", "--machine", "lab", "--bundle", "lab"), "Missing option '--out'"),
         (("train", "--machine", "lab"), "Missing option '--out'"),
     ],
 )
@@ -82,12 +62,11 @@ def test_wrong_arguments_exit_with_2_and_a_sentence(arguments: tuple[str, ...], 
     assert not (tmp_path / "x").exists()
 
 
-@pytest.mark.parametrize("command", ["train", "evaluate"])
-def test_help_needs_neither_torch_nor_scipy_nor_numpy(command: str) -> None:
+def test_help_needs_neither_torch_nor_scipy_nor_numpy() -> None:
     code = (
         "import sys, typer.testing, simulator.rotortrain as t\n"
-        f"result = typer.testing.CliRunner().invoke(t.app, ['{command}', '--help'])\n"
-        f"assert result.exit_code == 0 and 'rotortrain {command} --machine lab' in result.output, result.output\n"
+        "result = typer.testing.CliRunner().invoke(t.app, ['train', '--help'])\n"
+        "assert result.exit_code == 0 and 'rotortrain train --machine lab' in result.output, result.output\n"
         "print([name for name in ('torch', 'scipy', 'numpy') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -25,7 +25,7 @@ from models.machine import Machine
 from models.physics.matrices import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 
-__all__ = ["FeatureVector", "Peer", "SubspaceModes", "reference_modes", "score_limit"]
+__all__ = ["FeatureVector", "Peer", "SubspaceModes", "reference_modes"]
 
 _MORE_ORDERS = 16
 """Model orders from twice the number of modes to this many above it, as in a stabilisation diagram; the median over
@@ -62,31 +62,6 @@ class Peer(Protocol):
 
     def score(self, features: FloatArray) -> float:
         """Distance of one window's features from healthy; nan if it has none."""
-
-
-def score_limit(healthy_scores: FloatArray, false_alarm_rate: float) -> float:
-    """Limit that a further healthy window exceeds with the declared probability at most, whatever the distribution.
-
-    Parameters
-    ----------
-    healthy_scores : ndarray, shape (n,)
-        Of healthy windows that `Peer.fit` did not see.
-    false_alarm_rate : float
-        α per window: the ⌈(n+1)(1-α)⌉-th smallest score is the limit.
-
-    Raises
-    ------
-    EstimationError
-        If there are fewer than 1/α - 1 scores.
-    """
-    n = healthy_scores.size
-    rank = int(np.ceil((n + 1) * (1 - false_alarm_rate) - 1e-9))
-    if rank > n:
-        raise EstimationError(
-            f"{n} healthy scores for a false-alarm rate of {false_alarm_rate:g}, expected at least "
-            f"{int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1}"
-        )
-    return float(np.sort(healthy_scores)[rank - 1])
 
 
 def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:

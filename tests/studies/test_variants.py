@@ -1,32 +1,19 @@
-"""The ablation: variants are what they say, and a tiny table comes out as it must."""
+"""Variants of the relation networks' equations are what they say."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.bundle import load_bundle
+from benchmarks.studies.variants import VARIANTS, as_seen, linear_fit, variant_equation
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.paper import full_correlation
 from models.diagnosis.networks.relation import window_view
 from models.diagnosis.window import WindowStatistics
-from models.errors import EstimationError
 from models.machine import load_machine
-from simulator.campaigns.ablation import AblationPlan, run_ablation
-from simulator.campaigns.ablation_command import ablation_tables
-from simulator.campaigns.ablation_variants import (
-    VARIANTS,
-    Measure,
-    Reader,
-    Variant,
-    as_seen,
-    linear_fit,
-    variant_equation,
-)
 from simulator.training.draws import Draw, Purpose, simulate_window
 
 LAB = load_machine("lab")
-BUNDLE = load_bundle("lab", LAB)
 SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
 PRESENT = next(variant for variant in VARIANTS if variant.label.endswith("(the present one)"))
 
@@ -81,37 +68,3 @@ def test_the_linear_fit_leaves_nothing_that_its_inputs_explain(window: WindowSta
     projected = (rows.inputs / np.linalg.norm(rows.inputs, axis=0)).T @ residual
     assert np.abs(projected).max() < 1e-8
     assert 0 < np.mean(residual**2) < 0.2
-
-
-def _plan(variants: tuple[Variant, ...], calibration: int = 9) -> AblationPlan:
-    faults: tuple[dict[str, float], ...] = ({}, {"k_by": -0.4}, {"k_bz": -0.4})
-    return AblationPlan(SHORT, BUNDLE, 42, 2, 16, calibration, 0.1, variants, faults)
-
-
-@pytest.mark.long
-def test_a_halved_stiffness_is_found_where_it_is_and_not_elsewhere() -> None:
-    linear = Variant("table", "linear", reader=Reader.LINEAR)
-    blind = replace(linear, label="MSD", measure=Measure.MSD)
-    ablation = run_ablation(_plan((linear, blind)), 1, lambda *_: None)
-    assert [(row.label, row.equation) for row in ablation.rows] == [
-        ("linear", "28"),
-        ("MSD", "28"),
-        ("linear", "31"),
-        ("MSD", "31"),
-    ]
-    for row, parameter in zip(ablation.rows[::2], ("k_by", "k_bz"), strict=True):
-        (label,) = row.detected
-        assert label == f"{parameter} -40%"
-        assert row.detected[label].count == row.named[label].count == 2
-        assert -0.5 < row.reads[label] < -0.2  # sixteen training windows of 20 s
-        assert row.elsewhere.of == 2
-        assert row.elsewhere.count < 2
-    assert not ablation.rows[1].named  # the MSD names no parameter
-    assert "| linear |" in ablation_tables(ablation)
-
-
-def test_too_few_calibration_windows_are_refused() -> None:
-    with pytest.raises(
-        EstimationError, match=r"8 calibration windows for a false-alarm rate of 0\.1, expected at least 9"
-    ):
-        run_ablation(_plan((PRESENT,), calibration=8), 1, lambda *_: None)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import scipy.stats
 
+from benchmarks.studies.other_methods import FeatureVector, Peer, SubspaceModes, reference_modes
 from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from simulator.campaigns.peers import FeatureVector, Peer, SubspaceModes, reference_modes, score_limit
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
@@ -23,6 +23,7 @@ def _samples(number: int, faults: dict[str, float] | None = None) -> FloatArray:
     )
 
 
+@pytest.mark.long
 def test_ssi_finds_the_modes_of_the_machine() -> None:
     """Four modes 28-95 Hz, two close pairs of whirl modes, 7-8 % damped; one 60 s window."""
     frequency, _ = reference_modes(LAB)
@@ -31,12 +32,14 @@ def test_ssi_finds_the_modes_of_the_machine() -> None:
     assert found[4:] == pytest.approx([0.084, 0.0714, 0.0727, 0.0722], rel=0.25)
 
 
+@pytest.mark.long
 def test_ssi_follows_the_mode_that_a_soft_bearing_lowers() -> None:
     healthy, soft = (SubspaceModes(LAB).features(_samples(0, faults)) for faults in ({}, {"k_by": -0.2}))
     assert soft[0] / healthy[0] < 0.95
     assert soft[1] / healthy[1] == pytest.approx(1, abs=0.02)  # the vertical mode stays
 
 
+@pytest.mark.long
 def test_a_peer_learns_healthy_and_scores_a_large_change_above_its_limit() -> None:
     learned = [_samples(number) for number in range(12)]
     fresh, changed = _samples(60), _samples(50, {"k_by": -0.3})
@@ -62,15 +65,6 @@ def test_a_lost_mode_does_not_end_the_score() -> None:
     assert np.isnan(peer.score(np.full(8, np.nan)))
 
 
-def test_limits_keep_the_declared_rate() -> None:
-    """400 repetitions of 99 healthy scores and 50 further ones from a skewed distribution; seed 8."""
-    rng = np.random.default_rng(8)
-    exceeded = [
-        np.mean(rng.lognormal(size=50) > score_limit(rng.lognormal(size=99), false_alarm_rate=0.05)) for _ in range(400)
-    ]
-    assert np.mean(exceeded) == pytest.approx(0.05, abs=0.006)
-
-
 def test_hotellings_limit_is_that_of_gaussian_features() -> None:
     """2000 draws of n = 30 learned windows and one further one, p = 8 features; seed 9."""
     rng = np.random.default_rng(9)
@@ -84,8 +78,3 @@ def test_hotellings_limit_is_that_of_gaussian_features() -> None:
         count += peer.score(drawn[30]) > limit
     low, high = scipy.stats.binom.interval(0.999, 2000, 0.05)
     assert low <= count <= high
-
-
-def test_too_few_healthy_scores_are_refused() -> None:
-    with pytest.raises(EstimationError, match="expected at least 99"):
-        score_limit(np.ones(98), 0.01)

@@ -1,4 +1,4 @@
-"""Machines that are to be commissioned without their parameters: finite elements, and the shipped ones kept secret.
+"""Machines to commission: finite elements, and the shipped ones with their parameters kept secret.
 
 A subject gives healthy windows of one commissioning, which has one source of one cutoff and level, and single windows
 of later days, each with a cutoff, level, noise and direction of its own. All are independent realisations, and no two
@@ -7,23 +7,30 @@ purposes share a random number.
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
 
+from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel
+from models.commissioning.levels import learned_baseline
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.readings import Diagnosis, Diagnostician
+from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
 from models.machine import ConditionRange, Machine, MachineFile, load_machine
-from models.physics.parameters import KnownRotor
+from models.signals.block import FloatArray
 from simulator.finite_elements.machines import ROTORS, rotor_named
 from simulator.finite_elements.observed import WindowSizes, machine_of, plan, sampled, windows_of
 from simulator.finite_elements.rotor import BeamRotor
 from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
-__all__ = ["SHIPPED", "SUBJECTS", "Later", "Subject", "subject_named"]
+__all__ = ["SHIPPED", "SUBJECTS", "Later", "Subject", "commissioned", "subject_named"]
 
 SHIPPED = ("lab", "heavy", "light")
 SUBJECTS: tuple[str, ...] = (*(rotor.name for rotor in ROTORS), *SHIPPED)
@@ -48,19 +55,7 @@ class _Use(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Later:
-    """Which later window.
-
-    Attributes
-    ----------
-    seed : int
-        Of the whole campaign.
-    commissioning : int
-        Number of the commissioning it is read against.
-    cell, number : int
-    layout : Layout
-    changes : dict of str to float
-        True relative changes.
-    """
+    """Which window of a later day: read against which commissioning, of which cell and number, and what has changed."""
 
     seed: int
     commissioning: int
@@ -98,6 +93,38 @@ def subject_named(name: str) -> Subject:
     return _Shipped(load_machine(name)) if name in SHIPPED else _Beam(rotor_named(name))
 
 
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    """Windows compared with a machine's theory, each from a cold start: no two share their condition."""
+
+    machine: Machine
+    shared: FloatArray | None
+
+    @property
+    def by(self) -> str:
+        return "likelihood"
+
+    def diagnose(self, window: WindowStatistics) -> Diagnosis:
+        read = determined(LikelihoodFit(self.machine).diagnose(window), window, self.machine.window.length_s)
+        return read if self.shared is None else with_shared_error(read, self.shared)
+
+
+def commissioned(level: KnowledgeLevel, file: MachineFile, windows: Sequence[WindowStatistics]) -> Diagnostician:
+    """Commission on healthy windows of one recording with what the machine file tells.
+
+    Raises
+    ------
+    EstimationError
+        If the windows do not suffice.
+    """
+    if level is KnowledgeLevel.NONE:
+        return BaselineDiagnostician(learned_baseline(windows, ["recording 1"] * len(windows)))
+    if isinstance(file, Machine):
+        return _Compared(file, None)
+    identified = identify(file, windows)
+    return _Compared(identified.machine, identified.covariance)
+
+
 def _generator(name: str, seed: int, commissioning: int, use: _Use, *which: int) -> np.random.Generator:
     own = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")
     return np.random.default_rng([seed, own, commissioning, use, *which])
@@ -126,21 +153,13 @@ class _Beam:
         return self.rotor.description
 
     def file(self, level: KnowledgeLevel) -> MachineFile | None:
-        bare = machine_of(self.rotor, WindowSizes())
-        if level is KnowledgeLevel.NONE:
-            return bare
-        if level is KnowledgeLevel.FULL:
-            return None
-        return bare.model_copy(update={"rotor": _as_weighed(self.rotor)})
+        return machine_of(self.rotor, WindowSizes()) if level is KnowledgeLevel.NONE else None
 
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
         cutoff_hz = _commissioned_cutoff(self.rotor.name, seed, commissioning)
         rng = _generator(self.rotor.name, seed, commissioning, _Use.COMMISSIONING)
         limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
-        condition = drawn_condition(self.rotor, SourceLayout.ONE_SOURCE, limits, {}, rng)
-        sizes = plan(self.rotor, WindowSizes())
-        duration_s = (sizes.preamble + count * sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
-        return tuple(windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)[:count])
+        return self._windows(SourceLayout.ONE_SOURCE, limits, {}, rng, count)
 
     def later(self, which: Later) -> tuple[WindowStatistics, float]:
         name = self.rotor.name
@@ -151,11 +170,15 @@ class _Beam:
         limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
         if not self.rotor.linear:
             limits = replace(limits, stochastic_to_1x=_ALIKE)
-        condition = drawn_condition(self.rotor, layout, limits, which.changes, rng)
+        return self._windows(layout, limits, which.changes, rng, 1)[0], cutoff_hz
+
+    def _windows(
+        self, layout: SourceLayout, limits: SceneRange, changes: dict[str, float], rng: np.random.Generator, count: int
+    ) -> tuple[WindowStatistics, ...]:
+        condition = drawn_condition(self.rotor, layout, limits, changes, rng)
         sizes = plan(self.rotor, WindowSizes())
-        duration_s = (sizes.preamble + sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
-        (window,) = windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)
-        return window, cutoff_hz
+        duration_s = (sizes.preamble + count * sizes.hops * sizes.hop) / sizes.rate_hz + _SETTLING_S
+        return tuple(windows_of(sampled(self.rotor, condition, duration_s, int(rng.integers(2**62))), sizes)[:count])
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,46 +204,19 @@ class _Shipped:
         limits = ConditionRange(
             cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02)
         )
-        draw = Draw(
-            _within(self.machine, limits),
-            int(rng.integers(2**62)),
-            Purpose.TRAINING,
-            layout=Layout.ONE_SOURCE,
-            fixed_condition=True,
-        )
+        machine, own = _within(self.machine, limits), int(rng.integers(2**62))
+        draw = Draw(machine, own, Purpose.TRAINING, layout=Layout.ONE_SOURCE, fixed_condition=True)
         return tuple(simulate_window(draw, number) for number in range(1, count + 1))
 
     def later(self, which: Later) -> tuple[WindowStatistics, float]:
         name = self.machine.name
         rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
         own = self.machine.condition
-        commissioned = _commissioned_cutoff(name, which.seed, which.commissioning)
-        cutoff_hz = _other_cutoff(own.cutoff_hz, commissioned, rng)
-        limits = own.model_copy(update={"cutoff_hz": (cutoff_hz, cutoff_hz)})
-        draw = Draw(
-            _within(self.machine, limits),
-            int(rng.integers(2**62)),
-            Purpose.EVALUATION,
-            faults=which.changes,
-            layout=which.layout,
-        )
+        cutoff_hz = _other_cutoff(own.cutoff_hz, _commissioned_cutoff(name, which.seed, which.commissioning), rng)
+        machine = _within(self.machine, own.model_copy(update={"cutoff_hz": (cutoff_hz, cutoff_hz)}))
+        seed = int(rng.integers(2**62))
+        draw = Draw(machine, seed, Purpose.EVALUATION, faults=which.changes, layout=which.layout)
         return simulate_window(draw, which.number), cutoff_hz
-
-
-def _as_weighed(rotor: BeamRotor) -> KnownRotor:
-    """Masses and shaft as an engineer would write them down: half the shaft between bearing and disc to either."""
-    bearing, disc = rotor.bearings[0], rotor.discs[0]
-    length_m = rotor.length_m / rotor.elements * abs(disc.node - bearing.node)
-    half_kg = rotor.density_kg_m3 * rotor.area_m2 * length_m / 2
-    return KnownRotor(
-        m1_kg=bearing.housing_kg + half_kg,
-        m2_kg=disc.mass_kg + half_kg,
-        I2_kg_m2=disc.mass_kg * disc.radius_m**2 / 4,
-        I2p_kg_m2=disc.mass_kg * disc.radius_m**2 / 2,
-        shaft_length_m=length_m,
-        shaft_diameter_m=rotor.diameter_m,
-        shaft_E_Pa=rotor.E_Pa,
-    )
 
 
 def _within(machine: Machine, limits: ConditionRange) -> Machine:

@@ -1,0 +1,6 @@
+"""What the diagnosticians find, measured on simulated windows: seven studies, one runner, one page template."""
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")  # before numpy is imported: the workers are processes

@@ -1,0 +1,81 @@
+"""``python -m benchmarks.studies``: run studies, and write their pages."""
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from benchmarks.studies.ablation import ablation
+from benchmarks.studies.delay import delay
+from benchmarks.studies.evaluate import evaluate
+from benchmarks.studies.pages import TEXTS, Measured, write_page
+from benchmarks.studies.peers import peers
+from benchmarks.studies.reproduction import reproduction
+from benchmarks.studies.sensors import sensors
+from benchmarks.studies.study import Options, options_of, read, run
+from benchmarks.studies.unknown import unknown
+from models.errors import RotorwatchError
+
+STUDIES = {
+    "evaluate": evaluate,
+    "peers": peers,
+    "unknown": unknown,
+    "sensors": sensors,
+    "ablation": ablation,
+    "delay": delay,
+    "reproduction": reproduction,
+}
+
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def main(
+    names: Annotated[list[str], typer.Argument(metavar="STUDY...", help=f"Among {', '.join(STUDIES)}; or all.")],
+    out: Annotated[Path, typer.Option(help="Folder of the records, one file for each study.")],
+    machine: Annotated[list[str] | None, typer.Option(help="Machine; repeatable. The study's own if left out.")] = None,
+    windows: Annotated[int, typer.Option(min=1, help="Windows per cell.")] = 100,
+    seed: Annotated[int, typer.Option(min=0)] = 20261122,
+    processes: Annotated[int, typer.Option(min=1)] = os.cpu_count() or 1,
+    small: Annotated[bool, typer.Option("--small", help="The smallest plan: a check, not a result.")] = False,
+    docs: Annotated[
+        Path | None, typer.Option(help="Write the pages of these studies into this folder, from all records in --out.")
+    ] = None,
+) -> None:
+    """Run studies on simulated windows; records are kept, and an interrupted study carries on where it stopped.
+
+    Examples
+    --------
+    python -m benchmarks.studies evaluate --machine lab --windows 500 --out studies --docs docs
+
+    python -m benchmarks.studies all --small --out /tmp/check --docs /tmp/check
+    """
+    chosen = list(STUDIES) if names == ["all"] else names
+    for name in chosen:
+        if name not in STUDIES:
+            raise typer.BadParameter(f"{name!r}, expected among {', '.join(STUDIES)}, or all")
+    options = Options(tuple(machine or ()), windows, seed, small)
+    try:
+        for name in chosen:
+            typer.echo(f"written: {run(STUDIES[name](options), options, out, processes)}")
+        for page, of in TEXTS["pages"].items() if docs is not None else ():
+            if set(of["studies"]) & set(chosen):
+                parts = [_measured(name, out) for name in of["studies"] if (out / f"{name}.jsonl").exists()]
+                for path in write_page(page, parts, docs or out):
+                    typer.echo(f"written: {path}")
+    except RotorwatchError as error:
+        typer.echo(f"studies: {error}", err=True)
+        raise typer.Exit(2) from error
+
+
+def _measured(name: str, out: Path) -> Measured:
+    """A study as its file of records says that it was run."""
+    options = options_of(out / f"{name}.jsonl")
+    study = STUDIES[name](options)
+    return Measured(study, options, read(study, out))
+
+
+if __name__ == "__main__":
+    app(prog_name="python -m benchmarks.studies")

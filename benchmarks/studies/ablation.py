@@ -1,0 +1,334 @@
+"""What each ingredient of the relation networks buys: the same windows, read by variants of the same equations.
+
+Every variant alarms at the same rate of false alarms, by a limit from the same calibration windows.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from benchmarks.studies.evaluate import LAYOUTS
+from benchmarks.studies.opinions import changed_in
+from benchmarks.studies.results import Goal, Record, Table, Value, floats, grouped, limit_of, median, rate, robust
+from benchmarks.studies.study import Cell, Options, Over, Study
+from benchmarks.studies.variants import (
+    VARIANTS,
+    Measure,
+    Reader,
+    Variant,
+    VariantEquation,
+    as_seen,
+    equation_numbered,
+    linear_fit,
+    variant_equation,
+)
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.networks.amortised import NetworkDiagnostician
+from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.diagnosis.networks.equations import EQUATIONS
+from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperNetwork, mean_squared_deviation
+from models.diagnosis.networks.paper_training import train_paper_network
+from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
+from models.diagnosis.networks.relation_training import train_network
+from models.diagnosis.readings import Diagnostician, ParameterReading
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine, load_machine
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window
+
+__all__ = ["ablation"]
+
+_FAULTS: tuple[dict[str, float], ...] = (
+    {},
+    {"k_by": -0.2},
+    {"k_by": -0.05},
+    {"c_by": -0.2},
+    {"k_bz": -0.2},
+    {"k_bz": -0.05},
+    {"c_bz": -0.2},
+    {"e": 0.2},
+    {"e": 0.05},
+)
+"""True changes; their place is part of the seed."""
+_NUMBERS = ("28", "29", "31")
+_OWN = {equation.number: equation.parameters for equation in EQUATIONS}
+_FIXED_STREAM = 90
+_SCALE_QUANTILE = 0.9
+_EVERY_LAG = 3
+"""Training takes every third lag: neighbours 1 ms apart are nearly the same numbers, up to 150 Hz."""
+
+_Values = dict[str, tuple[float, float | None]]
+"""Test value, and relative change where there is one, of each parameter (or of the MSD)."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Trained:
+    """A trained variant of one equation, with the machine file that has its lags."""
+
+    variant: Variant
+    machine: Machine
+    relation: EquationNetwork | None
+    paper: PaperNetwork | None
+
+
+_Networks = dict[tuple[Variant, str], _Trained]
+
+
+def _learn(machine: Machine, options: Options, over: Over) -> _Networks:
+    count = 4 if options.small else 60
+    draws = {
+        number: Draw(
+            machine, options.seed, Purpose.TRAINING, int(number), kept_nominal=equation_numbered(number).kept_nominal
+        )
+        for number in _NUMBERS
+    }
+    draws["one"] = Draw(
+        machine, options.seed, Purpose.TRAINING, _FIXED_STREAM, layout=Layout.ONE_SOURCE, fixed_condition=True
+    )
+    jobs = [(name, draw, k) for name, draw in draws.items() for k in range(count)]
+    simulated = over("training windows", _training_window, [(draw, k) for _, draw, k in jobs])
+    training: dict[str, list[WindowStatistics]] = {name: [] for name in draws}
+    for (name, _, _), window in zip(jobs, simulated, strict=True):
+        training[name].append(window)
+    fits = dict.fromkeys(
+        (variant.network_key, number)
+        for variant in VARIANTS
+        if variant.reader in (Reader.PAPER, Reader.NETWORK, Reader.LINEAR)
+        for number in variant.equations
+    )
+    tasks = [(one, number, training[number if one.varied else "one"], machine, options.seed) for one, number in fits]
+    return dict(zip(fits, over("networks", _train, tasks), strict=True))
+
+
+def _training_window(job: tuple[Draw, int]) -> WindowStatistics:
+    """Simulate one window and keep what training looks at."""
+    window = simulate_window(*job)
+    return replace(
+        window,
+        lags_s=window.lags_s[::_EVERY_LAG],
+        correlation=window.correlation[::_EVERY_LAG],
+        hop_correlation=window.hop_correlation[:0],
+        spectrum=window.spectrum[:0],
+    )
+
+
+def _train(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) -> _Trained:
+    variant, number, windows, machine, seed = task
+    if variant.reader is Reader.PAPER:
+        printed = next(equation for equation in PAPER_EQUATIONS if equation.number == number)
+        return _Trained(variant, machine, None, train_paper_network(printed, windows, machine, seed))
+    if not variant.long_lags:
+        settings = machine.window.model_copy(update={"lag_from_s": 0.0})
+        machine = machine.model_copy(update={"window": settings})
+    windows = [as_seen(variant, window) for window in windows]
+    equation = variant_equation(variant, number)
+    if isinstance(equation, VariantEquation) and not variant.normalised:
+        norms = [equation.rows(window_view(window, machine), machine).norm for window in windows]
+        equation = replace(equation, unit=float(np.sqrt(np.mean(np.square(norms)))))
+    if variant.reader is Reader.LINEAR:
+        return _Trained(variant, machine, EquationNetwork(equation, linear_fit(equation, windows, machine), None), None)
+    return _Trained(variant, machine, train_network(equation, windows, machine, seed), None)
+
+
+def _measure(
+    machine: Machine, bundle: Bundle, seed: int, networks: _Networks, cell: Cell, number: int
+) -> list[dict[str, Value]]:
+    """One row for every variant of every equation."""
+    purpose, stream, faults, layout = cell.given
+    window = simulate_window(Draw(machine, seed, purpose, stream, faults=faults, layout=layout), number)
+    seen: dict[tuple[Variant, str], dict[Measure, _Values]] = {}
+    others: dict[Reader, dict[str, _Values]] = {}
+    rows: list[dict[str, Value]] = []
+    for variant in VARIANTS:
+        for equation in variant.equations:
+            key = (variant.network_key, equation)
+            if key in networks:
+                if key not in seen:
+                    seen[key] = _values(networks[key], window)
+                values = seen[key][Measure.MSD if variant.reader is Reader.PAPER else variant.measure]
+            else:
+                if variant.reader not in others:
+                    others[variant.reader] = _others(machine, bundle, variant.reader, window)
+                values = others[variant.reader][equation]
+            row: dict[str, Value] = {"equation": equation, "group": variant.group, "variant": variant.label}
+            for name, (value, change) in values.items():
+                row |= {f"{name} value": value} | ({} if change is None else {name: change})
+            rows.append(row)
+    return rows
+
+
+def _values(one: _Trained, window: WindowStatistics) -> dict[Measure, _Values]:
+    """All measures of one trained variant."""
+    if one.paper is not None:
+        return {Measure.MSD: {"msd": (mean_squared_deviation(one.paper, window, one.machine), None)}}
+    assert one.relation is not None  # noqa: S101  # one of the two is there by construction
+    window = as_seen(one.variant, window)
+    reading = read_equation(one.relation, window, one.machine)
+    rows = one.relation.equation.rows(window_view(window, one.machine), one.machine)
+    power = float(np.mean((rows.target / rows.norm) ** 2))  # 1 where the window is normalised
+    return {
+        Measure.MSD: {"msd": ((reading.msd or 0.0) / power, None)},
+        Measure.PROJECTION: {one.name: (one.change or 0.0, one.change or 0.0) for one in reading.parameters},
+        Measure.OWN_ERROR: {one.name: (one.z or 0.0, one.change or 0.0) for one in reading.parameters},
+    }
+
+
+def _others(machine: Machine, bundle: Bundle, reader: Reader, window: WindowStatistics) -> dict[str, _Values]:
+    """What shipped networks or the likelihood say of each equation's own parameters; nothing where they refuse."""
+    parameters: Sequence[ParameterReading] = ()
+    if reader is Reader.SHIPPED:
+        parameters = [one for network in bundle.networks for one in read_equation(network, window, machine).parameters]
+    else:
+        judge: Diagnostician = LikelihoodFit(machine)
+        if reader is Reader.AMORTISED and bundle.amortised is not None:
+            judge = NetworkDiagnostician(machine, bundle.amortised)
+        try:
+            parameters = judge.diagnose(window).evaluable
+        except EstimationError:
+            parameters = ()
+    read = {one.name: (one.z or 0.0, one.change or 0.0) for one in parameters}
+    return {number: {name: read[name] for name in own if name in read} for number, own in _OWN.items()}
+
+
+def _test_values(row: Record) -> dict[str, float]:
+    return {
+        key.removesuffix(" value"): abs(float(value or 0.0)) for key, value in row.items() if key.endswith(" value")
+    }
+
+
+def _judged(false_alarm_rate: float, records: Sequence[Record]) -> Iterator[Record]:
+    """Evaluation windows with the verdict of the limit that the calibration windows of the same row set."""
+    for rows in grouped(records, "layout", "equation", "group", "variant").values():
+        healthy = [_test_values(row) for row in rows if row["purpose"] == "calibration"]
+        # Every test value in units of its own upper quantile: no parameter decides the limits of another.
+        scale = {
+            name: float(np.quantile([one[name] for one in healthy if name in one], _SCALE_QUANTILE))
+            for name in sorted({name for one in healthy for name in one})
+        }
+        leading = [max((value / scale[name] for name, value in one.items()), default=0.0) for one in healthy]
+        limit = limit_of(np.array(leading), false_alarm_rate) * (1 + 1e-12)
+        for row in rows:
+            if row["purpose"] != "calibration":
+                ratios = {name: value / scale[name] for name, value in _test_values(row).items()}
+                leader = max(ratios, key=lambda name: ratios[name], default="")
+                yield {**row, "alarm": ratios.get(leader, 0.0) > limit, "leader": leader, "refused": not ratios}
+
+
+def _own(row: Record) -> bool:
+    return str(row["changed"]).split()[0] in _OWN[str(row["equation"])]
+
+
+def _read(rows: Sequence[Record], size: str) -> str:
+    """Median readings of the changed own parameters."""
+    found = {}
+    for (changed,), group in grouped(rows, "changed").items():
+        name = str(changed).split()[0]
+        if name in _OWN[str(group[0]["equation"])] and str(changed).endswith(size):
+            read = median(row.get(name) for row in group)
+            found[str(changed)] = "–" if read is None else f"{100 * read:+.1f} %"
+    return ", ".join(f"{changed}: {read}" for changed, read in found.items())
+
+
+def _spread(rows: Sequence[Record]) -> str:
+    healthy = [row for row in rows if row["changed"] == "healthy"]
+    names = [name for name in _OWN[str(rows[0]["equation"])] if any(name in row for row in healthy)]
+    values = {name: floats(row.get(name) for row in healthy) for name in names}
+    return ", ".join(f"{name} {100 * float(robust(found)):.2f} %" for name, found in values.items()) or "–"
+
+
+def _tables(false_alarm_rate: float) -> tuple[Table, ...]:
+    rows = partial(_judged, false_alarm_rate)
+    by = ("layout", "equation", "group", "variant")
+    found = {
+        f"{kind} {size}": lambda rows, kind=kind, size=size: rate(
+            row["alarm"] for row in rows if _own(row) and str(row["changed"]).startswith(kind)
+            and str(row["changed"]).endswith(size)
+        )
+        for kind, size in (("k", "-20%"), ("k", "-5%"), ("c", "-20%"), ("e", "+20%"), ("e", "+5%"))
+    }  # fmt: skip
+    wrong = {
+        "false alarms": lambda rows: rate(row["alarm"] for row in rows if row["changed"] == "healthy"),
+        "elsewhere": lambda rows: rate(row["alarm"] for row in rows if "20%" in str(row["changed"]) and not _own(row)),
+    }
+    return (
+        Table(
+            "ablation", by,
+            found | wrong | {"spread": _spread, "reads": lambda rows: _read(rows, "20%"),
+                             "refused": lambda rows: rate(row["refused"] for row in rows)},
+            rows,
+        ),
+        Table(
+            "ablation-parameters", (*by, "changed"),
+            {
+                "alarm": lambda rows: rate(row["alarm"] for row in rows),
+                "alarm, the changed one leading": lambda rows: rate(
+                    row["alarm"] and row["leader"] == str(row["changed"]).split()[0] for row in rows
+                ),
+                "reads": lambda rows: median(row.get(str(row["changed"]).split()[0]) for row in rows),
+            },
+            lambda records: (row for row in rows(records) if row["changed"] != "healthy" and _own(row)),
+        ),
+        Table(
+            "ablation-both", ("group", "variant"),
+            {
+                f"({number}) {name}": partial(_pivot, number, figure)
+                for number in _NUMBERS
+                for name, figure in (("found, large", _large), ("reads", _read_large))
+            } | {"false alarms": wrong["false alarms"], "wrong location": wrong["elsewhere"]},
+            lambda records: (row for row in rows(records) if row["layout"] == "either"),
+            "Both layouts mixed. *Found*: alarms at k −20 %, c −20 % and e +20 % of the equation's own parameters; "
+            "*reads*: the median reading of each; *wrong location*: alarms at 20 % of another equation's parameter.",
+        ),
+    )  # fmt: skip
+
+
+def _pivot(number: str, figure: object, rows: Sequence[Record]) -> str:
+    own = [row for row in rows if row["equation"] == number]
+    return str(figure(own)) if own and callable(figure) else ""
+
+
+def _large(rows: Sequence[Record]) -> str:
+    large = grouped((row for row in rows if "20%" in str(row["changed"]) and _own(row)), "changed")
+    rates = [(str(changed).split()[0], rate(row["alarm"] for row in group)) for (changed,), group in large.items()]
+    return ", ".join(
+        f"{name} {100 * one.value:.0f} ({100 * one.low:.0f}–{100 * one.high:.0f})" for name, one in rates if one
+    )
+
+
+def _read_large(rows: Sequence[Record]) -> str:
+    return _read(rows, "20%").replace(" -20%: ", " ").replace(" +20%: ", " ")
+
+
+def ablation(options: Options) -> Study:
+    """Variants of the relation networks on the same windows."""
+    machine = load_machine((options.machines or ("lab",))[0])
+    bundle = load_bundle(machine.name, machine)
+    calibration = 9 if options.small else 199
+    cells = []
+    for layout in (None, Layout.INDEPENDENT):
+        given: object = (Purpose.CALIBRATION, _FIXED_STREAM, {}, layout)
+        fewer = calibration if options.small or layout is None else 99
+        cells.append(Cell({"layout": LAYOUTS[layout], "purpose": "calibration", "changed": "healthy"}, fewer, given))
+        cells += [
+            Cell(
+                {"layout": LAYOUTS[layout], "purpose": "evaluation", "changed": changed_in(faults)},
+                options.windows if layout is None else max(2, options.windows // 2),
+                (Purpose.EVALUATION, at, faults, layout),
+            )
+            for at, faults in enumerate(_FAULTS)
+        ]
+    return Study(
+        name="ablation",
+        cells=tuple(cells),
+        measure=partial(_measure, machine, bundle, options.seed),
+        learn=partial(_learn, machine, options),
+        tables=_tables(options.rate),
+        goals=_goals,
+        made_with={machine.name: f"{machine.physics_hash} {bundle.identity}"},
+    )
+
+
+def _goals(_: Sequence[Record]) -> Iterator[Goal]:
+    yield from ()

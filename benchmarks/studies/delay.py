@@ -1,0 +1,343 @@
+"""Time to detection of step changes: streams, the same test on Gaussian hops, and the bound's time beside them.
+
+A stream is simulated sample by sample and fed to the sliding window, the likelihood and the sequential test as the
+monitor feeds them. The bound's time is the data that a test of one fixed length needs for a power of 95 % if it reads
+the parameter with the Cramér-Rao standard error, which falls as 1/√T. The Gaussian hops have that standard error: what
+they need beyond the bound's time is the price of looking at every hop and of the hop itself.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from benchmarks.studies.evaluate import LAYOUTS, true_condition
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, grouped, median, rate, within
+from benchmarks.studies.study import Cell, Options, Study
+from models.diagnosis.likelihood.bound import cramer_rao
+from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.moments import plan_for
+from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
+from models.diagnosis.verdict.delay import detection_delays
+from models.diagnosis.verdict.determined import determined
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
+from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
+from models.diagnosis.window import SlidingWindow
+from models.errors import EstimationError
+from models.machine import Machine, load_machine
+from models.physics.parameters import PARAMETERS
+from simulator.scenario import Event, Scenario
+from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+
+__all__ = ["bound_time_s", "delay", "with_hop"]
+
+_CHANGES = (("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2))
+"""Steps that are timed; their place is part of the seed."""
+_GAUSSIAN = ((5.0, (2, 4)), (5.0, (2, 4, 7)), (2.5, (2, 4, 7)), (2.5, (2, 4, 8, 14)))
+"""Hop lengths and short stretches that are compared on Gaussian hops."""
+_POWER = 1.644854
+"""Normal quantile of 95 %: how far above its threshold a change must lie to be found that often."""
+_HEALTHY_HOPS = 3
+_AFTER_S = 120.0
+_BLOCK_S = 0.5
+_STREAM = 40
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """One change in one layout at one hop: what trials have in common."""
+
+    machine: Machine
+    seed: int
+    stream: int
+    layout: Layout
+    parameter: str
+    change: float
+
+    def trial(self, number: int) -> tuple[Scenario, Scenario, float, dict[str, float]]:
+        """Condition without the step, the stream with it, when it comes, and the bound of a window."""
+        draw = Draw(self.machine, self.seed, Purpose.EVALUATION, self.stream, layout=self.layout)
+        healthy = draw_condition(draw, number)
+        rng = np.random.default_rng([self.seed, Purpose.EVALUATION, self.stream, number, _STREAM])
+        step_s = healthy.duration_s + self.machine.window.hop_s * float(rng.uniform(0, _HEALTHY_HOPS))
+        step = Event(at_s=step_s, parameter=self.parameter, relative_change=self.change)
+        states, length_s = plan_for(self.machine).states, self.machine.window.length_s
+        bound = cramer_rao(self.machine, states, true_condition(healthy, self.machine), length_s)
+        return healthy, healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound
+
+    def times(self, settings: SequentialSettings, bound: dict[str, float]) -> dict[str, Value]:
+        """The bound's time at the threshold of a test of the window alone, and at this test's."""
+        hops, own = settings.window_hops, settings.thresholds(settings.window_hops).first
+        fixed = month_thresholds(settings.false_alarms_per_month, settings.hop_s, hops, len(PARAMETERS)).first
+        length_s, error = self.machine.window.length_s, bound[self.parameter]
+        return {
+            name: _rounded(bound_time_s(error, length_s, self.parameter, self.change, threshold))
+            for name, threshold in (("bound_fixed_s", fixed), ("bound_s", own))
+        }
+
+
+def with_hop(machine: Machine, hop_s: float) -> Machine:
+    """The machine with another hop.
+
+    Raises
+    ------
+    ValueError
+        If its window cannot be cut so (`models.machine.WindowSettings`).
+    """
+    window = type(machine.window).model_validate(machine.window.model_dump() | {"hop_s": hop_s})
+    return machine.model_copy(update={"window": window})
+
+
+def bound_time_s(standard_error: float, duration_s: float, parameter: str, change: float, threshold: float) -> float:
+    """Data that a test of fixed length needs for a power of 95 % at the Cramér-Rao bound.
+
+    Parameters
+    ----------
+    standard_error : float
+        Bound of the relative change for `duration_s` of data of the unchanged machine.
+    duration_s : float
+    parameter : str
+    change : float
+        Relative change to be found.
+    threshold : float
+        Of the test, in standard errors.
+    """
+    return duration_s * ((threshold + _POWER) * standard_error / abs(to_scale(parameter, change))) ** 2
+
+
+class _Watch:
+    """One sequential test on one stream."""
+
+    def __init__(self, settings: SequentialSettings, step_ns: int, parameter: str) -> None:
+        self.test = SequentialTest(settings)
+        self._step_ns, self._parameter = step_ns, parameter
+        self.detected_s: float | None = None
+        self.named_s: float | None = None
+        self.early = self.wrong = False
+
+    @property
+    def finished(self) -> bool:
+        return self.early or self.named_s is not None
+
+    def update(self, looks: dict[int, Stretch], end_ns: int) -> None:
+        verdict = self.test.update(looks)
+        delay_s = (end_ns - self._step_ns) / 1e9
+        if delay_s <= 0:
+            self.early = self.early or verdict.detected
+            return
+        said = {finding.name for finding in verdict.findings}
+        self.wrong = self.wrong or bool(said - {self._parameter})
+        if verdict.detected and self.detected_s is None:
+            self.detected_s = delay_s
+        if said == {self._parameter} and self.named_s is None:
+            self.named_s = delay_s
+
+
+def _rates(machine: Machine) -> dict[str, float]:
+    """Declared false alarms per month: the machine file's, and 1 % per window length."""
+    per_window = 0.01 * MONTH_S / machine.window.length_s
+    return {"machine file": machine.alarms.false_alarms_per_month, "1 % per window": per_window}
+
+
+def _measure(_: None, cell: Cell, number: int) -> list[dict[str, Value]]:
+    case, gaussian = cell.given
+    if gaussian is not None:
+        return _gaussian(case, gaussian, number)
+    machine, plan = case.machine, plan_for(case.machine)
+    _, scenario, step_s, bound = case.trial(number)
+    settings = [SequentialSettings.for_machine(machine, rate) for rate in _rates(machine).values()]
+    window, whole, fits = SlidingWindow(plan), plan.hops, LengthFits(machine)
+    watches: list[_Watch] = []
+
+    def look(hops: int) -> Stretch | None:
+        statistics = window.statistics(hops)
+        if statistics is None:
+            return None
+        try:
+            read = fits.window(statistics) if hops == whole else fits.short(hops, statistics)
+        except (EstimationError, np.linalg.LinAlgError):
+            return None  # refused, as the monitor refuses it
+        known = determined(read, statistics, machine.window.length_s)
+        return stretch_of(known, statistics.start_ns, statistics.end_ns)
+
+    for block, _truth in blocks(scenario, machine, block_s=_BLOCK_S):
+        if not watches:
+            step_ns = block.start_ns + round(step_s * 1e9)
+            watches = [_Watch(one, step_ns, case.parameter) for one in settings]
+        for end_ns in window.feed(plan.to_si(block.samples), block.start_ns):
+            full = look(whole)
+            if full is None:
+                continue
+            wanted = {hops for watch in watches if not watch.finished for hops in watch.test.wanted()}
+            short = {hops: found for hops in sorted(wanted) if (found := look(hops)) is not None}
+            for watch in watches:
+                if not watch.finished:
+                    mine = {hops: short[hops] for hops in watch.test.wanted() if hops in short}
+                    watch.update(mine | {whole: full}, end_ns)
+        if all(watch.finished for watch in watches):
+            break
+    return [
+        {
+            "rate": rate,
+            "detected_s": _rounded(watch.detected_s),
+            "named_s": _rounded(watch.named_s),
+            "early": watch.early,
+            "wrong": watch.wrong,
+            **case.times(one, bound),
+        }
+        for rate, one, watch in zip(_rates(machine), settings, watches, strict=True)
+    ]
+
+
+def _gaussian(case: _Case, given: tuple[int, float, tuple[int, ...], int], at: int) -> list[dict[str, Value]]:
+    """The same change on Gaussian hops with the median Cramér-Rao standard errors of the streams' conditions."""
+    trials, hop_s, short, count = given
+    bounds = [case.trial(number)[3] for number in range(trials)]
+    error = {name: float(np.median([bound[name] for bound in bounds])) for name in PARAMETERS}
+    rate, per_month = list(_rates(case.machine).items())[at]
+    own = SequentialSettings.for_machine(case.machine, per_month)
+    bound_s = np.median([float(case.times(own, bound)["bound_s"] or 0) for bound in bounds])
+    settings = SequentialSettings.for_machine(with_hop(case.machine, hop_s), per_month)
+    settings = replace(settings, short_hops=short)
+    found = detection_delays(
+        settings,
+        np.diag(np.array([error[name] for name in PARAMETERS]) ** 2),
+        {case.parameter: case.change},
+        trials=count,
+        seed=case.seed,
+        before_hops=settings.window_hops + _HEALTHY_HOPS,
+        after_hops=round(min(_AFTER_S, max(30.0, 4 * bound_s)) / settings.hop_s),
+    )
+    times = {"rate": rate, "early": False, **case.times(settings, error)}
+    return [
+        {**times, "detected_s": _rounded(detected), "named_s": _rounded(named), "wrong": at_ < found.wrong}
+        for at_, (detected, named) in enumerate(zip(found.detected_s, found.named_s, strict=True))
+    ]
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
+
+
+def _quantile(values: Sequence[float], level: float) -> str:
+    if not values:
+        return "–"
+    found = float(np.quantile(values, level, method="higher"))
+    return f"{found:.3g}" if np.isfinite(found) else "not within 120 s"
+
+
+def _delays(rows: Sequence[Record], name: str = "detected_s") -> list[float]:
+    return [np.inf if row[name] is None else float(row[name] or 0) for row in rows if not row["early"]]
+
+
+def _ratios(rows: Sequence[Record], bound: str = "bound_s") -> list[float]:
+    valid = [row for row in rows if not row["early"]]
+    return [found / float(row[bound] or 1) for found, row in zip(_delays(valid), valid, strict=True)]
+
+
+def _within_twice(rows: Sequence[Record]) -> Estimate | None:
+    return rate(ratio <= 2 for ratio in _ratios(rows))
+
+
+_COLUMNS = {
+    "bound's time, median s": lambda rows: median(row["bound_s"] for row in rows),
+    "detected, median s": lambda rows: _quantile(_delays(rows), 0.5),
+    "95 %, s": lambda rows: _quantile(_delays(rows), 0.95),
+    "named, 95 %, s": lambda rows: _quantile(_delays(rows, "named_s"), 0.95),
+    "over bound's time, 50 %": lambda rows: _quantile(_ratios(rows), 0.5),
+    "95 %": lambda rows: _quantile(_ratios(rows), 0.95),
+    "within twice": _within_twice,
+}
+_TABLES = (
+    Table(
+        "delay",
+        ("source", "layout", "changed", "rate", "hop_s", "short_s"),
+        _COLUMNS | {
+            "95 %, fixed threshold": lambda rows: _quantile(_ratios(rows, "bound_fixed_s"), 0.95),
+            "wrong name": lambda rows: rate(row["wrong"] for row in rows if not row["early"]),
+            "alarm before the step": lambda rows: rate(row["early"] for row in rows),
+        },
+    ),
+    Table(
+        "delay-own-hop",
+        ("changed", "rate"),
+        _COLUMNS,
+        lambda records: (
+            row for row in records
+            if (row["source"], row["hop_s"], row["layout"]) == ("stream", 5.0, LAYOUTS[Layout.INDEPENDENT])
+        ),
+        "Streams with independent sources, hop of 5 s:",
+    ),
+)  # fmt: skip
+
+
+def _goals(records: Sequence[Record]) -> Iterator[Goal]:
+    streams = [row for row in records if row["source"] == "stream"]
+    several = [row for row in streams if row["layout"] == LAYOUTS[Layout.INDEPENDENT] and row["hop_s"] == 5.0]
+    for (declared,), rows in grouped(several, "rate").items():
+        shares = {str(changed): _within_twice(group) for (changed,), group in grouped(rows, "changed").items()}
+        yield within(f"found within twice the bound's time, {declared}", shares, 0.95, 1.0)
+    for (layout,), rows in grouped(streams, "layout").items():
+        yield within(f"a wrong name on the way, {layout}", {"all": rate(row["wrong"] for row in rows)}, 0.0, 0.01)
+    yield within("an alarm before the step", {"all": rate(row["early"] for row in streams)}, 0.0, 0.01)
+
+
+def _charts(records: Sequence[Record]) -> Iterator[Chart]:
+    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
+    several = [row for row in records if row["layout"] == LAYOUTS[Layout.INDEPENDENT]]
+    for (changed, declared), rows in grouped(several, "changed", "rate").items():
+        panel = panels.setdefault(f"{changed}, {declared}", {})
+        for (source, hop_s, short), group in grouped(rows, "source", "hop_s", "short_s").items():
+            found = np.sort(_delays(group))
+            share = np.arange(1, found.size + 1) / max(found.size, 1)
+            points = [(float(x), float(y)) for x, y in zip(found, share, strict=True) if np.isfinite(x)]
+            if source == "stream" or short == "10+20+35 s":
+                panel[f"{source}, hop {hop_s:g} s"] = list(points)
+    yield Chart(
+        "delay", "Share found over the time since the change: streams, and Gaussian hops at the bound",
+        panels, "time since the change, s", "found", steps=True, lines=(0.95,),
+    )  # fmt: skip
+
+
+def delay(options: Options) -> Study:
+    """Step changes on streams and on Gaussian hops."""
+    machine = load_machine((options.machines or ("lab",))[0])
+    own = machine.window.hop_s
+    hops = [own, own / 2] if (own / machine.window.segment_s).is_integer() else [own]
+    cells = []
+    for hop_s in hops:
+        layouts = (Layout.INDEPENDENT, Layout.ONE_SOURCE) if hop_s == own else (Layout.INDEPENDENT,)
+        for layout in layouts:
+            for at, (parameter, change) in enumerate(_CHANGES):
+                case = _Case(
+                    with_hop(machine, hop_s), options.seed, _STREAM + 10 * layout + at, layout, parameter, change
+                )
+                most = hop_s == own and layout is Layout.INDEPENDENT
+                trials = options.windows if most or options.small else max(2, round(0.4 * options.windows))
+                keys = {"source": "stream", "layout": LAYOUTS[layout], "changed": f"{parameter} {change:+.0%}"}
+                short = SequentialSettings.for_machine(case.machine, 1.0).short_hops
+                cells.append(Cell(keys | {"hop_s": hop_s, "short_s": _seconds(short, hop_s)}, trials, (case, None)))
+                if most:
+                    cells += [
+                        # One source is limited by sensor noise alone: its bound says nothing of a test on hops.
+                        Cell(
+                            keys | {"source": "Gaussian hops", "hop_s": other, "short_s": _seconds(lengths, other)},
+                            len(_rates(machine)),
+                            (case, (trials, other, lengths, 4 if options.small else 200)),
+                        )
+                        for other, lengths in _GAUSSIAN
+                    ]
+    return Study(
+        name="delay",
+        cells=tuple(cells),
+        measure=_measure,
+        tables=_TABLES,
+        goals=_goals,
+        charts=_charts,
+        made_with={machine.name: machine.physics_hash},
+    )
+
+
+def _seconds(short: tuple[int, ...], hop_s: float) -> str:
+    return "+".join(f"{hops * hop_s:g}" for hops in short) + " s"

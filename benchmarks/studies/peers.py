@@ -1,0 +1,235 @@
+"""The diagnosticians and the methods a user would otherwise pick, on the same windows.
+
+Two settings: in the laboratory nothing varies but the realisation, in the varying setting every window has a condition
+of its own. A change alters the machine and nothing else: force and noise are drawn for the healthy one.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from benchmarks.studies.opinions import TITLES, changed_in, diagnosticians, opinion
+from benchmarks.studies.other_methods import FeatureVector, Peer, SubspaceModes
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, grouped, limit_of, rate
+from benchmarks.studies.study import Cell, Options, Over, Study
+from models.diagnosis.moments import plan_for
+from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperDiagnostician, calibrate_paper
+from models.diagnosis.networks.paper_training import train_paper_network
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.machine import Machine, load_machine
+from models.signals.block import FloatArray
+from simulator.scenario import Event
+from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+
+__all__ = ["peers"]
+
+_BLOCK_S = 5.0
+_APART = 1_000_000
+"""Numbers of the laboratory's windows: learning, limits and every cell have a million of their own."""
+_SETTINGS = ("laboratory", "varying")
+_CHANGES: tuple[dict[str, float], ...] = (
+    {},
+    *({name: sign * size} for name, sign in (("k_by", -1), ("c_by", -1), ("e", 1)) for size in (0.05, 0.1, 0.2)),
+)
+"""Healthy, and bearing stiffness, bearing damping and unbalance changed by 5, 10 and 20 %."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Series:
+    """Windows of one purpose: 0 to learn from, 1 for the limits, 2 and up the cells."""
+
+    setting: str
+    number: int
+    faults: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class _Learned:
+    """Of one setting: methods that have learned healthy windows, and their limits."""
+
+    peers: tuple[Peer, ...]
+    limits: tuple[float, ...]
+    paper: PaperDiagnostician
+
+
+def _methods(machine: Machine) -> tuple[Peer, ...]:
+    return SubspaceModes(machine), FeatureVector(machine)
+
+
+def _simulate(machine: Machine, seed: int, series: _Series, number: int) -> tuple[FloatArray, WindowStatistics]:
+    """SI samples and statistics of one window."""
+    if series.setting == "laboratory":
+        draw = Draw(machine, seed, Purpose.EVALUATION, layout=Layout.ONE_SOURCE, fixed_condition=True)
+        number += series.number * _APART
+    else:
+        purpose = (Purpose.TRAINING, Purpose.CALIBRATION, Purpose.EVALUATION)[min(series.number, 2)]
+        draw = Draw(machine, seed, purpose, series.number)
+    events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in series.faults.items()]
+    scenario = draw_condition(draw, number).overridden(faults=events)
+    sizes = plan_for(machine)
+    statistics = SlidingWindow(sizes)
+    parts = []
+    for block, _ in blocks(scenario, machine, block_s=_BLOCK_S):
+        parts.append(sizes.to_si(block.samples))
+        for _ in statistics.feed(parts[-1], block.start_ns):
+            pass
+    window = statistics.statistics()
+    assert window is not None  # noqa: S101  # the drawn scenario lasts one window by construction
+    return np.concatenate(parts), window
+
+
+def _looked(machine: Machine, seed: int, job: tuple[_Series, int]) -> tuple[tuple[FloatArray, ...], WindowStatistics]:
+    """Features of every other method, and the statistics without hops and spectra: the printed networks need none."""
+    samples, window = _simulate(machine, seed, *job)
+    kept = replace(
+        window,
+        hop_correlation=window.hop_correlation[:0],
+        spectrum=window.spectrum[:0],
+        frequencies_hz=window.frequencies_hz[:0],
+    )
+    return tuple(peer.features(samples) for peer in _methods(machine)), kept
+
+
+def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Learned]:
+    """Both settings, on as many healthy windows to learn from as for the limits."""
+    count = 9 if options.small else 199
+    found = {}
+    for setting in _SETTINGS:
+        look = partial(_looked, machine, options.seed)
+        fit, limit = (
+            over(f"{setting}, {label}", look, [(_Series(setting, at, {}), number) for number in range(count)])
+            for at, label in enumerate(("healthy to learn", "healthy for the limits"))
+        )
+        methods, limits = _methods(machine), []
+        for n, peer in enumerate(methods):
+            peer.fit(np.stack([features[n] for features, _ in fit]))
+            limits.append(limit_of(np.array([peer.score(features[n]) for features, _ in limit]), options.rate))
+        windows = [window for _, window in fit]
+        measured = {*windows[0].states, *(() if windows[0].synchronous is None else ("theta",))}
+        networks = [
+            train_paper_network(equation, windows, machine, options.seed)
+            for equation in PAPER_EQUATIONS
+            if set(equation.channels) <= measured
+        ]
+        healthy = calibrate_paper(networks, [window for _, window in limit], machine, options.rate)
+        found[setting] = _Learned(methods, tuple(limits), PaperDiagnostician(machine, networks, healthy))
+    return found
+
+
+def _measure(
+    machine: Machine, bundle: Bundle, options: Options, learned: Mapping[str, _Learned], cell: Cell, number: int
+) -> list[dict[str, Value]]:
+    series: _Series = cell.given
+    own = learned[series.setting]
+    samples, window = _simulate(machine, options.seed, series, number)
+    rows: list[dict[str, Value]] = []
+    for peer, limit in zip(own.peers, own.limits, strict=True):
+        score = peer.score(peer.features(samples))
+        judged = bool(np.isfinite(score))
+        rows.append(
+            {"method": peer.name, "score": score if judged else None, "detected": score > limit, "refused": not judged}
+        )
+    equations = {equation.number for equation in PAPER_EQUATIONS if set(equation.parameters) & set(series.faults)}
+    flagged = own.paper.flagged_equations(own.paper.diagnose(window))
+    rows.append(
+        {"method": "paper", "named": " ".join(flagged), "detected": bool(flagged), "exact": set(flagged) == equations}
+    )
+    for one in diagnosticians(machine, bundle):
+        said = opinion(one, window, (options.rate,))
+        named = str(said.get("named", "")).split()
+        judged = not said["refused"]
+        rows.append(
+            {
+                "method": one.by,
+                "named": " ".join(named),
+                "detected": bool(named),
+                "exact": judged and set(named) == set(series.faults),
+                "refused": not judged,
+            }
+        )
+    return rows
+
+
+def _of(rows: Sequence[Record], method: str, column: str) -> Estimate | None:
+    return rate(row[column] for row in rows if row["method"] == method and column in row)
+
+
+_NAMES = ("SSI-cov", "features", *TITLES)
+_HEADS = {"SSI-cov": "SSI-cov", "features": "features, T²", **TITLES}
+
+
+def _short(rows: Sequence[Record], method: str) -> str:
+    """Detected, and behind it named exactly where the method says what changed; per cent."""
+    figures = [_of(rows, method, column) for column in ("detected", "exact")]
+    return " / ".join(f"{100 * one.value:.0f}" for one in figures if one is not None)
+
+
+_TABLES = (
+    Table(
+        "peers",
+        ("setting", "changed", "method"),
+        {
+            "detected": lambda rows: rate(row["detected"] for row in rows),
+            "exactly named": lambda rows: rate(row["exact"] for row in rows if "exact" in row),
+            "refused": lambda rows: sum(bool(row.get("refused")) for row in rows),
+        },
+    ),
+    Table(
+        "peers-short",
+        ("setting", "changed"),
+        {_HEADS[name]: partial(lambda name, rows: _short(rows, name), name) for name in _NAMES},
+        page="Per cent of windows in which something is said to have changed / exactly the right parameters (printed "
+        "networks: equations) are named:",
+    ),
+)
+
+
+def _goals(records: Sequence[Record]) -> Iterator[Goal]:
+    """Where another method notices a change more often than the likelihood."""
+    lost = []
+    for (setting, changed), rows in grouped(records, "setting", "changed").items():
+        own = _of(rows, "likelihood", "detected")
+        for name in ("SSI-cov", "features", "paper"):
+            other = _of(rows, name, "detected")
+            if changed != "healthy" and own is not None and other is not None and other.low > own.high:
+                lost.append(f"{setting}, {changed}: {_HEADS[name]} {other}, likelihood {own}")
+    yield Goal("no other method notices a change more often than the likelihood (intervals apart)", "nowhere",
+               "; ".join(lost) or "nowhere", "missed" if lost else "met")  # fmt: skip
+
+
+def _charts(records: Sequence[Record]) -> Iterator[Chart]:
+    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
+    for (setting, changed, method), rows in grouped(records, "setting", "changed", "method").items():
+        for column, title in (("detected", "something changed"), ("exact", "exactly the right set")):
+            share = _of(rows, str(method), column)
+            if share is not None:
+                panel = panels.setdefault(f"{setting}: {title}", {})
+                panel.setdefault(_HEADS[str(method)], []).append((str(changed), share))
+    yield Chart("results-peers", "Every method on the same windows, 95 % intervals", panels, "true change",
+                "share of windows")  # fmt: skip
+
+
+def peers(options: Options) -> Study:
+    """Beside operational modal analysis, a feature vector and the networks as printed."""
+    machine = load_machine((options.machines or ("lab",))[0])
+    bundle = load_bundle(machine.name, machine)
+    changes = (_CHANGES[0], _CHANGES[3], _CHANGES[6]) if options.small else _CHANGES
+    cells = tuple(
+        Cell({"setting": setting, "changed": changed_in(faults)}, options.windows, _Series(setting, at + 2, faults))
+        for setting in _SETTINGS
+        for at, faults in enumerate(changes)
+    )
+    return Study(
+        name="peers",
+        cells=cells,
+        measure=partial(_measure, machine, bundle, options),
+        learn=partial(_learn, machine, options),
+        tables=_TABLES,
+        goals=_goals,
+        charts=_charts,
+        made_with={machine.name: f"{machine.physics_hash} {bundle.identity}"},
+    )

@@ -1,0 +1,287 @@
+"""From records to figures: groups, rates and spreads with their 95 % intervals, and goals judged by them.
+
+Spread is a robust standard deviation, 1.4826 times the median distance from the median. Intervals of rates are
+Clopper-Pearson, those of everything else come from resampling the windows.
+"""
+
+import csv
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import scipy.stats
+
+__all__ = [
+    "Chart",
+    "Estimate",
+    "Goal",
+    "Record",
+    "Table",
+    "Value",
+    "at_least",
+    "at_most",
+    "floats",
+    "grouped",
+    "limit_of",
+    "median",
+    "pooled",
+    "rate",
+    "robust",
+    "spread",
+    "within",
+]
+
+Value = str | float | bool | None
+"""Of a record: what JSON has, none of it nested."""
+Record = Mapping[str, Value]
+FloatArray = npt.NDArray[np.float64]
+
+_RESAMPLINGS = 400
+_RESAMPLING_SEED = 20261
+_FEWEST = 4
+"""A spread of fewer windows says nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A figure with its 95 % interval.
+
+    Attributes
+    ----------
+    value, low, high : float
+    n : int
+        Windows.
+    count : int or None
+        Of a rate: windows in which it holds.
+    """
+
+    value: float
+    low: float
+    high: float
+    n: int
+    count: int | None = None
+
+    def __str__(self) -> str:
+        if self.count is None:
+            return f"{self.value:.3g} ({self.low:.3g}–{self.high:.3g})"
+        return f"{100 * self.value:.3g} % ({100 * self.low:.3g}–{100 * self.high:.3g}, {self.count} of {self.n})"
+
+
+def rate(flags: Iterable[object]) -> Estimate | None:
+    """Share of independent windows in which something holds, with its Clopper-Pearson interval; None without any."""
+    held = [bool(flag) for flag in flags]
+    return _share(sum(held), len(held)) if held else None
+
+
+def _share(count: int, n: int) -> Estimate:
+    low = 0.0 if count == 0 else float(scipy.stats.beta.ppf(0.025, count, n - count + 1))
+    high = 1.0 if count == n else float(scipy.stats.beta.ppf(0.975, count + 1, n - count))
+    return Estimate(count / n, low, high, n, count)
+
+
+def pooled(rates: Iterable[Estimate | None]) -> Estimate | None:
+    """One rate of all windows together; None without any."""
+    found = [one for one in rates if one is not None and one.count is not None]
+    return _share(sum(one.count or 0 for one in found), sum(one.n for one in found)) if found else None
+
+
+def resampled(statistic: Callable[[FloatArray], FloatArray], values: FloatArray) -> Estimate:
+    """Resample the windows; the statistic works on the last axis. Seed fixed: the same windows, the same limits."""
+    rng = np.random.default_rng(_RESAMPLING_SEED)
+    drawn = statistic(values[rng.integers(len(values), size=(_RESAMPLINGS, len(values)))])
+    low, high = np.quantile(drawn, (0.025, 0.975)).tolist()
+    return Estimate(float(statistic(values)), low, high, len(values))
+
+
+def robust(values: FloatArray) -> FloatArray:
+    """1.4826 times the median distance from the median, over the last axis."""
+    middle = np.median(values, axis=-1, keepdims=True)
+    return np.asarray(1.4826 * np.median(np.abs(values - middle), axis=-1), dtype=np.float64)
+
+
+def floats(values: Iterable[Value]) -> FloatArray:
+    """The numbers among them."""
+    return np.array([value for value in values if value is not None and not isinstance(value, str)], dtype=np.float64)
+
+
+def spread(values: Iterable[Value]) -> Estimate | None:
+    """Robust standard deviation; None of too few."""
+    found = floats(values)
+    return resampled(robust, found) if len(found) >= _FEWEST else None
+
+
+def median(values: Iterable[Value]) -> float | None:
+    """Median; None without any."""
+    found = floats(values)
+    return float(np.median(found)) if len(found) else None
+
+
+def limit_of(healthy: FloatArray, false_alarm_rate: float) -> float:
+    """Limit that a further healthy window exceeds with the declared probability at most, whatever the distribution.
+
+    Parameters
+    ----------
+    healthy : ndarray, shape (n,)
+        Scores of healthy windows that nothing was learned from.
+    false_alarm_rate : float
+        α per window: the ⌈(n+1)(1-α)⌉-th smallest score is the limit.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than 1/α - 1 scores.
+    """
+    rank = int(np.ceil((healthy.size + 1) * (1 - false_alarm_rate) - 1e-9))
+    if rank > healthy.size:
+        fewest = int(np.ceil(1 / false_alarm_rate - 1e-9)) - 1
+        raise ValueError(
+            f"{healthy.size} healthy scores for a rate of {false_alarm_rate:g}, expected at least {fewest}"
+        )
+    return float(np.sort(healthy)[rank - 1])
+
+
+def grouped(records: Iterable[Record], *by: str) -> dict[tuple[Value, ...], list[Record]]:
+    """Records by the values of some columns, in the order in which they come first."""
+    groups: dict[tuple[Value, ...], list[Record]] = {}
+    for record in records:
+        groups.setdefault(tuple(record[name] for name in by), []).append(record)
+    return groups
+
+
+Figure = Estimate | float | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table of results: one row for every group of records.
+
+    Attributes
+    ----------
+    name : str
+        Of its CSV file.
+    by : tuple of str
+        Columns whose values make a group.
+    columns : mapping of str to callable
+        Heading to a figure of the group's records.
+    rows : callable
+        What is grouped, from the records: themselves, or one for each parameter.
+    page : str
+        Heading under which it stands on the page; empty if it is in its file alone.
+    """
+
+    name: str
+    by: tuple[str, ...]
+    columns: Mapping[str, Callable[[Sequence[Record]], Figure]]
+    rows: Callable[[Sequence[Record]], Iterable[Record]] = field(default=lambda records: records)
+    page: str = ""
+
+    def of(self, records: Sequence[Record]) -> list[dict[str, Figure]]:
+        """Its rows."""
+        rows: list[dict[str, Figure]] = []
+        for key, group in grouped(self.rows(records), *self.by).items():
+            rows.append({**dict(zip(self.by, key, strict=True)), **{n: of(group) for n, of in self.columns.items()}})
+        return rows
+
+    def write(self, records: Sequence[Record], folder: Path) -> Path:
+        """Write it as CSV; an estimate takes four columns: value, 95 % interval, windows."""
+        path = folder / f"{self.name}.csv"
+        rows = [{k: v for name, value in row.items() for k, v in _cells(name, value)} for row in self.of(records)]
+        heads = list(dict.fromkeys(name for row in rows for name in row))
+        with path.open("w", encoding="utf-8", newline="") as out:
+            writer = csv.DictWriter(out, heads, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+        return path
+
+
+def _cells(name: str, value: Figure) -> list[tuple[str, Value]]:
+    if isinstance(value, Estimate):
+        parts = {"": value.value, " low": value.low, " high": value.high, " windows": value.n}
+        return [(f"{name}{part}", f"{figure:.5g}") for part, figure in parts.items()]
+    return [(name, f"{value:.5g}" if isinstance(value, float) else value)]
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """A declared goal, and what was measured of it.
+
+    Attributes
+    ----------
+    what, declared, measured : str
+    verdict : str
+        ``met``, ``missed`` where the whole 95 % interval misses it, ``within chance`` where only the figure does, or
+        ``–`` where nothing was declared or measured.
+    """
+
+    what: str
+    declared: str
+    measured: str
+    verdict: str
+
+
+def at_least(what: str, measured: Estimate | None, least: float, declared: str = "") -> Goal:
+    """Goal of a figure that should not be below a limit."""
+    return _judged(what, measured, least, np.inf, declared or f"≥ {_limit(measured, least)}")
+
+
+def at_most(what: str, measured: Estimate | None, most: float, declared: str = "") -> Goal:
+    """Goal of a figure that should not be above a limit."""
+    return _judged(what, measured, -np.inf, most, declared or f"≤ {_limit(measured, most)}")
+
+
+def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: float) -> Goal:
+    """Goal of one or several figures that should all lie between two limits; the farthest off is shown."""
+    found = {name: one for name, one in figures.items() if one is not None}
+    if not found:
+        return Goal(what, "", "–", "–")
+    judged = {name: _judged(what, one, low, high, "") for name, one in found.items()}
+    name = max(found, key=lambda name: abs(found[name].value - (low + high) / 2))
+    verdicts = [one.verdict for one in judged.values()]
+    verdict = next((one for one in ("missed", "within chance") if one in verdicts), "met")
+    several = f"{verdicts.count('met')} of {len(found)} inside; farthest {name}: " if len(found) > 1 else ""
+    declared = f"{_limit(found[name], low)} to {_limit(found[name], high)}"
+    return Goal(what, declared, f"{several}{found[name]}", verdict)
+
+
+def _limit(measured: Estimate | None, value: float) -> str:
+    return f"{value:.3g}" if measured is None or measured.count is None else f"{100 * value:.3g} %"
+
+
+def _judged(what: str, one: Estimate | None, low: float, high: float, declared: str) -> Goal:
+    if one is None:
+        return Goal(what, declared, "–", "–")
+    if low <= one.value <= high:
+        return Goal(what, declared, str(one), "met")
+    return Goal(what, declared, str(one), "missed" if one.high < low or one.low > high else "within chance")
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """Points with intervals in panels, or distributions as steps.
+
+    Attributes
+    ----------
+    name, caption : str
+        Of the file, and below it.
+    panels : mapping
+        Title to series; a series has points, an abscissa (a number or a word) each with an estimate, or with a float.
+    x, y : str
+        What the axes are.
+    steps : bool
+        Distributions: the abscissa is a number, the estimate a share.
+    log : bool
+        Logarithmic ordinate.
+    lines : tuple of float
+        Rules across.
+    """
+
+    name: str
+    caption: str
+    panels: Mapping[str, Mapping[str, Sequence[tuple[str | float, Estimate | float]]]]
+    x: str
+    y: str
+    steps: bool = False
+    log: bool = False
+    lines: tuple[float, ...] = ()

@@ -1,0 +1,153 @@
+"""Sensors at fault on a healthy machine: named, called a matter of data health, or taken for a fault of the machine."""
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+
+import numpy as np
+
+from benchmarks.studies.opinions import opinion
+from benchmarks.studies.results import Goal, Record, Table, Value, grouped, rate, within
+from benchmarks.studies.study import Cell, Options, Study
+from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
+from models.commissioning.knowledge import KnowledgeLevel
+from models.diagnosis.readings import Diagnostician
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
+from models.errors import MachineFileError
+from models.machine import Machine
+from models.physics.matrices import STATE_INDEX
+from models.signals.channels import Channel, Quantity, state_name
+from simulator.integrator import theoretical_rms
+from simulator.scenario import Event, Scenario
+from simulator.timeline import compile_timeline
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
+
+__all__ = ["sensors"]
+
+_FAULTS = {
+    "healthy": ("none (healthy)", ""),
+    "gain": ("gain ± 10–30 %", "gain"),
+    "drift": ("gain drifting by ± 10–30 %", "gain"),
+    "offset": ("offset of 3–10 rms", "offset"),
+    "stuck": ("stuck", "stuck"),
+    "clip": ("clipped at 1–2 rms", "clipped"),
+    "delay": ("delay of 1–5 ms", "delay"),
+    "swapped": ("swapped with another channel", "swapped"),
+}
+"""What is wrong with one channel, in words and as the checks call it; its place is part of the seed."""
+_LEVELS = (KnowledgeLevel.NONE, KnowledgeLevel.FULL)
+
+
+@lru_cache(maxsize=2)
+def _learned(name: str, level: KnowledgeLevel, seed: int, healthy: int) -> tuple[Diagnostician, SensorReference]:
+    subject = subject_named(name)
+    windows = subject.healthy(seed, 0, healthy)
+    file = subject.file(level)
+    assert file is not None  # noqa: S101  # a shipped machine has a file at every level
+    return commissioned(level, file, windows), learn_sensor_reference(windows)
+
+
+def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
+    name, level, fault = cell.given
+    diagnostician, reference = _learned(name, level, options.seed, 2 if options.small else 6)
+    file = subject_named(name).file(KnowledgeLevel.FULL)
+    assert isinstance(file, Machine)  # noqa: S101  # a shipped machine is known
+    at = list(_FAULTS).index(fault)
+    draw = Draw(file, options.seed, Purpose.EVALUATION, stream=900 + at, layout=Layout(number % 2))
+    scenario = draw_condition(draw, number)
+    event, channel, size = _event(fault, file, scenario, np.random.default_rng([options.seed, at, number]))
+    if event is not None:
+        scenario = scenario.model_copy(update={"events": (*scenario.events, event)})
+    window = simulate_scenario(scenario, file)
+    findings = sensor_findings(window, reference, file.sensors)
+    state = "" if channel is None else state_name(channel)
+    known: dict[str, Value] = {
+        "state": state,
+        "size": size,
+        "found": " ".join(dict.fromkeys(found.kind for found in findings)),
+        "right": any(found.kind == _FAULTS[fault][1] and state in found.states for found in findings),
+    }
+    # Nothing is said of the machine where something is found wrong with a sensor.
+    return [known if findings else known | opinion(diagnostician, window, (0.01,))]
+
+
+def _event(
+    fault: str, machine: Machine, scenario: Scenario, rng: np.random.Generator
+) -> tuple[Event | None, Channel | None, float]:
+    """The event of a fault, its channel and its size."""
+    if fault == "healthy":
+        return None, None, 0.0
+    channels = [channel for channel in machine.sensors if channel.quantity is not Quantity.SHAFT_ANGLE]
+    channel = channels[int(rng.integers(len(channels)))]
+    at_s = 0.0 if rng.random() < 0.5 else float(rng.uniform(0.1, 0.6)) * scenario.duration_s
+    sign = 1.0 if rng.random() < 0.5 else -1.0
+    condition = compile_timeline(scenario, machine).conditions[-1][1]
+    rms = float(theoretical_rms(machine, condition)[STATE_INDEX[state_name(channel)]])
+    fields: dict[str, object] = {"at_s": at_s, "sensor": channel.name, "sensor_fault": fault}
+    size = 0.0
+    match fault:
+        case "gain" | "drift":
+            size = sign * float(rng.uniform(0.1, 0.3))
+            fields |= {"sensor_fault": "gain", "value_SI": 1 + size}
+            fields |= {"at_s": 0.0, "ramp_s": scenario.duration_s} if fault == "drift" else {}
+        case "offset":
+            size = sign * float(rng.uniform(3.0, 10.0))
+            fields["value_SI"] = size * rms
+        case "clip":
+            size = float(rng.uniform(1.0, 2.0))
+            fields["value_SI"] = size * rms
+        case "delay":
+            size = float(rng.uniform(0.001, 0.005))
+            fields["value_SI"] = size
+        case "swapped":
+            others = [one for one in channels if (one.quantity, one.unit) == (channel.quantity, channel.unit)]
+            others.remove(channel)
+            fields["swapped_with"] = others[int(rng.integers(len(others)))].name
+    return Event.model_validate(fields), channel, size
+
+
+def _claims(record: Record) -> bool:
+    """A fault of the machine named without reserve: a name beside "outside the model" claims nothing."""
+    return bool(record.get("named")) and not record.get("outside")
+
+
+_COLUMNS = {
+    "fault and channel named": lambda rows: rate(row["right"] for row in rows),
+    "said to be the data": lambda rows: rate(row["found"] for row in rows),
+    "machine blamed": lambda rows: rate(map(_claims, rows)),
+}
+
+
+def _goals(records: Sequence[Record]) -> Iterator[Goal]:
+    healthy = grouped((row for row in records if row["fault"] == "none (healthy)"), "machine", "level")
+    yield within(
+        "a healthy sensor said to be at fault",
+        {", ".join(map(str, key)): rate(row["found"] for row in rows) for key, rows in healthy.items()}, 0.0, 0.01,
+    )  # fmt: skip
+    faulty = grouped((row for row in records if row["fault"] != "none (healthy)"), "machine", "fault", "level")
+    blamed = {", ".join(map(str, key)): rate(map(_claims, rows)) for key, rows in faulty.items()}
+    yield within("a faulty sensor taken for a fault of the machine", blamed, 0.0, 0.01)
+
+
+def sensors(options: Options) -> Study:
+    """One channel of a healthy machine at fault."""
+    machines = options.machines or ("lab",)
+    for name in machines:
+        if name not in SHIPPED:
+            raise MachineFileError(f"--machine {name}: not among {', '.join(SHIPPED)}")
+    cells = tuple(
+        Cell({"machine": name, "level": level.value, "fault": text}, options.windows, (name, level, fault))
+        for name in machines
+        for level in _LEVELS
+        for fault, (text, _) in _FAULTS.items()
+    )
+    return Study(
+        name="sensors",
+        cells=cells,
+        measure=partial(_measure, options),
+        tables=(
+            Table("sensors", ("machine", "level", "fault"), _COLUMNS),
+            Table("sensors-by-fault", ("fault",), _COLUMNS, page="Machines and levels together:"),
+        ),
+        goals=_goals,
+    )

@@ -1,0 +1,240 @@
+"""What a study is, and how it is run.
+
+A study declares its cells (windows of one kind, and how many), what is measured of a window, and what its records are
+added up to. The runner simulates window after window over worker processes and keeps one line of JSON for each, so that
+an interrupted study carries on where it stopped; windows of another plan are never mixed with them.
+
+::
+
+    Options ──> Study.cells ──> measure(learned, cell, number) ──> records ──> tables (CSV), goals, charts, page
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any, TypeVar
+
+from benchmarks.studies.results import Chart, Goal, Record, Table, Value
+from models.errors import RecordingError
+from simulator.training.progress import labelled_bars
+
+__all__ = ["Cell", "Options", "Over", "Study", "options_of", "read", "run"]
+
+_Task = TypeVar("_Task")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What is asked for on the command line.
+
+    Attributes
+    ----------
+    machines : tuple of str
+        The study's own if empty.
+    windows : int
+        Per cell; a study gives some cells a fixed multiple of it.
+    seed : int
+    small : bool
+        The smallest plan that exercises everything, at a declared rate of 10 % false alarms: a check, not a result.
+    """
+
+    machines: tuple[str, ...] = ()
+    windows: int = 100
+    seed: int = 20261122
+    small: bool = False
+
+    @property
+    def rate(self) -> float:
+        """Declared false alarms per window."""
+        return 0.1 if self.small else 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Windows of one kind.
+
+    Attributes
+    ----------
+    keys : mapping
+        What tells them from all others; columns of their records.
+    windows : int
+    given : object
+        What `Study.measure` needs besides to make one.
+    """
+
+    keys: Mapping[str, Value]
+    windows: int
+    given: Any = None
+
+    @property
+    def name(self) -> str:
+        """The keys in words."""
+        return ", ".join(f"{value}" for value in self.keys.values() if value not in ("", None))
+
+
+@dataclass(frozen=True, slots=True)
+class Over:
+    """Do a function over worker processes, in order, with a bar."""
+
+    name: str
+    pool: ProcessPoolExecutor | None
+    progress: Callable[[str, int, int], None]
+
+    def __call__(self, label: str, function: Callable[[_Task], _Result], tasks: Sequence[_Task]) -> list[_Result]:
+        """Results of all tasks; the function is at the top level of a module, or a partial of such a one."""
+        results = []
+        for result in map(function, tasks) if self.pool is None else self.pool.map(function, tasks):
+            results.append(result)
+            self.progress(f"{self.name}: {label}", len(results), len(tasks))
+        return results
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """One study, declared.
+
+    Attributes
+    ----------
+    name : str
+        Of its records, and of its words in ``texts.toml``.
+    cells : tuple of Cell
+    measure : callable
+        Records of one window, from what was learned, the cell and the window's number. At the top level of a module, or
+        a partial of such a function.
+    tables : tuple of Table
+    goals : callable
+        Judged figures from all records.
+    charts : callable
+        What is drawn of them.
+    learn : callable or None
+        What has to be trained or calibrated beforehand; done anew when a study is carried on.
+    made_with : mapping
+        Whatever else records of one file must share: digests of machine and bundle.
+    """
+
+    name: str
+    cells: tuple[Cell, ...]
+    measure: Callable[[Any, Cell, int], Sequence[Mapping[str, Value]]]
+    tables: tuple[Table, ...]
+    goals: Callable[[Sequence[Record]], Iterable[Goal]]
+    charts: Callable[[Sequence[Record]], Iterable[Chart]] = field(default=lambda _: ())
+    learn: Callable[[Over], Any] | None = None
+    made_with: Mapping[str, str] = field(default_factory=dict)
+
+
+def run(study: Study, options: Options, folder: Path, processes: int) -> Path:
+    """Measure what is missing of a study; returns the file of records.
+
+    Raises
+    ------
+    RecordingError
+        If the file holds windows of another plan, or cannot be written.
+    RotorwatchError
+        Whatever learning refuses.
+    """
+    kept = folder / f"{study.name}.jsonl"
+    head = {"study": study.name, "options": asdict(options), "made_with": dict(study.made_with)}
+    head = json.loads(json.dumps(head))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lines = _lines(kept)
+        if lines and _of_plan(lines[0]) != _of_plan(head):
+            raise RecordingError(f"{kept}: holds windows of {lines[0]}, expected {head}; choose another --out")
+        # Written again: a last line that was cut short would swallow the next one.
+        kept.write_text("".join(json.dumps(line) + "\n" for line in [head, *lines[1:]]), encoding="utf-8")
+    except OSError as error:
+        raise RecordingError(f"{kept}: cannot be written ({error.strerror})") from error
+    done = {(line["cell"], line["number"]) for line in lines[1:]}
+    tasks = [(cell, n) for cell in study.cells for n in range(cell.windows) if (cell.name, n) not in done]
+    if not tasks:
+        return kept
+    with ProcessPoolExecutor(processes) as pool, labelled_bars(remaining=True) as progress:
+        learned = (
+            None if study.learn is None else study.learn(Over(study.name, pool if processes > 1 else None, progress))
+        )
+        measure = partial(_measured, study.measure, learned)
+        found = pool.map(measure, tasks, chunksize=4) if processes > 1 else map(measure, tasks)
+        before = sum(cell.windows for cell in study.cells) - len(tasks)
+        with kept.open("a", encoding="utf-8") as out:
+            for at, line in enumerate(found, start=before + 1):
+                out.write(json.dumps(line) + "\n")
+                out.flush()
+                progress(f"{study.name}: windows", at, before + len(tasks))
+    return kept
+
+
+def _measured(
+    measure: Callable[[Any, Cell, int], Sequence[Mapping[str, Value]]], learned: object, task: tuple[Cell, int]
+) -> dict[str, Any]:
+    cell, number = task
+    return {"cell": cell.name, "number": number, "found": [dict(found) for found in measure(learned, cell, number)]}
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    """What is kept; a last line cut short by an interruption is left out.
+
+    Raises
+    ------
+    RecordingError
+        If another line is damaged.
+    """
+    if not path.exists():
+        return []
+    text = path.read_text(encoding="utf-8")
+    whole = text.splitlines() if text.endswith("\n") else text.splitlines()[:-1]
+    try:
+        return [json.loads(line) for line in whole]
+    except ValueError as error:
+        raise RecordingError(f"{path}: a line is not JSON ({error}), expected the records of a study") from error
+
+
+def _of_plan(head: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What must agree: more or fewer windows of the same plan are welcome."""
+    options = {name: value for name, value in head.get("options", {}).items() if name != "windows"}
+    return {**head, "options": options}
+
+
+def options_of(path: Path) -> Options:
+    """What a file of records was made with.
+
+    Raises
+    ------
+    RecordingError
+        If its first line does not say so.
+    """
+    try:
+        options = _lines(path)[0]["options"]
+        return Options(**options | {"machines": tuple(options["machines"])})
+    except (IndexError, KeyError, TypeError) as error:
+        raise RecordingError(f"{path}: does not say what it was made with, expected the records of a study") from error
+
+
+def read(study: Study, folder: Path) -> list[Record]:
+    """Records of all windows of the plan, with the keys of their cells; windows beyond the plan are left out.
+
+    Raises
+    ------
+    RecordingError
+        If there are none, or a line is damaged.
+    """
+    path = folder / f"{study.name}.jsonl"
+    lines = _lines(path)[1:]
+    if not lines:
+        raise RecordingError(f"{path}: no records; run the study first")
+    cells = {cell.name: cell for cell in study.cells}
+    records: list[Record] = []
+    for name, of_cell in groupby(lines, key=lambda line: line["cell"]):
+        cell = cells.get(name)
+        if cell is not None:
+            records += [
+                {**cell.keys, "number": line["number"], **found}
+                for line in of_cell
+                if line["number"] < cell.windows
+                for found in line["found"]
+            ]
+    return records

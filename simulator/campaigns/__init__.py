@@ -1,1 +1,0 @@
-"""Simulation campaigns behind ``rotortrain``: random windows, training, evaluation, studies and their pages."""
