@@ -39,7 +39,7 @@ _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
 _CACHED_BLOCKS = 300
 _CACHED_EVENTS = 200
-_QUERY_TIMEOUT_S = 2.0
+_QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0
 _CONNECT_S = 10.0
 _NEVER = timedelta(days=365)

@@ -29,6 +29,7 @@ from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 from tests.loopback import endpoint
+from tests.service.preloaded import Preloaded
 
 __all__ = [
     "IN_MEMORY",
@@ -194,7 +195,7 @@ class Feed:
 class Program:
     """A started program and the files its output goes to."""
 
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[bytes] | Preloaded
     out: Path
     err: Path
 
@@ -247,15 +248,20 @@ def program(
     """
     number = len(list(folder.glob("*.out")))
     out, err = folder / f"{number}.out", folder / f"{number}.err"
+    variables = {**({**os.environ, **_ALONE} if alone is None else alone), "COLUMNS": "200", **environment}
+    process: subprocess.Popen[bytes] | Preloaded
     with out.open("wb") as out_file, err.open("wb") as err_file:
-        process = subprocess.Popen(
-            [*within, sys.executable, "-m", *arguments],
-            cwd=cwd,
-            stdin=subprocess.DEVNULL,
-            stdout=out_file,
-            stderr=err_file,
-            env={**({**os.environ, **_ALONE} if alone is None else alone), "COLUMNS": "200", **environment},
-        )
+        if within or alone is not None:
+            process = subprocess.Popen(
+                [*within, sys.executable, "-m", *arguments],
+                cwd=cwd,
+                stdin=subprocess.DEVNULL,
+                stdout=out_file,
+                stderr=err_file,
+                env=variables,
+            )
+        else:
+            process = Preloaded(arguments, cwd, out, err, variables)
     try:
         yield Program(process, out, err)
     finally:
