@@ -5,11 +5,12 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.service.preloaded import ran
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
@@ -27,10 +28,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     for command in commands:
         program, *arguments = command.split()
-        words = [sys.executable, "-m", _PROGRAMS[program]] if program in _PROGRAMS else [program]
-        found = subprocess.run(
-            [*words, *arguments], cwd=place, env=variables, capture_output=True, text=True, timeout=600, check=False
-        )
+        if program in _PROGRAMS:
+            found = ran(_PROGRAMS[program], *arguments, cwd=place, environment=variables)
+        else:
+            found = subprocess.run(
+                [program, *arguments], cwd=place, env=variables, capture_output=True, text=True, check=False
+            )
         assert found.returncode == 0, f"{command}: {found.stdout}{found.stderr}"
     return place
 

@@ -1,7 +1,6 @@
 """The commands `import` and `export` as processes, with the example that the documents show."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +10,14 @@ import pytest
 from models.machine import load_machine_file
 from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
 from tests.interchange.material import stretches
+from tests.service.preloaded import ran
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "docs" / "examples" / "fe_rotor"
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "service.rotorwatch", *map(str, arguments)]
-    clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300, env=clean, check=False)
+    return ran("service.rotorwatch", *arguments, environment={"PATH": "/usr/bin:/bin", "COLUMNS": "200"})
 
 
 def sample(path: Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -9,9 +9,12 @@ import runpy
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
-__all__ = ["Preloaded"]
+__all__ = ["Preloaded", "ran"]
+
+_ROOT = Path(__file__).parents[2]
 
 _CONTEXT = multiprocessing.get_context("forkserver")
 _CONTEXT.set_forkserver_preload(["service.runtime", "simulator.publisher", "models.signals.recording", __name__])
@@ -20,7 +23,9 @@ _CONTEXT.set_forkserver_preload(["service.runtime", "simulator.publisher", "mode
 class Preloaded:
     """``python -m ARGUMENTS``, as `subprocess.Popen` would start it."""
 
-    def __init__(self, arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]) -> None:
+    def __init__(
+        self, arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]
+    ) -> None:
         self.args = arguments
         self._process = _CONTEXT.Process(target=_run, args=(arguments, cwd, out, err, environment))
         self._process.start()
@@ -60,6 +65,25 @@ class Preloaded:
     def kill(self) -> None:
         """kill -9."""
         self.send_signal(signal.SIGKILL)
+
+
+def ran(
+    *arguments: str | Path, cwd: Path = _ROOT, environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run ``python -m ARGUMENTS`` to its end, in the environment of the tests or in one of its own."""
+    words = tuple(map(str, arguments))
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = Path(folder, "out"), Path(folder, "err")
+        out.touch()
+        err.touch()
+        process = Preloaded(words, cwd, out, err, dict(os.environ) if environment is None else environment)
+        try:
+            code = process.wait(600)
+        finally:
+            process.kill()
+        return subprocess.CompletedProcess(
+            words, code, out.read_text(encoding="utf-8"), err.read_text(encoding="utf-8")
+        )
 
 
 def _run(arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]) -> None:

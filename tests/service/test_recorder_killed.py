@@ -3,7 +3,6 @@
 import json
 import re
 import subprocess
-import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,8 @@ import zenoh
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
 from models.signals.salvage import inspect_recording, salvage_recording
 from service.recording.leftovers import DAMAGED
-from tests.service.live import LAB, ROOT, Program, endpoint, program, until
+from tests.service.live import LAB, Program, endpoint, program, until
+from tests.service.preloaded import ran
 
 KEY = LAB.keys.stream
 ROUNDS, BESIDE = 2, 5
@@ -25,8 +25,7 @@ NS = 1_000_000_000
 
 
 def recover(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "service.rotorwatch", "recover", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=180, check=False)
+    return ran("service.rotorwatch", "recover", *arguments)
 
 
 class Sender:

@@ -3,14 +3,14 @@
 import hashlib
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from models.signals.recording import read_recording
 from simulator.scenario import parse_fault
-from tests.service.live import LAB, ROOT, endpoint, machine_file, program, scenario_blocks, until
+from tests.service.live import LAB, endpoint, machine_file, program, scenario_blocks, until
+from tests.service.preloaded import ran
 from tests.service.replaying import recording, write
 
 
@@ -21,9 +21,8 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "service.rotorwatch", "replay", *map(str, arguments)]
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200"}
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300, env=clean, check=False)
+    return ran("service.rotorwatch", "replay", *arguments, environment=clean)
 
 
 def test_lines_go_to_a_file_or_to_the_terminal_and_are_the_same(faulty: Path, tmp_path: Path) -> None:

@@ -27,13 +27,13 @@ from tests.service.live import (
     service,
     until,
 )
+from tests.service.preloaded import ran
 
 
 def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
-    command = [sys.executable, "-m", "service.rotorwatch", *arguments]
     clean = {"PATH": "/usr/bin:/bin", "COLUMNS": "200", **environment}
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300, env=clean, check=False)
+    return ran("service.rotorwatch", *arguments, environment=clean)
 
 
 def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
