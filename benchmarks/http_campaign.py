@@ -179,14 +179,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--small", action="store_true", help="some dozens of callers, for seconds")
     parser.add_argument("--files", type=int, nargs="+", help="how many the monitor may open (256 1024)")
-    parser.add_argument("--seconds", type=float, help="how long each attack lasts (70; small: 2)")
+    parser.add_argument("--seconds", type=float, help="how long each attack lasts (70; small: 1.2)")
     options = parser.parse_args()
     small = options.small
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     names = ("HEAD", "BODY", "SEND")
     timeouts = {f"ROTORWATCH_HTTP__{name}_TIMEOUT_S": "1" for name in names} if small else {}
-    seconds = options.seconds or (2.0 if small else 70.0)
+    seconds = options.seconds or (1.2 if small else 70.0)
     print("| callers | how many | what became of them | /healthz | files open | blocks | log, kB | over after, s |")
     print("|---|---|---|---|---|---|---|---|")
     faults: list[str] = []

@@ -93,6 +93,7 @@ def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int, tmp_pa
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_raised_where_nothing_breaks(tmp_path: Path) -> None:
     process = demo(tmp_path / "tmp", "--fault", "none", "--once")
     output, _ = process.communicate(timeout=600)
@@ -131,7 +132,7 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
 @pytest.mark.parametrize(
     ("number", "whose", "code"),
     [
-        (signal.SIGINT, "demo", 130),
+        pytest.param(signal.SIGINT, "demo", 130, marks=pytest.mark.long),
         pytest.param(signal.SIGTERM, "demo", 130, marks=pytest.mark.long),
         pytest.param(signal.SIGKILL, "demo", -signal.SIGKILL, marks=pytest.mark.long),
         (signal.SIGKILL, "monitor", 1),
