@@ -9,9 +9,22 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.studies.evaluate import LAYOUTS
-from benchmarks.studies.opinions import changed_in
-from benchmarks.studies.results import Goal, Record, Table, Value, floats, grouped, limit_of, median, rate, robust
+from benchmarks.studies.opinions import LAYOUTS, changed_in
+from benchmarks.studies.results import (
+    Estimate,
+    Record,
+    Table,
+    Value,
+    floats,
+    grouped,
+    limit_of,
+    median,
+    middle,
+    rate,
+    robust,
+    share,
+    where,
+)
 from benchmarks.studies.study import Cell, Options, Over, Study
 from benchmarks.studies.variants import (
     VARIANTS,
@@ -37,8 +50,6 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
-
-__all__ = ["ablation"]
 
 _FAULTS: tuple[dict[str, float], ...] = (
     {},
@@ -213,92 +224,78 @@ def _judged(false_alarm_rate: float, records: Sequence[Record]) -> Iterator[Reco
             if row["purpose"] != "calibration":
                 ratios = {name: value / scale[name] for name, value in _test_values(row).items()}
                 leader = max(ratios, key=lambda name: ratios[name], default="")
-                yield {**row, "alarm": ratios.get(leader, 0.0) > limit, "leader": leader, "refused": not ratios}
+                own, size = _changed(row)
+                yield {
+                    **row,
+                    "alarm": ratios.get(leader, 0.0) > limit,
+                    "right": ratios.get(leader, 0.0) > limit and leader == own,
+                    "refused": not ratios,
+                    "own": own in _OWN[str(row["equation"])],
+                    "kind": f"{own[:1]} {size}",
+                    "read": row.get(own),
+                }
 
 
-def _own(row: Record) -> bool:
-    return str(row["changed"]).split()[0] in _OWN[str(row["equation"])]
+def _changed(row: Record) -> tuple[str, str]:
+    """Parameter and size of the true change."""
+    name, _, size = str(row["changed"]).partition(" ")
+    return name, size
 
 
-def _read(rows: Sequence[Record], size: str) -> str:
-    """Median readings of the changed own parameters."""
-    found = {}
-    for (changed,), group in grouped(rows, "changed").items():
-        name = str(changed).split()[0]
-        if name in _OWN[str(group[0]["equation"])] and str(changed).endswith(size):
-            read = median(row.get(name) for row in group)
-            found[str(changed)] = "–" if read is None else f"{100 * read:+.1f} %"
-    return ", ".join(f"{changed}: {read}" for changed, read in found.items())
+def _found(kind: str, rows: Sequence[Record]) -> Estimate | None:
+    return share("alarm")(where(rows, kind=kind, own=True))
+
+
+def _elsewhere(rows: Sequence[Record]) -> Estimate | None:
+    return rate(row["alarm"] for row in rows if str(row["kind"]).endswith("20%") and not row["own"])
+
+
+def _reads(rows: Sequence[Record]) -> str:
+    """Median readings of own parameters that changed by 20 %, in the order of the changes."""
+    own = [row for row in where(rows, own=True) if str(row["kind"]).endswith("20%")]
+    found = [median(row["read"] for row in group) for group in grouped(own, "changed").values()]
+    return ", ".join(f"{100 * one:+.1f} %" for one in found if one is not None)
 
 
 def _spread(rows: Sequence[Record]) -> str:
-    healthy = [row for row in rows if row["changed"] == "healthy"]
-    names = [name for name in _OWN[str(rows[0]["equation"])] if any(name in row for row in healthy)]
-    values = {name: floats(row.get(name) for row in healthy) for name in names}
-    return ", ".join(f"{name} {100 * float(robust(found)):.2f} %" for name, found in values.items()) or "–"
+    healthy = where(rows, changed="healthy")
+    values = {name: floats(row.get(name) for row in healthy) for name in _OWN[str(rows[0]["equation"])]}
+    return ", ".join(f"{name} {100 * float(robust(x)):.2f} %" for name, x in values.items() if x.size)
+
+
+def _short(rows: Sequence[Record]) -> str:
+    """Found at 20 % of its own parameters, and what it reads there."""
+    shares = [_found(kind, rows) for kind in ("k -20%", "c -20%", "e +20%")]
+    text = " / ".join(f"{100 * one.value:.0f}" for one in shares if one is not None)
+    return text + (f" ({_reads(rows)})" if rows and _reads(rows) else "")
 
 
 def _tables(false_alarm_rate: float) -> tuple[Table, ...]:
     rows = partial(_judged, false_alarm_rate)
+    wrong = {"false alarms": lambda rows: share("alarm")(where(rows, changed="healthy")), "elsewhere": _elsewhere}
     by = ("layout", "equation", "group", "variant")
-    found = {
-        f"{kind} {size}": lambda rows, kind=kind, size=size: rate(
-            row["alarm"] for row in rows if _own(row) and str(row["changed"]).startswith(kind)
-            and str(row["changed"]).endswith(size)
-        )
-        for kind, size in (("k", "-20%"), ("k", "-5%"), ("c", "-20%"), ("e", "+20%"), ("e", "+5%"))
-    }  # fmt: skip
-    wrong = {
-        "false alarms": lambda rows: rate(row["alarm"] for row in rows if row["changed"] == "healthy"),
-        "elsewhere": lambda rows: rate(row["alarm"] for row in rows if "20%" in str(row["changed"]) and not _own(row)),
-    }
+    kinds = ("k -20%", "k -5%", "c -20%", "e +20%", "e +5%")
+    figures = {"spread": _spread, "reads": _reads, "refused": share("refused")}
     return (
+        Table("ablation", by, {**{kind: partial(_found, kind) for kind in kinds}, **wrong, **figures}, rows),
         Table(
-            "ablation", by,
-            found | wrong | {"spread": _spread, "reads": lambda rows: _read(rows, "20%"),
-                             "refused": lambda rows: rate(row["refused"] for row in rows)},
-            rows,
+            "ablation-changes",
+            (*by, "changed"),
+            {"alarm": share("alarm"), "alarm, the changed one leading": share("right"), "reads": middle("read")},
+            lambda records: where(rows(records), own=True),
         ),
         Table(
-            "ablation-parameters", (*by, "changed"),
+            "ablation-short",
+            ("group", "variant"),
             {
-                "alarm": lambda rows: rate(row["alarm"] for row in rows),
-                "alarm, the changed one leading": lambda rows: rate(
-                    row["alarm"] and row["leader"] == str(row["changed"]).split()[0] for row in rows
-                ),
-                "reads": lambda rows: median(row.get(str(row["changed"]).split()[0]) for row in rows),
+                **{f"equation {n}": partial(lambda n, rows: _short(where(rows, equation=n)), n) for n in _NUMBERS},
+                **wrong,
             },
-            lambda records: (row for row in rows(records) if row["changed"] != "healthy" and _own(row)),
+            lambda records: where(rows(records), layout=LAYOUTS[None]),
+            "Both layouts mixed: per cent of windows in which k −20 % / c −20 % (28, 31) or e +20 % (29) is found, and "
+            "the median readings; *elsewhere*: alarms at 20 % of another equation's parameter.",
         ),
-        Table(
-            "ablation-both", ("group", "variant"),
-            {
-                f"({number}) {name}": partial(_pivot, number, figure)
-                for number in _NUMBERS
-                for name, figure in (("found, large", _large), ("reads", _read_large))
-            } | {"false alarms": wrong["false alarms"], "wrong location": wrong["elsewhere"]},
-            lambda records: (row for row in rows(records) if row["layout"] == "either"),
-            "Both layouts mixed. *Found*: alarms at k −20 %, c −20 % and e +20 % of the equation's own parameters; "
-            "*reads*: the median reading of each; *wrong location*: alarms at 20 % of another equation's parameter.",
-        ),
-    )  # fmt: skip
-
-
-def _pivot(number: str, figure: object, rows: Sequence[Record]) -> str:
-    own = [row for row in rows if row["equation"] == number]
-    return str(figure(own)) if own and callable(figure) else ""
-
-
-def _large(rows: Sequence[Record]) -> str:
-    large = grouped((row for row in rows if "20%" in str(row["changed"]) and _own(row)), "changed")
-    rates = [(str(changed).split()[0], rate(row["alarm"] for row in group)) for (changed,), group in large.items()]
-    return ", ".join(
-        f"{name} {100 * one.value:.0f} ({100 * one.low:.0f}–{100 * one.high:.0f})" for name, one in rates if one
     )
-
-
-def _read_large(rows: Sequence[Record]) -> str:
-    return _read(rows, "20%").replace(" -20%: ", " ").replace(" +20%: ", " ")
 
 
 def ablation(options: Options) -> Study:
@@ -325,10 +322,5 @@ def ablation(options: Options) -> Study:
         measure=partial(_measure, machine, bundle, options.seed),
         learn=partial(_learn, machine, options),
         tables=_tables(options.rate),
-        goals=_goals,
         made_with={machine.name: f"{machine.physics_hash} {bundle.identity}"},
     )
-
-
-def _goals(_: Sequence[Record]) -> Iterator[Goal]:
-    yield from ()

@@ -6,13 +6,27 @@ the parameter with the Cramér-Rao standard error, which falls as 1/√T. The Ga
 they need beyond the bound's time is the price of looking at every hop and of the hop itself.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.studies.evaluate import LAYOUTS, true_condition
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, grouped, median, rate, within
+from benchmarks.studies.evaluate import true_condition
+from benchmarks.studies.opinions import LAYOUTS, SEVERAL
+from benchmarks.studies.results import (
+    Chart,
+    Estimate,
+    Goal,
+    Record,
+    Table,
+    Value,
+    each,
+    grouped,
+    middle,
+    share,
+    where,
+    within,
+)  # fmt: skip
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.likelihood.bound import cramer_rao
 from models.diagnosis.likelihood.lengths import LengthFits
@@ -29,8 +43,6 @@ from models.physics.parameters import PARAMETERS
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
-
-__all__ = ["bound_time_s", "delay", "with_hop"]
 
 _CHANGES = (("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2))
 """Steps that are timed; their place is part of the seed."""
@@ -78,32 +90,17 @@ class _Case:
 
 
 def with_hop(machine: Machine, hop_s: float) -> Machine:
-    """The machine with another hop.
-
-    Raises
-    ------
-    ValueError
-        If its window cannot be cut so (`models.machine.WindowSettings`).
-    """
+    """The machine with another hop; a ValueError if its window cannot be cut so."""
     window = type(machine.window).model_validate(machine.window.model_dump() | {"hop_s": hop_s})
     return machine.model_copy(update={"window": window})
 
 
-def bound_time_s(standard_error: float, duration_s: float, parameter: str, change: float, threshold: float) -> float:
-    """Data that a test of fixed length needs for a power of 95 % at the Cramér-Rao bound.
+def bound_time_s(error: float, duration_s: float, parameter: str, change: float, threshold: float) -> float:
+    """Data that a test of fixed length needs for a power of 95 % at the Cramér-Rao bound, s.
 
-    Parameters
-    ----------
-    standard_error : float
-        Bound of the relative change for `duration_s` of data of the unchanged machine.
-    duration_s : float
-    parameter : str
-    change : float
-        Relative change to be found.
-    threshold : float
-        Of the test, in standard errors.
+    `error` is the bound of the relative change for `duration_s` of data, `threshold` the test's, in standard errors.
     """
-    return duration_s * ((threshold + _POWER) * standard_error / abs(to_scale(parameter, change))) ** 2
+    return duration_s * ((threshold + _POWER) * error / abs(to_scale(parameter, change))) ** 2
 
 
 class _Watch:
@@ -220,78 +217,75 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
 
 
-def _quantile(values: Sequence[float], level: float) -> str:
-    if not values:
-        return "–"
-    found = float(np.quantile(values, level, method="higher"))
-    return f"{found:.3g}" if np.isfinite(found) else "not within 120 s"
+def _judged(records: Sequence[Record]) -> Iterator[Record]:
+    """With the delay over the bound's time; infinite where it was not found while it was watched."""
+    for row in records:
+        valid = row | {"found": np.inf if row["detected_s"] is None else row["detected_s"]}  # type: ignore[operator]
+        valid["named"] = np.inf if row["named_s"] is None else row["named_s"]
+        for name, bound in (("ratio", "bound_s"), ("fixed ratio", "bound_fixed_s")):
+            valid[name] = float(valid["found"]) / float(row[bound] or 1.0)
+        yield valid | {"within": valid["ratio"] <= 2}
 
 
-def _delays(rows: Sequence[Record], name: str = "detected_s") -> list[float]:
-    return [np.inf if row[name] is None else float(row[name] or 0) for row in rows if not row["early"]]
+def _quantile(column: str, level: float) -> Callable[[Sequence[Record]], str]:
+    def of(rows: Sequence[Record]) -> str:
+        values = [float(row[column] or 0.0) for row in rows if not row["early"]]
+        found = float(np.quantile(values, level, method="higher")) if values else np.nan
+        return f"{found:.3g}" if np.isfinite(found) else "not within 120 s"
 
-
-def _ratios(rows: Sequence[Record], bound: str = "bound_s") -> list[float]:
-    valid = [row for row in rows if not row["early"]]
-    return [found / float(row[bound] or 1) for found, row in zip(_delays(valid), valid, strict=True)]
-
-
-def _within_twice(rows: Sequence[Record]) -> Estimate | None:
-    return rate(ratio <= 2 for ratio in _ratios(rows))
+    return of
 
 
 _COLUMNS = {
-    "bound's time, median s": lambda rows: median(row["bound_s"] for row in rows),
-    "detected, median s": lambda rows: _quantile(_delays(rows), 0.5),
-    "95 %, s": lambda rows: _quantile(_delays(rows), 0.95),
-    "named, 95 %, s": lambda rows: _quantile(_delays(rows, "named_s"), 0.95),
-    "over bound's time, 50 %": lambda rows: _quantile(_ratios(rows), 0.5),
-    "95 %": lambda rows: _quantile(_ratios(rows), 0.95),
-    "within twice": _within_twice,
+    "bound's time, median s": middle("bound_s"),
+    "detected, median s": _quantile("found", 0.5),
+    "95 %, s": _quantile("found", 0.95),
+    "named, 95 %, s": _quantile("named", 0.95),
+    "over bound's time, 50 %": _quantile("ratio", 0.5),
+    "95 %": _quantile("ratio", 0.95),
+    "within twice": share("within"),
 }
 _TABLES = (
     Table(
         "delay",
         ("source", "layout", "changed", "rate", "hop_s", "short_s"),
-        _COLUMNS | {
-            "95 %, fixed threshold": lambda rows: _quantile(_ratios(rows, "bound_fixed_s"), 0.95),
-            "wrong name": lambda rows: rate(row["wrong"] for row in rows if not row["early"]),
-            "alarm before the step": lambda rows: rate(row["early"] for row in rows),
+        _COLUMNS
+        | {
+            "95 %, fixed threshold": _quantile("fixed ratio", 0.95),
+            "wrong name": share("wrong"),
+            "alarm before the step": share("early"),
         },
+        _judged,
     ),
     Table(
         "delay-own-hop",
         ("changed", "rate"),
         _COLUMNS,
-        lambda records: (
-            row for row in records
-            if (row["source"], row["hop_s"], row["layout"]) == ("stream", 5.0, LAYOUTS[Layout.INDEPENDENT])
-        ),
+        lambda records: _judged(where(records, source="stream", hop_s=5.0, layout=SEVERAL)),
         "Streams with independent sources, hop of 5 s:",
     ),
-)  # fmt: skip
+)
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    streams = [row for row in records if row["source"] == "stream"]
-    several = [row for row in streams if row["layout"] == LAYOUTS[Layout.INDEPENDENT] and row["hop_s"] == 5.0]
+    streams = list(_judged(where(records, source="stream")))
+    several = where(streams, layout=SEVERAL, hop_s=5.0, early=False)
     for (declared,), rows in grouped(several, "rate").items():
-        shares = {str(changed): _within_twice(group) for (changed,), group in grouped(rows, "changed").items()}
-        yield within(f"found within twice the bound's time, {declared}", shares, 0.95, 1.0)
-    for (layout,), rows in grouped(streams, "layout").items():
-        yield within(f"a wrong name on the way, {layout}", {"all": rate(row["wrong"] for row in rows)}, 0.0, 0.01)
-    yield within("an alarm before the step", {"all": rate(row["early"] for row in streams)}, 0.0, 0.01)
+        within_twice = each(rows, ("changed",), share("within"))
+        yield within(f"found within twice the bound's time, {declared}", within_twice, 0.95, 1.0)
+    yield within("a wrong name on the way", each(streams, ("layout",), share("wrong")), 0.0, 0.01)
+    yield within("an alarm before the step", each(streams, ("layout",), share("early")), 0.0, 0.01)
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-    several = [row for row in records if row["layout"] == LAYOUTS[Layout.INDEPENDENT]]
-    for (changed, declared), rows in grouped(several, "changed", "rate").items():
+    for (changed, declared), rows in grouped(
+        _judged(where(records, layout=SEVERAL, early=False)), "changed", "rate"
+    ).items():
         panel = panels.setdefault(f"{changed}, {declared}", {})
         for (source, hop_s, short), group in grouped(rows, "source", "hop_s", "short_s").items():
-            found = np.sort(_delays(group))
-            share = np.arange(1, found.size + 1) / max(found.size, 1)
-            points = [(float(x), float(y)) for x, y in zip(found, share, strict=True) if np.isfinite(x)]
+            found = np.sort([float(row["found"] or 0.0) for row in group])
+            points = [(float(x), (n + 1) / found.size) for n, x in enumerate(found) if np.isfinite(x)]
             if source == "stream" or short == "10+20+35 s":
                 panel[f"{source}, hop {hop_s:g} s"] = list(points)
     yield Chart(
@@ -324,7 +318,7 @@ def delay(options: Options) -> Study:
                         Cell(
                             keys | {"source": "Gaussian hops", "hop_s": other, "short_s": _seconds(lengths, other)},
                             len(_rates(machine)),
-                            (case, (trials, other, lengths, 4 if options.small else 200)),
+                            (case, (trials, other, lengths, 4 if options.small else 100)),
                         )
                         for other, lengths in _GAUSSIAN
                     ]

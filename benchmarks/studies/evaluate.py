@@ -7,24 +7,21 @@ from functools import partial
 import numpy as np
 from scipy.special import ndtr
 
-from benchmarks.studies.opinions import RATES, TITLES, changed_in, diagnosticians, opinion
-from benchmarks.studies.results import (
-    Chart,
-    Estimate,
-    Goal,
-    Record,
-    Table,
-    Value,
-    at_least,
-    at_most,
-    floats,
-    grouped,
-    median,
-    rate,
-    resampled,
-    spread,
-    within,
-)
+from benchmarks.studies import results as r
+from benchmarks.studies.opinions import (
+    LAYOUTS,
+    ONE,
+    RATES,
+    SEVERAL,
+    TITLES,
+    changed_in,
+    diagnosticians,
+    judged,
+    opinion,
+    readings,
+    truth,
+)  # fmt: skip
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, each, rate, where, within
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.likelihood.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
@@ -43,9 +40,6 @@ from simulator.scenario import Scenario
 from simulator.timeline import Condition
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario
 
-__all__ = ["LAYOUTS", "evaluate", "true_condition"]
-
-LAYOUTS = {None: "either", Layout.ONE_SOURCE: "one source", Layout.INDEPENDENT: "independent sources"}
 _EXCITATIONS = {
     Excitation.SECOND_ORDER: "as assumed",
     Excitation.FIRST_ORDER: "first-order low-pass",
@@ -158,7 +152,7 @@ def _measure(
         "layout": LAYOUTS[Layout.INDEPENDENT if len(scenario.sources) > 1 else Layout.ONE_SOURCE],
         "cutoff_hz": scenario.sources[0].cutoff_hz,
         "noise": scenario.sensors.noise_relative,
-        **{f"{name} true": faults.get(name, 0.0) for name in PARAMETERS},
+        **truth(faults),
     }
     if kind.topic in ("healthy", "length"):
         bound = cramer_rao(machine, window.states, true_condition(scenario, machine), window.duration_s)
@@ -186,279 +180,193 @@ def _with_length(machine: Machine, length_s: float) -> Machine:
     return machine.model_copy(update={"window": window.model_copy(update=changed)})
 
 
-def _readings(records: Iterable[Record]) -> Iterator[Record]:
-    """One row for every parameter of every window, refused ones too: deviation, in errors and in bounds, covered."""
-    for record in records:
-        named = str(record.get("named", "")).split()
-        for name in PARAMETERS:
-            row = {**record, "parameter": name, "is named": name in named, "true": record[f"{name} true"]}
-            change, error = record.get(name), record.get(f"{name} error")
-            if isinstance(change, float) and isinstance(error, float):
-                off, bound = change - float(record[f"{name} true"] or 0.0), record.get(f"{name} bound")
-                row |= {"off": off, "error": error, "in errors": off / error, "covered": abs(off) <= Z95 * error}
-                row |= {"in bounds": off / float(bound), "bound": bound} if bound else {}
-            yield row
-
-
-def _column(rows: Iterable[Record], name: str) -> list[Value]:
-    return [row[name] for row in rows if name in row]
-
-
 def _biased(rows: Sequence[Record]) -> Estimate | None:
-    found = floats(_column(rows, "in errors"))
-    return resampled(lambda x: np.asarray(np.mean(x, axis=-1)), found) if len(found) > 1 else None
-
-
-def _wrong(record: Record) -> bool:
-    return any(not record[f"{name} true"] for name in str(record.get("named", "")).split())
-
-
-def _exact(record: Record, prefix: str = "") -> bool:
-    named = set(str(record.get(f"{prefix}named", "")).split())
-    return named == {name for name in PARAMETERS if record[f"{name} true"]}
-
-
-def _claimed(record: Record) -> bool:
-    """A bearing parameter or the unbalance named without reserve."""
-    return bool({*str(record.get("named", "")).split()} - {"EI"}) and not record.get("outside")
-
-
-def _noticed(record: Record) -> bool:
-    return bool(record.get("outside") or record.get("suspect"))
-
-
-def _spread_in_bounds(method: str, rows: Sequence[Record]) -> Estimate | None:
-    return spread(_column(_of(rows, method=method), "in bounds"))
+    found = r.floats(row.get("in errors") for row in rows)
+    return r.resampled(lambda x: np.asarray(np.mean(x, axis=-1)), found) if len(found) > 1 else None
 
 
 _KIND = ("machine", "topic", "changed", "excitation", "anomaly", "length_s", "layout", "method")
-
-
 _TABLES = (
     Table(
         "evaluate-sharpness",
         ("parameter",),
         {
-            "bound, median": lambda rows: f"{100 * (median(_column(rows, 'bound')) or 0):.2g} %",
-            **{f"{TITLES[by]}: spread / bound": partial(_spread_in_bounds, by) for by in ("likelihood", "network")},
-            "likelihood: 95 % interval covers": lambda rows: rate(_column(_of(rows, method="likelihood"), "covered")),
+            "bound, median": lambda rows: f"{100 * (r.middle('bound')(rows) or 0):.2g} %",
+            **{
+                f"{TITLES[by]}: {text}": partial(lambda by, figure, rows: figure(where(rows, method=by)), by, figure)
+                for text, figure in (("spread / bound", r.scatter("in bounds")), ("95 % covers", r.share("covered")))
+                for by in ("likelihood", "network")
+            },
         },
-        lambda records: (
-            row
-            for row in _readings(records)
-            if (row["machine"], row["topic"], row["layout"]) == ("lab", "healthy", "independent sources")
-        ),
+        lambda records: readings(where(records, machine="lab", topic="healthy", layout=SEVERAL)),
         "Sharpness on healthy windows of `lab`, independent sources:",
     ),
     Table(
         "evaluate-readings",
         (*_KIND, "parameter"),
         {
-            "read": lambda rows: len(_column(rows, "off")),
-            "median deviation": lambda rows: median(_column(rows, "off")),
+            "read": lambda rows: sum("off" in row for row in rows),
+            "median deviation": r.middle("off"),
             "bias / stated": _biased,
-            "spread": lambda rows: spread(_column(rows, "off")),
-            "stated, median": lambda rows: median(_column(rows, "error")),
-            "spread / stated": lambda rows: spread(_column(rows, "in errors")),
-            "bound, median": lambda rows: median(_column(rows, "bound")),
-            "spread / bound": lambda rows: spread(_column(rows, "in bounds")),
-            "covered": lambda rows: rate(_column(rows, "covered")),
-            "named": lambda rows: rate(_column(rows, "is named")),
+            "spread": r.scatter("off"),
+            "stated, median": r.middle("error"),
+            "spread / stated": r.scatter("in errors"),
+            "bound, median": r.middle("bound"),
+            "spread / bound": r.scatter("in bounds"),
+            "covered": r.share("covered"),
+            "named": r.share("is named"),
         },
-        _readings,
+        readings,
     ),
     Table(
         "evaluate-windows",
         _KIND,
         {
             "refused": lambda rows: sum(bool(row["refused"]) for row in rows),
-            "any named at 1 %": lambda rows: rate(row.get("named") for row in rows),
-            "any named at 0.1 %": lambda rows: rate(row.get("strict named") for row in rows),
-            "exactly the changed": lambda rows: rate(map(_exact, rows)),
-            "an unchanged one": lambda rows: rate(map(_wrong, rows)),
-            "called outside": lambda rows: rate(row.get("outside") for row in rows),
-            "outside or a suspect": lambda rows: rate(map(_noticed, rows)),
-            "bearing or unbalance claimed": lambda rows: rate(map(_claimed, rows)),
-            "misfit, median": lambda rows: median(row.get("misfit") for row in rows),
-            "processor time, ms": lambda rows: 1000 * (median(row["seconds"] for row in rows) or 0.0),
+            "any named at 1 %": r.share("any"),
+            "any named at 0.1 %": r.share("strict any"),
+            "exactly the changed": r.share("exact"),
+            "an unchanged one": r.share("wrong"),
+            "called outside": r.share("outside"),
+            "outside or a suspect": r.share("noticed"),
+            "bearing or unbalance claimed": r.share("claimed"),
+            "misfit, median": r.middle("misfit"),
+            "processor time, s": r.middle("seconds"),
         },
+        judged,
     ),
 )
-
 
 _SMALL = (("k_by", -0.02), ("c_bz", -0.10), ("e", 0.10), ("c_by", -0.05), ("e", 0.05))
 _NETWORK = (("k_bz", -0.05), ("c_by", -0.20), ("c_bz", -0.20), ("e", 0.20))
 _READ = ("k_by", "k_bz", "c_by", "c_bz", "e")
-_ONE, _SEVERAL = LAYOUTS[Layout.ONE_SOURCE], LAYOUTS[Layout.INDEPENDENT]
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     """The declared goals; what asked for more than the bound allows is held to what a reading at the bound finds."""
-    rows = list(_readings(records))
-    lab = _of(rows, machine="lab")
-    asked = [by for by in ("likelihood", "network") if _of(records, method=by)]
+    rows, windows = list(readings(records)), list(judged(records))
+    asked = [by for by in ("likelihood", "network") if where(records, method=by)]
+    lab, whole = where(rows, machine="lab"), where(windows, machine="lab")
     if lab:
-        yield from _detection(lab, "network" in asked)
-        yield from _sets(_of(records, machine="lab", topic="paper"), asked)
-    yield from _sharpness(rows)
+        yield from _detection(lab, asked)
+        for by in asked:
+            least, exact = (0.99 if by == "likelihood" else 0.95), where(whole, topic="paper", method=by)
+            yield within(f"{by}: exactly the changed ones named, paper's eight conditions",
+                         each(exact, ("layout",), r.share("exact")), least, 1.0)  # fmt: skip
+        wrong = r.share("wrong")(where(whole, topic="paper", method="likelihood"))
+        yield r.at_most("likelihood: an unchanged one named, paper's eight conditions", wrong, 0.005)
+    for machine, by, layout, names, column, most in (
+        ("lab", "likelihood", SEVERAL, _READ, "in bounds", 1.15),
+        ("lab", "network", SEVERAL, ("k_by", "k_bz"), "in bounds", 2.0),
+        ("lab", "network", SEVERAL, ("c_by", "c_bz"), "in bounds", 1.5),
+        ("light", "likelihood", SEVERAL, _READ, "in bounds", 1.3),
+        ("lab", "likelihood", ONE, ("k_by", "k_bz"), "off", 0.0008),
+        ("lab", "likelihood", ONE, ("c_by", "c_bz"), "off", 0.003),
+    ):
+        own = where(rows, topic="healthy", machine=machine, method=by, layout=layout)
+        spreads = each([row for row in own if row["parameter"] in names], ("parameter",), r.scatter(column))
+        over = " over the bound" if column == "in bounds" else ""
+        if own:
+            yield within(f"{by}: spread{over}, {layout}, {machine}", spreads, 0.0, most)
     for by in asked:
-        yield from _errors(_of(records, method=by), _of(rows, method=by), by)
+        for column, declared in zip(("any", "strict any"), RATES, strict=True):
+            alarms = each(where(windows, topic="healthy", method=by), ("machine",), r.share(column))
+            yield r.holding(f"{by}: false alarms of healthy windows", alarms, declared)
+        for text, topics in (("healthy", ("healthy",)), ("changed", ("small", "paper"))):
+            own = [row for row in where(rows, method=by) if row["topic"] in topics]
+            covered = each(own, ("parameter", "machine", "layout"), r.share("covered"))
+            yield within(f"{by}: 95 % intervals cover, {text} windows", covered, 0.93, 0.97)
     if lab:
         yield from _strained(lab)
-        outside = grouped(_of(records, machine="lab", topic="outside", method="likelihood"), "anomaly")
-        claimed = {str(anomaly): rate(map(_claimed, found)) for (anomaly,), found in outside.items()}
+        outside = where(whole, topic="outside", method="likelihood")
+        claimed = each(outside, ("anomaly",), r.share("claimed"))
         yield within("likelihood: outside the model, bearing or unbalance claimed all the same", claimed, 0.0, 0.05)
-        seen = [f"{anomaly} {rate(map(_noticed, found))}" for (anomaly,), found in outside.items()]
-        yield Goal("likelihood: called outside the model, or a suspect named", "", "; ".join(seen), "–")
+        seen = "; ".join(f"{name} {one}" for name, one in each(outside, ("anomaly",), r.share("noticed")).items())
+        yield Goal("likelihood: called outside the model, or a suspect named", "", seen, "–")
 
 
-def _detection(lab: Sequence[Record], networks: bool) -> Iterator[Goal]:
+def _detection(lab: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
     for name, true in _SMALL:
-        possible = _found_at_bound(lab, _SEVERAL, name, true)
-        if possible is not None:
-            found = _found(lab, "likelihood", _SEVERAL, name, true)
-            declared = f"≥ {100 * possible:.1f} %, as at the bound"
-            yield at_least(f"likelihood: {name} {true:+.0%} detected, {_SEVERAL}", found, possible, declared)
-    one = {f"{name} {true:+.0%}": _found(lab, "likelihood", _ONE, name, true) for name, true in _SMALL}
-    yield within(f"likelihood: the same changes, {_ONE}", one, 0.99, 1.0)
-    for layout in (_SEVERAL, _ONE) if networks else ():
+        found, possible = _found(lab, "likelihood", SEVERAL, name, true), _found_at_bound(lab, SEVERAL, name, true)
+        declared = f"≥ {100 * possible:.1f} %, as at the bound"
+        yield r.at_least(f"likelihood: {name} {true:+.0%} detected, {SEVERAL}", found, possible, declared)
+    one = {f"{name} {true:+.0%}": _found(lab, "likelihood", ONE, name, true) for name, true in _SMALL}
+    yield within(f"likelihood: the same changes, {ONE}", one, 0.99, 1.0)
+    for layout in (SEVERAL, ONE) if "network" in asked else ():
         rates = {f"{name} {true:+.0%}": _found(lab, "network", layout, name, true) for name, true in _NETWORK}
         yield within(f"network: k −5 %, c −20 %, e +20 % detected, {layout}", rates, 0.99, 1.0)
 
 
-def _sets(paper: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
-    for by in asked:
-        exact = {
-            str(layout): rate(map(_exact, found))
-            for (layout,), found in grouped(_of(paper, method=by), "layout").items()
-        }
-        least = 0.99 if by == "likelihood" else 0.95
-        yield within(f"{by}: exactly the changed ones named, the paper's eight conditions", exact, least, 1.0)
-    wrong = rate(map(_wrong, _of(paper, method="likelihood")))
-    yield at_most("likelihood: an unchanged one named, the paper's eight conditions", wrong, 0.005)
-
-
-def _sharpness(rows: Sequence[Record]) -> Iterator[Goal]:
-    healthy = _of(rows, topic="healthy")
-    for machine, by, layout, names, column, most in (
-        ("lab", "likelihood", _SEVERAL, _READ, "in bounds", 1.15),
-        ("lab", "network", _SEVERAL, ("k_by", "k_bz"), "in bounds", 2.0),
-        ("lab", "network", _SEVERAL, ("c_by", "c_bz"), "in bounds", 1.5),
-        ("light", "likelihood", _SEVERAL, _READ, "in bounds", 1.3),
-        ("lab", "likelihood", _ONE, ("k_by", "k_bz"), "off", 0.0008),
-        ("lab", "likelihood", _ONE, ("c_by", "c_bz"), "off", 0.003),
-    ):
-        own = _of(healthy, machine=machine, method=by, layout=layout)
-        spreads = {name: spread(_column(_of(own, parameter=name), column)) for name in names}
-        over = " over the bound" if column == "in bounds" else ""
-        if own:
-            yield within(f"{by}: spread{over}, {layout}, {machine}", spreads, 0.0, most)
-
-
-def _errors(records: Sequence[Record], rows: Sequence[Record], by: str) -> Iterator[Goal]:
-    """False alarms, and the coverage of the intervals, on every machine."""
-    for prefix, declared in zip(("", "strict "), RATES, strict=True):
-        alarms = {
-            str(machine): rate(record.get(f"{prefix}named") for record in found)
-            for (machine,), found in grouped(_of(records, topic="healthy"), "machine").items()
-        }
-        yield _holding(f"{by}: false alarms of healthy windows", alarms, declared)
-    for text, topics in (("healthy", ("healthy",)), ("changed", ("small", "paper"))):
-        groups = grouped((row for row in rows if row["topic"] in topics), "parameter", "machine", "layout")
-        covered = {", ".join(map(str, key)): rate(_column(found, "covered")) for key, found in groups.items()}
-        yield within(f"{by}: 95 % intervals cover, {text} windows", covered, 0.93, 0.97)
-
-
 def _strained(lab: Sequence[Record]) -> Iterator[Goal]:
     """The likelihood at the quoted minimum detectable change, under other excitations, in windows of other lengths."""
-    power = [row["is named"] for row in _of(lab, topic="detectable", method="likelihood") if row["true"]]
-    yield within("likelihood: found at the quoted minimum detectable change", {"all": rate(power)}, 0.92, 0.98)
-    untold = [row for row in _of(lab, topic="excitation", method="likelihood") if row["parameter"] != "EI"]
-    groups = grouped(untold, "parameter", "excitation", "layout").items()
-    named = {", ".join(map(str, key)): found for key, found in groups}
-    for what, figures, low, high in (
-        ("95 % intervals cover", {key: rate(_column(found, "covered")) for key, found in named.items()}, 0.93, 0.97),
-        ("bias / stated error", {key: _biased(found) for key, found in named.items()}, -0.5, 0.5),
-        ("spread / stated error", {key: spread(_column(f, "in errors")) for key, f in named.items()}, 0.0, 1.5),
+    own = where(lab, method="likelihood")
+    power = rate(row["is named"] for row in where(own, topic="detectable") if row["true"])
+    yield within("likelihood: found at the quoted minimum detectable change", {"all": power}, 0.92, 0.98)
+    untold = [row for row in where(own, topic="excitation") if row["parameter"] != "EI"]
+    for what, figure, low, high in (
+        ("95 % intervals cover", r.share("covered"), 0.93, 0.97),
+        ("bias / stated error", _biased, -0.5, 0.5),
+        ("spread / stated error", r.scatter("in errors"), 0.0, 1.5),
     ):
+        figures = each(untold, ("parameter", "excitation", "layout"), figure)
         yield within(f"likelihood: {what}, another excitation than assumed", figures, low, high)
-    exponents = {f"{name}, {layout}": _exponent(lab, name, layout) for layout in (_SEVERAL, _ONE) for name in _READ}
+    lengths = [row for row in own if "bound" in row and row["parameter"] != "EI"]
+    exponents = each(lengths, ("parameter", "layout"), _exponent)
     yield within("likelihood: exponent of the window length in the spread", exponents, -0.6, -0.4)
-
-
-def _of(rows: Iterable[Record], **wanted: Value) -> list[Record]:
-    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
 def _found(rows: Iterable[Record], by: str, layout: str, name: str, true: float) -> Estimate | None:
     """Windows in which a change is named; alone, where that was measured: beside another it needs stronger evidence."""
     same = [
-        r for r in _of(rows, method=by, layout=layout, parameter=name, true=true) if r["topic"] in ("small", "paper")
+        row
+        for row in where(rows, method=by, layout=layout, parameter=name, true=true)
+        if row["topic"] in ("small", "paper")
     ]
-    alone = [r for r in same if sum(bool(r[f"{other} true"]) for other in PARAMETERS) == 1]
-    return rate(r["is named"] for r in (alone or [r for r in same if r["topic"] == "small"]))
+    alone = [row for row in same if sum(bool(row[f"{other} true"]) for other in PARAMETERS) == 1]
+    return r.share("is named")(alone or where(same, topic="small"))
 
 
-def _found_at_bound(rows: Iterable[Record], layout: str, name: str, true: float) -> float | None:
+def _found_at_bound(rows: Iterable[Record], layout: str, name: str, true: float) -> float:
     """Share of windows in which a normal reading with the bound's standard error would cross the same threshold.
 
     Over the conditions of the healthy windows, which are drawn as those of the changed ones are.
     """
-    healthy = _of(rows, method="likelihood", layout=layout, parameter=name, topic="healthy")
-    bounds = floats(_column(healthy, "bound"))
-    if not bounds.size:
-        return None
+    healthy = where(rows, method="likelihood", layout=layout, parameter=name, topic="healthy")
     threshold = window_thresholds(RATES[0], len(PARAMETERS)).first
-    z = abs(to_scale(name, true)) / bounds
+    z = abs(to_scale(name, true)) / r.floats(row.get("bound") for row in healthy)
     return float(np.mean(ndtr(z - threshold) + ndtr(-z - threshold)))
 
 
-def _holding(what: str, rates: dict[str, Estimate | None], declared: float) -> Goal:
-    """Goal of rates whose intervals should hold the declared one."""
-    found = {name: one for name, one in rates.items() if one is not None}
-    met = all(one.low <= declared <= one.high for one in found.values())
-    text = "; ".join(f"{name} {one}" for name, one in found.items())
-    return Goal(what, f"{100 * declared:g} % inside", text or "–", ("met" if met else "missed") if found else "–")
-
-
-def _exponent(rows: Iterable[Record], name: str, layout: str) -> Estimate | None:
+def _exponent(rows: Sequence[Record]) -> Estimate | None:
     """Exponent of the window length in the spread.
 
     Fitted to the spread over the bound, which is itself proportional to 1/√T, so that windows of different conditions
     can be compared. None with fewer than three lengths.
     """
-    own = (r for r in _of(rows, method="likelihood", layout=layout, parameter=name) if "bound" in r)
-    points = {length: spread(_column(found, "in bounds")) for (length,), found in grouped(own, "length_s").items()}
-    known = [(float(length or 0), one) for length, one in points.items() if one is not None and one.low > 0]
+    points = {float(length): one for length, one in each(rows, ("length_s",), r.scatter("in bounds")).items() if one}
+    known = {length: one for length, one in points.items() if one.low > 0}
     if len(known) < 3:
         return None
-    x, y = np.log([length for length, _ in known]), np.log([one.value for _, one in known])
-    weight = np.array([(2 * Z95 / np.log(one.high / one.low)) ** 2 for _, one in known])
+    x, y = np.log(list(known)), np.log([one.value for one in known.values()])
+    weight = np.array([(2 * Z95 / np.log(one.high / one.low)) ** 2 for one in known.values()])
     x = x - np.average(x, weights=weight)
     precision = float(np.sum(weight * x**2))
     slope, half = float(np.sum(weight * x * y)) / precision - 0.5, Z95 / precision**0.5
-    return Estimate(slope, slope - half, slope + half, sum(one.n for _, one in known))
+    return Estimate(slope, slope - half, slope + half, len(rows))
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """What is named over the size of the change, and what would be named at the bound."""
-    lab = list(_readings(_of(records, machine="lab")))
-    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-    for layout in (_SEVERAL, _ONE):
-        panel = panels.setdefault(layout, {})
+    lab = list(readings(where(records, machine="lab")))
+    panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {SEVERAL: {}, ONE: {}}
+    for layout, panel in panels.items() if lab else ():
         for name, true in (*_SMALL, *_NETWORK):
-            label = f"{name} {true:+.0%}"
-            for by, title in TITLES.items():
-                found = _found(lab, by, layout, name, true)
-                if found is not None:
-                    panel.setdefault(title, []).append((label, found))
-            possible = _found_at_bound(lab, layout, name, true)
-            if possible is not None:
-                panel.setdefault("at the Cramér–Rao bound", []).append((label, possible))
-    yield Chart(
-        "results-detection", "Windows of lab in which a change is named at 1 % false alarms, 95 % intervals",
-        panels, "true change", "share of windows",
-    )  # fmt: skip
+            found = {title: _found(lab, by, layout, name, true) for by, title in TITLES.items()}
+            for title, one in (found | {"at the Cramér–Rao bound": _found_at_bound(lab, layout, name, true)}).items():
+                if one is not None:
+                    panel.setdefault(title, []).append((f"{name} {true:+.0%}", one))
+    text = "Windows of lab in which a change is named at 1 % false alarms, with 95 % intervals"
+    yield Chart("results-detection", text, panels, "true change", "share of windows")
 
 
 def evaluate(options: Options) -> Study:

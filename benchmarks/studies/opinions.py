@@ -1,31 +1,33 @@
-"""What the diagnosticians say of one window, as columns of a record."""
+"""What the diagnosticians say of one window, as columns of a record, and whether that is right."""
 
+from collections.abc import Iterable, Iterator, Mapping
 from time import process_time
 
 import numpy as np
 
-from benchmarks.studies.results import Value
+from benchmarks.studies.results import Record, Value
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
-from models.diagnosis.readings import Diagnostician
+from models.diagnosis.readings import Z95, Diagnostician
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-
-__all__ = ["RATES", "TITLES", "changed_in", "diagnosticians", "opinion"]
+from models.physics.parameters import PARAMETERS
+from simulator.training.draws import Layout
 
 RATES = (0.01, 0.001)
 """Declared false alarms per window at which an opinion is judged, strict last."""
-
 TITLES = {
     "likelihood": "likelihood",
     "network": "amortised networks",
     "relation": "equations' networks",
     "paper": "networks as printed",
 }
+ONE, SEVERAL = "one source", "independent sources"
+LAYOUTS = {None: "either", Layout.ONE_SOURCE: ONE, Layout.INDEPENDENT: SEVERAL}
 
 
 def diagnosticians(machine: Machine, bundle: Bundle | None) -> tuple[Diagnostician, ...]:
@@ -49,14 +51,18 @@ def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ..
     started = process_time()
     try:
         diagnosis = one.diagnose(window)
-        spent, refused = process_time() - started, "; ".join(sorted({read.reason for read in diagnosis.parameters}))
+        refused = "; ".join(sorted({read.reason for read in diagnosis.parameters})) or "nothing was read"
+        read = diagnosis.evaluable
     except (EstimationError, np.linalg.LinAlgError) as error:
-        return {"method": one.by, "refused": str(error), "seconds": round(process_time() - started, 5)}
-    if not diagnosis.evaluable:
-        return {"method": one.by, "refused": refused or "nothing was read", "seconds": round(spent, 5)}
-    said: dict[str, Value] = {"method": one.by, "refused": "", "seconds": round(spent, 5)}
-    for read in diagnosis.evaluable:
-        said |= {read.name: _rounded(read.change), f"{read.name} error": _rounded(read.standard_error)}
+        refused, read = str(error), ()
+    seconds = round(process_time() - started, 5)
+    if not read:
+        return {"method": one.by, "refused": refused, "seconds": seconds}
+    said: dict[str, Value] = {"method": one.by, "refused": "", "seconds": seconds}
+    for parameter in read:
+        figures = (parameter.change or 0.0, parameter.standard_error or 0.0)
+        change, error_ = (float(f"{figure:.6g}") for figure in figures)
+        said |= {parameter.name: change, f"{parameter.name} error": error_}
     for prefix, rate in zip(("", "strict "), rates, strict=False):
         verdict = isolate_window(diagnosis, rate)
         said |= {f"{prefix}named": " ".join(verdict.changed), f"{prefix}outside": verdict.outside}
@@ -64,10 +70,51 @@ def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ..
     return said | {"misfit": misfit, "suspect": diagnosis.suspect}
 
 
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else float(f"{value:.6g}")
+def truth(faults: Mapping[str, float]) -> dict[str, Value]:
+    """True changes as columns of a record."""
+    return {f"{name} true": faults.get(name, 0.0) for name in PARAMETERS}
 
 
-def changed_in(faults: dict[str, float]) -> str:
+def named_in(record: Record, column: str = "named") -> set[str]:
+    """What is named in a record; nothing in a refused window."""
+    return set(str(record.get(column) or "").split())
+
+
+def judged(records: Iterable[Record]) -> Iterator[Record]:
+    """Records with what is right and wrong in them, at the first declared rate.
+
+    ``any``: something is named; ``exact``: the changed ones and no others; ``wrong``: one that did not change;
+    ``claimed``: something is named without "outside the model" beside it, but for the shaft alone; ``noticed``: outside
+    the model, or a suspect is named.
+    """
+    for record in records:
+        named, true = named_in(record), {name for name in PARAMETERS if record.get(f"{name} true")}
+        yield {
+            **record,
+            "any": bool(named),
+            "strict any": bool(record.get("strict named")),
+            "exact": not record.get("refused") and named == true,
+            "wrong": not named <= true,
+            "claimed": bool(named - {"EI"}) and not record.get("outside"),
+            "noticed": bool(record.get("outside") or record.get("suspect")),
+            "outside": bool(record.get("outside")),
+        }
+
+
+def readings(records: Iterable[Record]) -> Iterator[Record]:
+    """One row for every parameter of every window, refused ones too: deviation, in errors and in bounds, covered."""
+    for record in records:
+        for name in PARAMETERS:
+            change, error, true = (record.get(f"{name}{column}") for column in ("", " error", " true"))
+            row = {**record, "parameter": name, "is named": name in named_in(record), "true": true or 0.0}
+            if isinstance(change, float) and isinstance(error, float):
+                off, bound = change - float(true or 0.0), record.get(f"{name} bound")
+                row |= {"read": change, "off": off, "error": error, "in errors": off / error}
+                row["covered"] = abs(off) <= Z95 * error
+                row |= {"bound": bound, "in bounds": off / float(bound)} if bound else {}
+            yield row
+
+
+def changed_in(faults: Mapping[str, float]) -> str:
     """True changes in words."""
     return ", ".join(f"{name} {change:+.0%}" for name, change in faults.items()) or "healthy"

@@ -10,11 +10,8 @@ backward whirl are, and a damping limit of 10 % throws out well-damped bearings.
 
 import logging
 import os
-from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
-import scipy.linalg
 import scipy.optimize
 import scipy.signal
 import scipy.stats
@@ -25,43 +22,126 @@ from models.machine import Machine
 from models.physics.matrices import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 
-__all__ = ["FeatureVector", "Peer", "SubspaceModes", "reference_modes"]
+__all__ = ["FeatureVector", "Hotelling", "SubspaceModes", "reference_modes"]
 
 _MORE_ORDERS = 16
 """Model orders from twice the number of modes to this many above it, as in a stabilisation diagram; the median over
 them counts."""
-
 _BLOCK_ROWS_PER_PERIOD = 1.4
 _MOST_DAMPING = 0.3
 _NEAREST = 0.3
 """A pole further than this from a reference mode in relative frequency is not that mode."""
-
 _LEAST_MAC = 0.5
 _MOST_SHARE_LOST = 0.5
 _LEAST_SHARE_THERE = 0.8
+_BANDS = 6
 
 
-class Peer(Protocol):
-    """A method that knows only how the machine used to be."""
+class Hotelling:
+    """Hotelling's T² of features from mean and covariance of healthy windows; `shrink`: after Ledoit and Wolf.
 
-    @property
-    def name(self) -> str:
-        """Name under which it is reported."""
+    Features that more than a fifth of the healthy windows lack are not used; of the others, T² of a window is that of
+    the features it has.
+    """
 
-    def features(self, samples: FloatArray) -> FloatArray:
-        """Features of one window of SI samples, shape (n_features,); nan where there is nothing to be found.
-
-        Parameters
-        ----------
-        samples : ndarray, shape (n_samples, n_states [+ 1])
-            As `models.diagnosis.moments.Plan.to_si` gives them, the shaft angle last.
-        """
+    def __init__(self, *, shrink: bool) -> None:
+        self._shrink = shrink
+        self._used = np.empty(0, dtype=np.intp)
 
     def fit(self, healthy: FloatArray) -> None:
         """Learn from the features of healthy windows, shape (n_windows, n_features)."""
+        used = np.flatnonzero(np.isfinite(healthy).mean(axis=0) >= _LEAST_SHARE_THERE)
+        complete = healthy[np.all(np.isfinite(healthy[:, used]), axis=1)][:, used]
+        n, p = complete.shape
+        if p == 0 or n < 4 or (not self._shrink and n <= p):
+            raise EstimationError(f"{n} complete healthy windows for {p} features, expected at least {max(4, p + 1)}")
+        self._mean, self._scale = complete.mean(axis=0), complete.std(axis=0)
+        standard = (complete - self._mean) / self._scale
+        self._covariance: FloatArray = standard.T @ standard / (n - 1)
+        if self._shrink:
+            from sklearn.covariance import ledoit_wolf  # noqa: PLC0415  # takes a second to import
+
+            self._covariance = np.asarray(ledoit_wolf(standard, assume_centered=True)[0], dtype=np.float64)
+        self._used = used
 
     def score(self, features: FloatArray) -> float:
         """Distance of one window's features from healthy; nan if it has none."""
+        if not self._used.size:
+            raise EstimationError("a window was to be scored before any healthy window was learned from")
+        standard = (features[self._used] - self._mean) / self._scale
+        there = np.flatnonzero(np.isfinite(standard))
+        if not there.size:
+            return float("nan")
+        return float(standard[there] @ np.linalg.solve(self._covariance[np.ix_(there, there)], standard[there]))
+
+
+class SubspaceModes(Hotelling):
+    """Natural frequencies and damping ratios by SSI-cov, tracked by frequency and mode shape."""
+
+    name = "SSI-cov"
+
+    def __init__(self, machine: Machine) -> None:
+        super().__init__(shrink=False)
+        plan = plan_for(machine)
+        self._states, self._has_angle = plan.states, plan.angle_column is not None
+        # Half the new rate stays 30 % above the band, as the decimation filter needs it.
+        self._factor = max(1, int(plan.rate_hz / (2.6 * machine.window.band_hz[1])))
+        self._rate_hz = plan.rate_hz / self._factor
+        self._frequency, self._shapes = reference_modes(machine)
+        self._block_rows = max(8, round(_BLOCK_ROWS_PER_PERIOD * self._rate_hz / self._frequency[0]))
+        self._orders = range(2 * self._frequency.size, 2 * self._frequency.size + _MORE_ORDERS + 1, 2)
+
+    def features(self, samples: FloatArray) -> FloatArray:
+        """Frequencies (Hz) and damping ratios of the tracked modes, shape (2 n_modes,); nan where a mode is lost."""
+        rest, _ = _without_rotation(samples, len(self._states), self._has_angle)
+        if self._factor > 1:
+            rest = scipy.signal.decimate(rest, self._factor, ftype="fir", axis=0)
+        deviation = rest.std(axis=0)
+        frequency, damping, shapes = _poles(rest / deviation, self._block_rows, self._orders[-1], self._rate_hz)
+        found = np.full((len(self._orders), 2, self._frequency.size), np.nan)
+        for row, order in enumerate(n // 2 for n in self._orders):
+            there = np.flatnonzero(np.isfinite(frequency[:, order]))
+            if there.size:
+                own = shapes[there, order] * deviation
+                for mode, pole in self._matched(frequency[there, order], own):
+                    found[row, :, mode] = frequency[there[pole], order], damping[there[pole], order]
+        lost = np.isnan(found[:, 0]).mean(axis=0) > _MOST_SHARE_LOST
+        middle = np.array([[_median(values) for values in kind.T] for kind in found.transpose(1, 0, 2)])
+        middle[:, lost] = np.nan
+        return middle.ravel()
+
+    def _matched(self, frequency: FloatArray, shapes: FloatArray) -> list[tuple[int, int]]:
+        """Pairs of reference mode and pole: assignment by distance in frequency and 1 - MAC."""
+        away = np.abs(frequency[None, :] / self._frequency[:, None] - 1)
+        mac = np.stack([_mac(reference, shapes / _units(self._states, frequency)) for reference in self._shapes])
+        pairs = zip(*scipy.optimize.linear_sum_assignment(away + (1 - mac)), strict=True)
+        return [(int(m), int(p)) for m, p in pairs if away[m, p] < _NEAREST and mac[m, p] > _LEAST_MAC]
+
+
+class FeatureVector(Hotelling):
+    """Rms, kurtosis, 1× amplitude and levels in bands of equal logarithmic width, of every channel, as logarithms."""
+
+    name = "features"
+
+    def __init__(self, machine: Machine) -> None:
+        super().__init__(shrink=True)
+        plan = plan_for(machine)
+        self._n_states, self._has_angle = len(plan.states), plan.angle_column is not None
+        self._rate_hz = plan.rate_hz
+        self._edges_hz = np.geomspace(*machine.window.band_hz, _BANDS + 1)
+        self._segment = round(machine.window.segment_s * plan.rate_hz)
+
+    def features(self, samples: FloatArray) -> FloatArray:
+        """All features, shape (n_channels · (2 + n_bands [+ 1]),)."""
+        rest, amplitude = _without_rotation(samples, self._n_states, self._has_angle)
+        x = samples[:, : self._n_states]
+        frequency, density = scipy.signal.welch(rest, self._rate_hz, nperseg=self._segment, axis=0)
+        bands = [
+            np.log(density[(frequency >= low) & (frequency < high)].mean(axis=0))
+            for low, high in zip(self._edges_hz[:-1], self._edges_hz[1:], strict=True)
+        ]
+        parts = [np.log(x.std(axis=0)), scipy.stats.kurtosis(x, axis=0), *bands]
+        return np.concatenate([*parts, np.log(amplitude)] if self._has_angle else parts)
 
 
 def reference_modes(machine: Machine) -> tuple[FloatArray, FloatArray]:
@@ -89,187 +169,28 @@ def _units(states: tuple[str, ...], frequency_hz: FloatArray) -> FloatArray:
     return np.where(rates, 2 * np.pi * frequency_hz[:, None], 1.0)
 
 
-class SubspaceModes:
-    """Natural frequencies and damping ratios by SSI-cov, tracked by frequency and mode shape.
-
-    Parameters
-    ----------
-    machine : Machine
-        Sampling rate, channels, and the modes to track.
-    """
-
-    def __init__(self, machine: Machine) -> None:
-        plan = plan_for(machine)
-        self._states, self._has_angle = plan.states, plan.angle_column is not None
-        # Half the new rate stays 30 % above the band, as the decimation filter needs it.
-        self._factor = max(1, int(plan.rate_hz / (2.6 * machine.window.band_hz[1])))
-        self._rate_hz = plan.rate_hz / self._factor
-        self._frequency, self._shapes = reference_modes(machine)
-        self._block_rows = max(8, round(_BLOCK_ROWS_PER_PERIOD * self._rate_hz / self._frequency[0]))
-        self._orders = range(2 * self._frequency.size, 2 * self._frequency.size + _MORE_ORDERS + 1, 2)
-        self._t2 = _Hotelling(shrink=False)
-
-    @property
-    def name(self) -> str:
-        """Name under which it is reported."""
-        return "SSI-cov"
-
-    def features(self, samples: FloatArray) -> FloatArray:
-        """Frequencies (Hz) and damping ratios of the tracked modes, shape (2 n_modes,); nan where a mode is lost."""
-        rest, _ = _without_rotation(samples, len(self._states), self._has_angle)
-        if self._factor > 1:
-            rest = scipy.signal.decimate(rest, self._factor, ftype="fir", axis=0)
-        deviation = rest.std(axis=0)
-        frequency, damping, shapes = _poles(rest / deviation, self._block_rows, self._orders[-1], self._rate_hz)
-        found = np.full((len(self._orders), 2, self._frequency.size), np.nan)
-        for row, order in enumerate(n // 2 for n in self._orders):
-            there = np.flatnonzero(np.isfinite(frequency[:, order]))
-            if there.size:
-                own = shapes[there, order] * deviation
-                for mode, pole in self._matched(frequency[there, order], own):
-                    found[row, :, mode] = frequency[there[pole], order], damping[there[pole], order]
-        lost = np.isnan(found[:, 0]).mean(axis=0) > _MOST_SHARE_LOST
-        middle = np.array([[_median(values) for values in kind.T] for kind in found.transpose(1, 0, 2)])
-        middle[:, lost] = np.nan
-        return middle.ravel()
-
-    def _matched(self, frequency: FloatArray, shapes: FloatArray) -> list[tuple[int, int]]:
-        """Pairs of reference mode and pole: assignment by distance in frequency and 1 - MAC."""
-        away = np.abs(frequency[None, :] / self._frequency[:, None] - 1)
-        mac = np.stack([_mac(reference, shapes / _units(self._states, frequency)) for reference in self._shapes])
-        modes, poles = scipy.optimize.linear_sum_assignment(away + (1 - mac))
-        return [
-            (int(mode), int(pole))
-            for mode, pole in zip(modes, poles, strict=True)
-            if away[mode, pole] < _NEAREST and mac[mode, pole] > _LEAST_MAC
-        ]
-
-    def fit(self, healthy: FloatArray) -> None:
-        """Learn from the features of healthy windows."""
-        self._t2.fit(healthy)
-
-    def score(self, features: FloatArray) -> float:
-        """T² of one window."""
-        return self._t2.score(features)
-
-
-class FeatureVector:
-    """Rms, kurtosis, 1× amplitude and band levels of every channel; levels as logarithms.
-
-    Parameters
-    ----------
-    machine : Machine
-    n_bands : int
-        Bands of equal logarithmic width within the likelihood's band.
-    """
-
-    def __init__(self, machine: Machine, n_bands: int = 6) -> None:
-        plan = plan_for(machine)
-        self._n_states, self._has_angle = len(plan.states), plan.angle_column is not None
-        self._rate_hz = plan.rate_hz
-        self._edges_hz = np.geomspace(*machine.window.band_hz, n_bands + 1)
-        self._segment = round(machine.window.segment_s * plan.rate_hz)
-        self._t2 = _Hotelling(shrink=True)
-
-    @property
-    def name(self) -> str:
-        """Name under which it is reported."""
-        return "features"
-
-    def features(self, samples: FloatArray) -> FloatArray:
-        """All features, shape (n_channels · (2 + n_bands [+ 1]),)."""
-        rest, amplitude = _without_rotation(samples, self._n_states, self._has_angle)
-        x = samples[:, : self._n_states]
-        frequency, density = scipy.signal.welch(rest, self._rate_hz, nperseg=self._segment, axis=0)
-        bands = [
-            np.log(density[(frequency >= low) & (frequency < high)].mean(axis=0))
-            for low, high in zip(self._edges_hz[:-1], self._edges_hz[1:], strict=True)
-        ]
-        parts = [np.log(x.std(axis=0)), scipy.stats.kurtosis(x, axis=0), *bands]
-        if self._has_angle:
-            parts.append(np.log(amplitude))
-        return np.concatenate(parts)
-
-    def fit(self, healthy: FloatArray) -> None:
-        """Learn from the features of healthy windows."""
-        self._t2.fit(healthy)
-
-    def score(self, features: FloatArray) -> float:
-        """T² of one window, with a covariance shrunk after Ledoit and Wolf."""
-        return self._t2.score(features)
-
-
-class _Hotelling:
-    """Hotelling's T² of features from the mean and covariance of healthy windows.
-
-    Features that more than a fifth of the healthy windows lack are not used; of the others, T² of a window is that of
-    the features it has.
-    """
-
-    def __init__(self, *, shrink: bool) -> None:
-        self._shrink = shrink
-        self._used: npt.NDArray[np.intp] = np.empty(0, dtype=np.intp)
-
-    def fit(self, healthy: FloatArray) -> None:
-        used = np.flatnonzero(np.isfinite(healthy).mean(axis=0) >= _LEAST_SHARE_THERE)
-        complete = healthy[np.all(np.isfinite(healthy[:, used]), axis=1)][:, used]
-        n, p = complete.shape
-        if p == 0 or n < 4 or (not self._shrink and n <= p):
-            raise EstimationError(f"{n} complete healthy windows for {p} features, expected at least {max(4, p + 1)}")
-        self._mean, self._scale = complete.mean(axis=0), complete.std(axis=0)
-        standard = (complete - self._mean) / self._scale
-        if self._shrink:
-            from sklearn.covariance import ledoit_wolf  # noqa: PLC0415  # an optional extra
-
-            covariance = np.asarray(ledoit_wolf(standard, assume_centered=True)[0], dtype=np.float64)
-        else:
-            covariance = standard.T @ standard / (n - 1)
-        self._used, self._covariance = used, covariance
-
-    def score(self, features: FloatArray) -> float:
-        if not self._used.size:
-            raise EstimationError("a window was to be scored before any healthy window was learned from")
-        standard = (features[self._used] - self._mean) / self._scale
-        there = np.flatnonzero(np.isfinite(standard))
-        if not there.size:
-            return float("nan")
-        return float(standard[there] @ np.linalg.solve(self._covariance[np.ix_(there, there)], standard[there]))
-
-
 def _without_rotation(samples: FloatArray, n_states: int, has_angle: bool) -> tuple[FloatArray, FloatArray]:
     """Channels without mean and 1× part, and the 1× amplitudes (zero without a shaft angle)."""
     x = samples[:, :n_states]
-    columns = [np.ones(len(x))]
-    if has_angle:
-        columns += [np.cos(samples[:, n_states]), np.sin(samples[:, n_states])]
-    regressors = np.stack(columns, axis=1)
+    angle = [np.cos(samples[:, n_states]), np.sin(samples[:, n_states])] if has_angle else []
+    regressors = np.stack([np.ones(len(x)), *angle], axis=1)
     beta = np.linalg.lstsq(regressors, x, rcond=None)[0]
-    amplitude = np.hypot(beta[1], beta[2]) if has_angle else np.zeros(n_states)
-    return x - regressors @ beta, amplitude
+    return x - regressors @ beta, np.hypot(beta[1], beta[2]) if has_angle else np.zeros(n_states)
 
 
-def _poles(
-    x: FloatArray, block_rows: int, most_order: int, rate_hz: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _poles(x: FloatArray, block_rows: int, most: int, rate_hz: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Frequencies, damping ratios and shapes of all poles, one column for each even order from 0 on."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # the library draws progress bars otherwise
     with np.errstate():  # and changes numpy's error state on import
-        from pyoma2.functions.ssi import SSI_fast, SSI_poles, build_hank  # noqa: PLC0415  # an optional extra
+        from pyoma2.functions.ssi import SSI_fast, SSI_poles, build_hank  # noqa: PLC0415  # for the reason above
 
         logging.getLogger("pyoma2").setLevel(logging.WARNING)  # it reports every step
         np.seterr(divide="ignore", invalid="ignore")
         hankel, _ = build_hank(x.T, x.T, block_rows, "cov_R")
-        observability, A, C, _ = SSI_fast(hankel, block_rows, most_order, step=2)
+        observability, A, C, _ = SSI_fast(hankel, block_rows, most, step=2)
         frequency, damping, shapes, *_ = SSI_poles(
-            observability,  # type: ignore[arg-type]  # SSI_fast calls this matrix a list
-            A,
-            C,
-            most_order,
-            1 / rate_hz,
-            step=2,
-            HC=True,
-            xi_max=_MOST_DAMPING,
-        )
+            observability, A, C, most, 1 / rate_hz, step=2, HC=True, xi_max=_MOST_DAMPING  # type: ignore[arg-type]
+        )  # fmt: skip
     return frequency, damping, shapes
 
 

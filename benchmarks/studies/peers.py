@@ -10,9 +10,21 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.studies.opinions import TITLES, changed_in, diagnosticians, opinion
-from benchmarks.studies.other_methods import FeatureVector, Peer, SubspaceModes
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, grouped, limit_of, rate
+from benchmarks.studies.opinions import TITLES, changed_in, diagnosticians, named_in, opinion
+from benchmarks.studies.other_methods import FeatureVector, SubspaceModes
+from benchmarks.studies.results import (
+    Chart,
+    Estimate,
+    Goal,
+    Record,
+    Table,
+    Value,
+    each,
+    grouped,
+    limit_of,
+    share,
+    where,
+)
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -24,8 +36,6 @@ from models.signals.block import FloatArray
 from simulator.scenario import Event
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition
-
-__all__ = ["peers"]
 
 _BLOCK_S = 5.0
 _APART = 1_000_000
@@ -51,12 +61,12 @@ class _Series:
 class _Learned:
     """Of one setting: methods that have learned healthy windows, and their limits."""
 
-    peers: tuple[Peer, ...]
+    peers: tuple[SubspaceModes | FeatureVector, ...]
     limits: tuple[float, ...]
     paper: PaperDiagnostician
 
 
-def _methods(machine: Machine) -> tuple[Peer, ...]:
+def _methods(machine: Machine) -> tuple[SubspaceModes | FeatureVector, ...]:
     return SubspaceModes(machine), FeatureVector(machine)
 
 
@@ -135,36 +145,21 @@ def _measure(
         )
     equations = {equation.number for equation in PAPER_EQUATIONS if set(equation.parameters) & set(series.faults)}
     flagged = own.paper.flagged_equations(own.paper.diagnose(window))
-    rows.append(
-        {"method": "paper", "named": " ".join(flagged), "detected": bool(flagged), "exact": set(flagged) == equations}
-    )
-    for one in diagnosticians(machine, bundle):
-        said = opinion(one, window, (options.rate,))
-        named = str(said.get("named", "")).split()
-        judged = not said["refused"]
-        rows.append(
-            {
-                "method": one.by,
-                "named": " ".join(named),
-                "detected": bool(named),
-                "exact": judged and set(named) == set(series.faults),
-                "refused": not judged,
-            }
-        )
+    said: list[dict[str, Value]] = [{"method": "paper", "named": " ".join(flagged), "refused": ""}]
+    said += [opinion(one, window, (options.rate,)) for one in diagnosticians(machine, bundle)]
+    for one in said:
+        named, true = named_in(one), equations if one["method"] == "paper" else set(series.faults)
+        row: dict[str, Value] = {"method": one["method"], "named": " ".join(sorted(named)), "detected": bool(named)}
+        rows.append(row | {"exact": not one["refused"] and named == true, "refused": bool(one["refused"])})
     return rows
 
 
-def _of(rows: Sequence[Record], method: str, column: str) -> Estimate | None:
-    return rate(row[column] for row in rows if row["method"] == method and column in row)
-
-
-_NAMES = ("SSI-cov", "features", *TITLES)
 _HEADS = {"SSI-cov": "SSI-cov", "features": "features, T²", **TITLES}
 
 
-def _short(rows: Sequence[Record], method: str) -> str:
+def _short(method: str, rows: Sequence[Record]) -> str:
     """Detected, and behind it named exactly where the method says what changed; per cent."""
-    figures = [_of(rows, method, column) for column in ("detected", "exact")]
+    figures = [share(column)(where(rows, method=method)) for column in ("detected", "exact")]
     return " / ".join(f"{100 * one.value:.0f}" for one in figures if one is not None)
 
 
@@ -172,16 +167,12 @@ _TABLES = (
     Table(
         "peers",
         ("setting", "changed", "method"),
-        {
-            "detected": lambda rows: rate(row["detected"] for row in rows),
-            "exactly named": lambda rows: rate(row["exact"] for row in rows if "exact" in row),
-            "refused": lambda rows: sum(bool(row.get("refused")) for row in rows),
-        },
+        {"detected": share("detected"), "exactly named": share("exact"), "refused": share("refused")},
     ),
     Table(
         "peers-short",
         ("setting", "changed"),
-        {_HEADS[name]: partial(lambda name, rows: _short(rows, name), name) for name in _NAMES},
+        {head: partial(_short, name) for name, head in _HEADS.items()},
         page="Per cent of windows in which something is said to have changed / exactly the right parameters (printed "
         "networks: equations) are named:",
     ),
@@ -191,26 +182,28 @@ _TABLES = (
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     """Where another method notices a change more often than the likelihood."""
     lost = []
-    for (setting, changed), rows in grouped(records, "setting", "changed").items():
-        own = _of(rows, "likelihood", "detected")
+    changed = [row for row in records if row["changed"] != "healthy"]
+    for (setting, change), rows in grouped(changed, "setting", "changed").items():
+        shares = each(rows, ("method",), share("detected"))
+        own = shares["likelihood"]
         for name in ("SSI-cov", "features", "paper"):
-            other = _of(rows, name, "detected")
-            if changed != "healthy" and own is not None and other is not None and other.low > own.high:
-                lost.append(f"{setting}, {changed}: {_HEADS[name]} {other}, likelihood {own}")
-    yield Goal("no other method notices a change more often than the likelihood (intervals apart)", "nowhere",
-               "; ".join(lost) or "nowhere", "missed" if lost else "met")  # fmt: skip
+            other = shares[name]
+            if own is not None and other is not None and other.low > own.high:
+                lost.append(f"{setting}, {change}: {_HEADS[name]} {other}, likelihood {own}")
+    what = "another method notices a change more often than the likelihood (intervals apart)"
+    yield Goal(what, "nowhere", "; ".join(lost) or "nowhere", "missed" if lost else "met")
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
     for (setting, changed, method), rows in grouped(records, "setting", "changed", "method").items():
         for column, title in (("detected", "something changed"), ("exact", "exactly the right set")):
-            share = _of(rows, str(method), column)
-            if share is not None:
+            found = share(column)(rows)
+            if found is not None:
                 panel = panels.setdefault(f"{setting}: {title}", {})
-                panel.setdefault(_HEADS[str(method)], []).append((str(changed), share))
-    yield Chart("results-peers", "Every method on the same windows, 95 % intervals", panels, "true change",
-                "share of windows")  # fmt: skip
+                panel.setdefault(_HEADS[str(method)], []).append((str(changed), found))
+    text = "Every method on the same windows, with 95 % intervals"
+    yield Chart("results-peers", text, panels, "true change", "share of windows")
 
 
 def peers(options: Options) -> Study:

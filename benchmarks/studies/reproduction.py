@@ -5,14 +5,27 @@ trained on, as the paper evidently had it, and on independent realisations. The 
 one source of fixed direction and level, fixed speed, the paper's four cutoffs.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from benchmarks.studies.opinions import TITLES, diagnosticians
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, floats, grouped, pooled, rate
+from benchmarks.studies.opinions import TITLES, diagnosticians, named_in
+from benchmarks.studies.results import (
+    Chart,
+    Estimate,
+    Goal,
+    Record,
+    Table,
+    Value,
+    each,
+    floats,
+    grouped,
+    rate,
+    share,
+    where,
+)
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -24,7 +37,6 @@ from models.diagnosis.networks.paper import (
     calibrate_paper,
 )
 from models.diagnosis.networks.paper_training import train_paper_network
-from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -34,12 +46,11 @@ from models.physics.matrices import STATE_INDEX
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.training.draws import Purpose, simulate_scenario, with_tilt
 
-__all__ = ["CONDITIONS", "Run", "own_equations", "reproduction", "simulate"]
-
 _CUTOFFS_HZ = (25.0, 50.0, 100.0, 200.0)
 """Cutoffs of the excitation; the paper's own four (its Table 3) are lost."""
 _NOISE_LEVELS = (0.01, 0.02, 0.03, 0.04, 0.05)
 """Coloured noise at the sensors in parts of each channel's rms (§4.2.3)."""
+_REALISATIONS = ("shared", "independent")
 _NOISE_CORNER_HZ, _NOISE_CUTOFF_HZ = 200.0, 100.0
 _EQUATIONS = tuple(equation.number for equation in PAPER_EQUATIONS)
 _OWN = {name: equation.number for equation in PAPER_EQUATIONS for name in equation.parameters}
@@ -58,12 +69,8 @@ CONDITIONS: dict[str, dict[str, float]] = {
 """Healthy, and the paper's eight under their names there, each change 20 %; their place is part of the seed."""
 
 
-def own_equations(faults: dict[str, float]) -> tuple[str, ...]:
-    """Equations that contain a changed parameter: what a right location names."""
-    return _equations_of(tuple(faults))
-
-
-def _equations_of(parameters: Sequence[str]) -> tuple[str, ...]:
+def own_equations(parameters: Iterable[str]) -> tuple[str, ...]:
+    """Equations that contain any of the parameters: of the changed ones what a right location names."""
     named = {_OWN[name] for name in parameters}
     return tuple(number for number in _EQUATIONS if number in named)
 
@@ -145,29 +152,24 @@ def _measure(
     faults, realisation = cell.given
     run = Run(faults, float(cell.keys["cutoff_hz"] or 0), float(cell.keys["noise"] or 0), (*realisation, number))
     whole = simulate(machine, options.seed, run)
-    paper = PaperDiagnostician(machine, networks, limits[str(cell.keys["realisation"])])
-    opinion = paper.diagnose(whole)
-    own: dict[str, Value] = {"own": " ".join(own_equations(faults))}
-    found: list[dict[str, Value]] = [
-        own | {"method": "paper", "named": " ".join(paper.flagged_equations(opinion))} | _deviations(opinion)
-    ]
     seen = _seen_by(machine, whole)
-    for one in diagnosticians(machine, bundle):
-        row: dict[str, Value] = own | {"method": one.by, "named": None}
+    paper = PaperDiagnostician(machine, networks, limits[str(cell.keys["realisation"])])
+    found: list[dict[str, Value]] = []
+    for one in (paper, *diagnosticians(machine, bundle)):
+        row: dict[str, Value] = {"method": one.by, "own": " ".join(own_equations(faults)), "named": None}
         try:
-            # Equation 30 needs tilt; the others judge by the machine's own channels.
-            other = one.diagnose(whole if one.by == "relation" else seen)
+            # Equation 30 needs tilt; the likelihood and the amortised networks judge by the machine's own channels.
+            opinion = one.diagnose(whole if one.by in ("paper", "relation") else seen)
         except EstimationError:  # a refused window is a result: it is counted
             found.append(row)
             continue
-        if other.evaluable:
-            row["named"] = " ".join(_equations_of(isolate_window(other, options.rate).changed))
-        found.append(row | _deviations(other))
+        if one is paper:
+            row["named"] = " ".join(paper.flagged_equations(opinion))
+        elif opinion.evaluable:
+            row["named"] = " ".join(own_equations(isolate_window(opinion, options.rate).changed))
+        row |= {f"msd {read.equation}": read.msd for read in opinion.equations if read.msd is not None}
+        found.append(row)
     return found
-
-
-def _deviations(diagnosis: Diagnosis) -> dict[str, Value]:
-    return {f"msd {reading.equation}": reading.msd for reading in diagnosis.equations if reading.msd is not None}
 
 
 def _seen_by(machine: Machine, window: WindowStatistics) -> WindowStatistics:
@@ -185,33 +187,23 @@ def _seen_by(machine: Machine, window: WindowStatistics) -> WindowStatistics:
     )
 
 
-def _named(row: Record) -> set[str]:
-    return set(str(row["named"] or "").split())
-
-
-def _own(row: Record) -> set[str]:
-    return set(str(row["own"]).split())
-
-
-def _changed(rows: Sequence[Record]) -> list[Record]:
-    return [row for row in rows if row["condition"] != "healthy"]
-
-
-def _exact(rows: Sequence[Record]) -> Estimate | None:
-    return rate(row["named"] is not None and _named(row) == _own(row) for row in _changed(rows))
-
-
-def _titled(records: Sequence[Record]) -> Iterator[Record]:
-    return ({**row, "method": TITLES[str(row["method"])]} for row in records)
+def _judged(records: Iterable[Record]) -> Iterator[Record]:
+    for row in records:
+        named, own = named_in(row), named_in(row, "own")
+        changed = row["condition"] != "healthy"
+        yield {
+            **row,
+            "method": TITLES[str(row["method"])],
+            "exact": row["named"] is not None and named == own if changed else None,
+            "wrong": not named <= own if changed else None,
+            "flagged": None if changed else bool(named),
+            **{f"({number})": number in named for number in _EQUATIONS},
+            **{f"own ({number})": number in named if number in own else None for number in _EQUATIONS},
+        }
 
 
 def _eight(records: Sequence[Record]) -> Iterator[Record]:
-    """Without the rows at other noise levels."""
-    return (row for row in _titled(records) if row["part"] == "conditions")
-
-
-def _naming(number: str, rows: Sequence[Record]) -> Estimate | None:
-    return rate(number in _named(row) for row in rows)
+    return _judged(where(records, part="conditions"))
 
 
 def _quantile(number: str, level: float, rows: Sequence[Record]) -> float | None:
@@ -224,12 +216,12 @@ _TABLES = (
         "reproduction",
         ("realisation", "method"),
         {
-            "exactly the changed equations": _exact,
+            "exactly the changed equations": share("exact"),
             "changed equations named": lambda rows: rate(
-                number in _named(row) for row in _changed(rows) for number in _own(row)
+                row[f"own ({n})"] for row in rows for n in _EQUATIONS if row[f"own ({n})"] is not None
             ),
-            "an unchanged one named": lambda rows: rate(not _named(row) <= _own(row) for row in _changed(rows)),
-            "healthy windows flagged": lambda rows: rate(_named(row) for row in rows if row["condition"] == "healthy"),
+            "an unchanged one named": share("wrong"),
+            "healthy windows flagged": share("flagged"),
         },
         _eight,
         "Who finds what, over the eight conditions and all cutoffs:",
@@ -237,54 +229,47 @@ _TABLES = (
     Table(
         "reproduction-equations",
         ("realisation", "method", "condition", "own"),
-        {f"({number}) named": partial(_naming, number) for number in _EQUATIONS},
+        {f"({number}) named": share(f"({number})") for number in _EQUATIONS},
         _eight,
     ),
     Table(
         "reproduction-noise",
         ("realisation", "method", "noise"),
-        {"healthy windows flagged": lambda rows: rate(map(_named, rows))},
-        lambda records: (row for row in _titled(records) if row["part"] == "noise"),
+        {"healthy windows flagged": share("flagged")},
+        lambda records: _judged(where(records, part="noise")),
     ),
     Table(
         "reproduction-msd",
         ("part", "realisation", "method", "condition", "cutoff_hz", "noise"),
         {
-            f"({number}) {name}": partial(_quantile, number, level)
+            f"({number}) MSD, {100 * level:g} %": partial(_quantile, number, level)
             for number in _EQUATIONS
-            for name, level in (("MSD, 5 %", 0.05), ("MSD, median", 0.5), ("MSD, 95 %", 0.95))
+            for level in (0.05, 0.5, 0.95)
         },
         lambda records: (row for row in records if row["method"] in ("paper", "relation")),
     ),
 )
 
 
+def _goals(records: Sequence[Record]) -> Iterator[Goal]:
+    exact = each(where(_eight(records), method=TITLES["paper"]), ("realisation",), share("exact"))
+    text = "; ".join(f"{kind} {one}" for kind, one in exact.items())
+    yield Goal("networks as printed: exactly the changed equations named", "the paper: all", text, "–")
+
+
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """The paper's Figs. 5 and 6: MSD of every printed network over the cutoff, for every condition."""
-    for realisation in ("shared", "independent"):
+    for realisation in _REALISATIONS:
         panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-        rows = [
-            r for r in records if (r["part"], r["method"], r["realisation"]) == ("conditions", "paper", realisation)
-        ]
+        rows = where(records, part="conditions", method="paper", realisation=realisation)
         for (condition, cutoff_hz), group in grouped(rows, "condition", "cutoff_hz").items():
             for number in _EQUATIONS:
                 low, middle, high = (_quantile(number, level, group) or 0.0 for level in (0.05, 0.5, 0.95))
                 series = panels.setdefault(str(condition), {}).setdefault(f"equation {number}", [])
                 series.append((f"{cutoff_hz:g}", Estimate(middle, low, high, len(group))))
-        yield Chart(
-            f"reproduction-msd-{realisation}",
-            f"MSD of the networks as printed, {realisation} realisations: median and 5–95 % of the windows",
-            panels, "cutoff of the excitation, Hz", "MSD, of the target's mean square", log=True,
-        )  # fmt: skip
-
-
-def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    rows = [row for row in records if row["part"] == "conditions" and row["method"] == "paper"]
-    shares = {kind: _exact([row for row in rows if row["realisation"] == kind]) for kind in ("shared", "independent")}
-    both = pooled(shares.values())
-    text = "; ".join(f"{kind} {one}" for kind, one in shares.items())
-    if both is not None:
-        yield Goal("networks as printed: exactly the changed equations named", "none; the paper says all", text, "–")
+        text = f"MSD of the networks as printed, {realisation} realisations: median and 5–95 % of the windows"
+        yield Chart(f"reproduction-msd-{realisation}", text, panels, "cutoff of the excitation, Hz",
+                    "MSD, of the target's mean square", log=True)  # fmt: skip
 
 
 def reproduction(options: Options) -> Study:
@@ -294,11 +279,13 @@ def reproduction(options: Options) -> Study:
     cutoffs = _CUTOFFS_HZ[1:3] if options.small else _CUTOFFS_HZ
     noises = _NOISE_LEVELS[::4] if options.small else _NOISE_LEVELS
     noise_hz = min(cutoffs, key=lambda cutoff: abs(cutoff - _NOISE_CUTOFF_HZ))
-    kinds = ("shared", "independent")
     plan = [
-        ("conditions", kind, name, cutoff, noises[0]) for kind in kinds for name in CONDITIONS for cutoff in cutoffs
+        ("conditions", kind, name, cutoff, noises[0])
+        for kind in _REALISATIONS
+        for name in CONDITIONS
+        for cutoff in cutoffs
     ]
-    plan += [("noise", kind, "healthy", noise_hz, noise) for kind in kinds for noise in noises]
+    plan += [("noise", kind, "healthy", noise_hz, noise) for kind in _REALISATIONS for noise in noises]
     cells = tuple(
         Cell(
             {"part": part, "realisation": kind, "condition": name, "cutoff_hz": cutoff, "noise": noise},

@@ -7,31 +7,12 @@ Clopper-Pearson, those of everything else come from resampling the windows.
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import scipy.stats
-
-__all__ = [
-    "Chart",
-    "Estimate",
-    "Goal",
-    "Record",
-    "Table",
-    "Value",
-    "at_least",
-    "at_most",
-    "floats",
-    "grouped",
-    "limit_of",
-    "median",
-    "pooled",
-    "rate",
-    "robust",
-    "spread",
-    "within",
-]
 
 Value = str | float | bool | None
 """Of a record: what JSON has, none of it nested."""
@@ -46,22 +27,15 @@ _FEWEST = 4
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """A figure with its 95 % interval.
-
-    Attributes
-    ----------
-    value, low, high : float
-    n : int
-        Windows.
-    count : int or None
-        Of a rate: windows in which it holds.
-    """
+    """A figure with its 95 % interval."""
 
     value: float
     low: float
     high: float
     n: int
+    """Windows."""
     count: int | None = None
+    """Of a rate: windows in which it holds."""
 
     def __str__(self) -> str:
         if self.count is None:
@@ -121,17 +95,7 @@ def median(values: Iterable[Value]) -> float | None:
 def limit_of(healthy: FloatArray, false_alarm_rate: float) -> float:
     """Limit that a further healthy window exceeds with the declared probability at most, whatever the distribution.
 
-    Parameters
-    ----------
-    healthy : ndarray, shape (n,)
-        Scores of healthy windows that nothing was learned from.
-    false_alarm_rate : float
-        α per window: the ⌈(n+1)(1-α)⌉-th smallest score is the limit.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than 1/α - 1 scores.
+    The ⌈(n+1)(1-α)⌉-th smallest of n healthy scores that nothing was learned from; refused with fewer than 1/α - 1.
     """
     rank = int(np.ceil((healthy.size + 1) * (1 - false_alarm_rate) - 1e-9))
     if rank > healthy.size:
@@ -150,38 +114,55 @@ def grouped(records: Iterable[Record], *by: str) -> dict[tuple[Value, ...], list
     return groups
 
 
+def where(records: Iterable[Record], **wanted: Value) -> list[Record]:
+    """Records with these values."""
+    return [record for record in records if all(record.get(name) == value for name, value in wanted.items())]
+
+
+def share(column: str) -> Callable[[Sequence[Record]], Estimate | None]:
+    """Rate of the records that have the column in which it holds."""
+    return partial(lambda name, rows: rate(row[name] for row in rows if row.get(name) is not None), column)
+
+
+def scatter(column: str) -> Callable[[Sequence[Record]], Estimate | None]:
+    """Spread of a column."""
+    return partial(lambda name, rows: spread(row.get(name) for row in rows), column)
+
+
+def middle(column: str) -> Callable[[Sequence[Record]], float | None]:
+    """Median of a column."""
+    return partial(lambda name, rows: median(row.get(name) for row in rows), column)
+
+
+def each(
+    records: Iterable[Record], by: Sequence[str], figure: Callable[[Sequence[Record]], Estimate | None]
+) -> dict[str, Estimate | None]:
+    """A figure of every group, under the values that make it."""
+    return {", ".join(map(str, key)): figure(group) for key, group in grouped(records, *by).items()}
+
+
 Figure = Estimate | float | str | None
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table of results: one row for every group of records.
-
-    Attributes
-    ----------
-    name : str
-        Of its CSV file.
-    by : tuple of str
-        Columns whose values make a group.
-    columns : mapping of str to callable
-        Heading to a figure of the group's records.
-    rows : callable
-        What is grouped, from the records: themselves, or one for each parameter.
-    page : str
-        Heading under which it stands on the page; empty if it is in its file alone.
-    """
+    """A table of results: one row for every group of records."""
 
     name: str
+    """Of its CSV file."""
     by: tuple[str, ...]
     columns: Mapping[str, Callable[[Sequence[Record]], Figure]]
     rows: Callable[[Sequence[Record]], Iterable[Record]] = field(default=lambda records: records)
+    """What is grouped, from the records: themselves, or one for each parameter."""
     page: str = ""
+    """Words above it on the page; without any it is in its file alone."""
 
     def of(self, records: Sequence[Record]) -> list[dict[str, Figure]]:
         """Its rows."""
         rows: list[dict[str, Figure]] = []
         for key, group in grouped(self.rows(records), *self.by).items():
-            rows.append({**dict(zip(self.by, key, strict=True)), **{n: of(group) for n, of in self.columns.items()}})
+            figures = {name: of(group) for name, of in self.columns.items()}
+            rows.append({**dict(zip(self.by, key, strict=True)), **figures})
         return rows
 
     def write(self, records: Sequence[Record], folder: Path) -> Path:
@@ -205,20 +186,13 @@ def _cells(name: str, value: Figure) -> list[tuple[str, Value]]:
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A declared goal, and what was measured of it.
-
-    Attributes
-    ----------
-    what, declared, measured : str
-    verdict : str
-        ``met``, ``missed`` where the whole 95 % interval misses it, ``within chance`` where only the figure does, or
-        ``–`` where nothing was declared or measured.
-    """
+    """A declared goal, and what was measured of it."""
 
     what: str
     declared: str
     measured: str
     verdict: str
+    """``met``; ``missed``: the whole interval misses it; ``within chance``: only the figure does; or ``–``."""
 
 
 def at_least(what: str, measured: Estimate | None, least: float, declared: str = "") -> Goal:
@@ -242,7 +216,17 @@ def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: 
     verdict = next((one for one in ("missed", "within chance") if one in verdicts), "met")
     several = f"{verdicts.count('met')} of {len(found)} inside; farthest {name}: " if len(found) > 1 else ""
     declared = f"{_limit(found[name], low)} to {_limit(found[name], high)}"
+    if low == 0 or (high >= 1 and found[name].count is not None):
+        declared = f"≤ {_limit(found[name], high)}" if low == 0 else f"≥ {_limit(found[name], low)}"
     return Goal(what, declared, f"{several}{found[name]}", verdict)
+
+
+def holding(what: str, rates: Mapping[str, Estimate | None], declared: float) -> Goal:
+    """Goal of rates whose intervals should hold the declared one."""
+    found = {name: one for name, one in rates.items() if one is not None}
+    met = all(one.low <= declared <= one.high for one in found.values())
+    text = "; ".join(f"{name} {one}" for name, one in found.items())
+    return Goal(what, f"{100 * declared:g} % inside", text or "–", ("met" if met else "missed") if found else "–")
 
 
 def _limit(measured: Estimate | None, value: float) -> str:
@@ -259,29 +243,15 @@ def _judged(what: str, one: Estimate | None, low: float, high: float, declared: 
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Points with intervals in panels, or distributions as steps.
-
-    Attributes
-    ----------
-    name, caption : str
-        Of the file, and below it.
-    panels : mapping
-        Title to series; a series has points, an abscissa (a number or a word) each with an estimate, or with a float.
-    x, y : str
-        What the axes are.
-    steps : bool
-        Distributions: the abscissa is a number, the estimate a share.
-    log : bool
-        Logarithmic ordinate.
-    lines : tuple of float
-        Rules across.
-    """
+    """Points with intervals in panels, or distributions as steps."""
 
     name: str
     caption: str
     panels: Mapping[str, Mapping[str, Sequence[tuple[str | float, Estimate | float]]]]
+    """Title to series; the points of a series have an abscissa, a number or a word, and a figure."""
     x: str
     y: str
     steps: bool = False
     log: bool = False
     lines: tuple[float, ...] = ()
+    """Rules across."""

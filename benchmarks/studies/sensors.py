@@ -1,12 +1,12 @@
 """Sensors at fault on a healthy machine: named, called a matter of data health, or taken for a fault of the machine."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
 
 import numpy as np
 
 from benchmarks.studies.opinions import opinion
-from benchmarks.studies.results import Goal, Record, Table, Value, grouped, rate, within
+from benchmarks.studies.results import Estimate, Goal, Record, Table, Value, each, share, where, within
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
 from models.commissioning.knowledge import KnowledgeLevel
@@ -21,8 +21,6 @@ from simulator.integrator import theoretical_rms
 from simulator.scenario import Event, Scenario
 from simulator.timeline import compile_timeline
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario
-
-__all__ = ["sensors"]
 
 _FAULTS = {
     "healthy": ("none (healthy)", ""),
@@ -106,27 +104,29 @@ def _event(
     return Event.model_validate(fields), channel, size
 
 
-def _claims(record: Record) -> bool:
-    """A fault of the machine named without reserve: a name beside "outside the model" claims nothing."""
-    return bool(record.get("named")) and not record.get("outside")
+def _judged(records: Sequence[Record]) -> Iterator[Record]:
+    """With what is made of every window; a name beside "outside the model" blames nothing."""
+    for row in records:
+        blamed = bool(row.get("named")) and not row.get("outside")
+        yield {**row, "data": bool(row["found"]), "blamed": blamed, "at fault": row["fault"] != _FAULTS["healthy"][0]}
 
 
 _COLUMNS = {
-    "fault and channel named": lambda rows: rate(row["right"] for row in rows),
-    "said to be the data": lambda rows: rate(row["found"] for row in rows),
-    "machine blamed": lambda rows: rate(map(_claims, rows)),
+    "fault and channel named": share("right"),
+    "said to be the data": share("data"),
+    "machine blamed": share("blamed"),
 }
 
 
+def _at(level: str, figure: Callable[[Sequence[Record]], Estimate | None], rows: Sequence[Record]) -> Estimate | None:
+    return figure(where(rows, level=level))
+
+
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    healthy = grouped((row for row in records if row["fault"] == "none (healthy)"), "machine", "level")
-    yield within(
-        "a healthy sensor said to be at fault",
-        {", ".join(map(str, key)): rate(row["found"] for row in rows) for key, rows in healthy.items()}, 0.0, 0.01,
-    )  # fmt: skip
-    faulty = grouped((row for row in records if row["fault"] != "none (healthy)"), "machine", "fault", "level")
-    blamed = {", ".join(map(str, key)): rate(map(_claims, rows)) for key, rows in faulty.items()}
-    yield within("a faulty sensor taken for a fault of the machine", blamed, 0.0, 0.01)
+    rows, by = list(_judged(records)), ("machine", "fault", "level")
+    healthy, faulty = ([row for row in rows if row["at fault"] is one] for one in (False, True))
+    yield within("a healthy sensor said to be at fault", each(healthy, by, share("data")), 0.0, 0.01)
+    yield within("a faulty sensor taken for a fault of the machine", each(faulty, by, share("blamed")), 0.0, 0.01)
 
 
 def sensors(options: Options) -> Study:
@@ -146,8 +146,18 @@ def sensors(options: Options) -> Study:
         cells=cells,
         measure=partial(_measure, options),
         tables=(
-            Table("sensors", ("machine", "level", "fault"), _COLUMNS),
-            Table("sensors-by-fault", ("fault",), _COLUMNS, page="Machines and levels together:"),
+            Table("sensors", ("machine", "level", "fault"), _COLUMNS, _judged),
+            Table(
+                "sensors-by-fault",
+                ("fault",),
+                {
+                    # Sensors are checked before the machine is read: both levels have the same findings.
+                    **{name: partial(_at, KnowledgeLevel.FULL, of) for name, of in list(_COLUMNS.items())[:2]},
+                    **{f"machine blamed, {level}": partial(_at, level, share("blamed")) for level in _LEVELS},
+                },
+                _judged,
+                "All machines:",
+            ),
         ),
         goals=_goals,
     )

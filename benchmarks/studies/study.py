@@ -22,31 +22,21 @@ from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from models.errors import RecordingError
 from simulator.training.progress import labelled_bars
 
-__all__ = ["Cell", "Options", "Over", "Study", "options_of", "read", "run"]
-
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What is asked for on the command line.
-
-    Attributes
-    ----------
-    machines : tuple of str
-        The study's own if empty.
-    windows : int
-        Per cell; a study gives some cells a fixed multiple of it.
-    seed : int
-    small : bool
-        The smallest plan that exercises everything, at a declared rate of 10 % false alarms: a check, not a result.
-    """
+    """What is asked for on the command line."""
 
     machines: tuple[str, ...] = ()
+    """The study's own if empty."""
     windows: int = 100
+    """Per cell; a study gives some cells a fixed multiple of it."""
     seed: int = 20261122
     small: bool = False
+    """The smallest plan that exercises everything, at a declared rate of 10 % false alarms: a check, not a result."""
 
     @property
     def rate(self) -> float:
@@ -56,20 +46,13 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Windows of one kind.
-
-    Attributes
-    ----------
-    keys : mapping
-        What tells them from all others; columns of their records.
-    windows : int
-    given : object
-        What `Study.measure` needs besides to make one.
-    """
+    """Windows of one kind."""
 
     keys: Mapping[str, Value]
+    """What tells them from all others; columns of their records."""
     windows: int
     given: Any = None
+    """What `Study.measure` needs besides to make one."""
 
     @property
     def name(self) -> str:
@@ -96,35 +79,20 @@ class Over:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """One study, declared.
-
-    Attributes
-    ----------
-    name : str
-        Of its records, and of its words in ``texts.toml``.
-    cells : tuple of Cell
-    measure : callable
-        Records of one window, from what was learned, the cell and the window's number. At the top level of a module, or
-        a partial of such a function.
-    tables : tuple of Table
-    goals : callable
-        Judged figures from all records.
-    charts : callable
-        What is drawn of them.
-    learn : callable or None
-        What has to be trained or calibrated beforehand; done anew when a study is carried on.
-    made_with : mapping
-        Whatever else records of one file must share: digests of machine and bundle.
-    """
+    """One study, declared. What is sent to the workers is at the top level of a module, or a partial of it."""
 
     name: str
+    """Of its records, and of its words in ``texts.toml``."""
     cells: tuple[Cell, ...]
     measure: Callable[[Any, Cell, int], Sequence[Mapping[str, Value]]]
+    """Records of one window, from what was learned, the cell and the window's number."""
     tables: tuple[Table, ...]
-    goals: Callable[[Sequence[Record]], Iterable[Goal]]
+    goals: Callable[[Sequence[Record]], Iterable[Goal]] = field(default=lambda _: ())
     charts: Callable[[Sequence[Record]], Iterable[Chart]] = field(default=lambda _: ())
     learn: Callable[[Over], Any] | None = None
+    """What has to be trained or calibrated beforehand; done anew when a study is carried on."""
     made_with: Mapping[str, str] = field(default_factory=dict)
+    """Whatever else records of one file must share: digests of machine and bundle."""
 
 
 def run(study: Study, options: Options, folder: Path, processes: int) -> Path:

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Protocol
 
 import numpy as np
 
@@ -29,8 +28,6 @@ from simulator.finite_elements.observed import WindowSizes, machine_of, plan, sa
 from simulator.finite_elements.rotor import BeamRotor
 from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
-
-__all__ = ["SHIPPED", "SUBJECTS", "Later", "Subject", "commissioned", "subject_named"]
 
 SHIPPED = ("lab", "heavy", "light")
 SUBJECTS: tuple[str, ...] = (*(rotor.name for rotor in ROTORS), *SHIPPED)
@@ -65,32 +62,9 @@ class Later:
     changes: dict[str, float]
 
 
-class Subject(Protocol):
-    """A machine to commission."""
-
-    @property
-    def description(self) -> str:
-        """What it is, in a few words."""
-
-    def file(self, level: KnowledgeLevel) -> MachineFile | None:
-        """Its machine file at a level of knowledge; None where its model class has no such file."""
-
-    def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
-        """Windows of 60 s of one commissioning, which do not overlap."""
-
-    def later(self, which: Later) -> tuple[WindowStatistics, float]:
-        """One window of 60 s, and the cutoff of its excitation, Hz."""
-
-
-def subject_named(name: str) -> Subject:
-    """Look a machine of `SUBJECTS` up.
-
-    Raises
-    ------
-    KeyError
-        If it is not among them.
-    """
-    return _Shipped(load_machine(name)) if name in SHIPPED else _Beam(rotor_named(name))
+def subject_named(name: str) -> "Shipped | Beam":
+    """Look a machine of `SUBJECTS` up; a KeyError if it is not among them."""
+    return Shipped(load_machine(name)) if name in SHIPPED else Beam(rotor_named(name))
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,13 +84,7 @@ class _Compared:
 
 
 def commissioned(level: KnowledgeLevel, file: MachineFile, windows: Sequence[WindowStatistics]) -> Diagnostician:
-    """Commission on healthy windows of one recording with what the machine file tells.
-
-    Raises
-    ------
-    EstimationError
-        If the windows do not suffice.
-    """
+    """Commission on healthy windows of one recording with what the machine file tells."""
     if level is KnowledgeLevel.NONE:
         return BaselineDiagnostician(learned_baseline(windows, ["recording 1"] * len(windows)))
     if isinstance(file, Machine):
@@ -145,23 +113,24 @@ def _other_cutoff(limits: tuple[float, float], commissioned: float, rng: np.rand
 
 
 @dataclass(frozen=True, slots=True)
-class _Beam:
+class Beam:
+    """A rotor of finite elements; it has a machine file at level none alone."""
+
     rotor: BeamRotor
 
-    @property
-    def description(self) -> str:
-        return self.rotor.description
-
     def file(self, level: KnowledgeLevel) -> MachineFile | None:
+        """Machine file at a level of knowledge; None where there is none."""
         return machine_of(self.rotor, WindowSizes()) if level is KnowledgeLevel.NONE else None
 
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
+        """Windows of 60 s of one commissioning, which do not overlap."""
         cutoff_hz = _commissioned_cutoff(self.rotor.name, seed, commissioning)
         rng = _generator(self.rotor.name, seed, commissioning, _Use.COMMISSIONING)
         limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
         return self._windows(SourceLayout.ONE_SOURCE, limits, {}, rng, count)
 
     def later(self, which: Later) -> tuple[WindowStatistics, float]:
+        """One window of 60 s, and the cutoff of its excitation, Hz."""
         name = self.rotor.name
         rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
         commissioned = _commissioned_cutoff(name, which.seed, which.commissioning)
@@ -182,14 +151,13 @@ class _Beam:
 
 
 @dataclass(frozen=True, slots=True)
-class _Shipped:
+class Shipped:
+    """A shipped machine, in windows of 60 s."""
+
     machine: Machine
 
-    @property
-    def description(self) -> str:
-        return f"{self.machine.description}, six degrees of freedom"
-
     def file(self, level: KnowledgeLevel) -> MachineFile | None:
+        """Machine file at a level of knowledge; None where there is none."""
         machine = _within(self.machine, self.machine.condition)
         if level is KnowledgeLevel.FULL:
             return machine
@@ -199,6 +167,7 @@ class _Shipped:
         return MachineFile.model_validate(content)
 
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
+        """Windows of 60 s of one commissioning, which do not overlap."""
         cutoff_hz = _commissioned_cutoff(self.machine.name, seed, commissioning)
         rng = _generator(self.machine.name, seed, commissioning, _Use.COMMISSIONING)
         limits = ConditionRange(
@@ -209,6 +178,7 @@ class _Shipped:
         return tuple(simulate_window(draw, number) for number in range(1, count + 1))
 
     def later(self, which: Later) -> tuple[WindowStatistics, float]:
+        """One window of 60 s, and the cutoff of its excitation, Hz."""
         name = self.machine.name
         rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
         own = self.machine.condition

@@ -48,43 +48,26 @@ class Reader(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row of the table, and what of it is switched on.
-
-    Attributes
-    ----------
-    group, label : str
-        Part of the table, and what distinguishes the row.
-    equations : tuple of str
-        Equations it exists for.
-    reader : Reader
-    synchronous_out : bool
-        Rotation-synchronous part removed.
-    long_lags : bool
-        Lags from ``lag_from_s`` on, not from zero.
-    normalised : bool
-        Every window divided by the rms of its target.
-    every_reference : bool
-        All measured displacements as references, not y1 alone.
-    tilt_out : bool
-        The disc's acceleration among the inputs.
-    speed_powers : bool
-        Powers of Ω among the inputs of equation 29.
-    varied : bool
-        Trained on windows in which everything else varies, not on one condition.
-    measure : Measure
-    """
+    """One row of the table, and what of it is switched on."""
 
     group: str
     label: str
     equations: tuple[str, ...] = ("28", "31")
+    """Equations it exists for."""
     reader: Reader = Reader.NETWORK
     synchronous_out: bool = True
     long_lags: bool = True
+    """Lags from ``lag_from_s`` on, not from zero."""
     normalised: bool = True
+    """Every window divided by the rms of its target."""
     every_reference: bool = True
+    """All measured displacements as references, not y1 alone."""
     tilt_out: bool = True
+    """The disc's acceleration among the inputs."""
     speed_powers: bool = True
+    """Powers of Ω among the inputs of equation 29."""
     varied: bool = True
+    """Trained on windows in which everything else varies, not on one condition."""
     measure: Measure = Measure.OWN_ERROR
 
     @property
@@ -94,18 +77,10 @@ class Variant:
 
 
 _PRINTED = Variant(
-    "one after the other",
-    "as printed",
-    equations=("28", "29", "31"),
-    reader=Reader.PAPER,
-    synchronous_out=False,
-    long_lags=False,
-    normalised=False,
-    every_reference=False,
-    tilt_out=False,
-    varied=False,
+    "one after the other", "as printed", ("28", "29", "31"), Reader.PAPER,
+    synchronous_out=False, long_lags=False, normalised=False, every_reference=False, tilt_out=False, varied=False,
     measure=Measure.MSD,
-)
+)  # fmt: skip
 _OUT = replace(_PRINTED, label="+ synchronous part removed", equations=("28", "31"), reader=Reader.NETWORK)
 _OUT = replace(_OUT, synchronous_out=True)
 _LAGS = replace(_OUT, label="+ lags beyond the excitation's memory", long_lags=True)
@@ -118,8 +93,15 @@ _PRESENT = replace(_PROJECTED, label="+ block standard error (the present one)",
 
 _ALL = ("28", "29", "31")
 _29 = replace(_VARIED, equations=("29",))
-_WITHOUT = replace(_PRESENT, group="the present one without")
-_BESIDE = replace(_PRESENT, group="in its place", equations=_ALL)
+
+
+def _without(label: str, equations: tuple[str, ...] = ("28", "31"), **off: object) -> Variant:
+    return replace(_PRESENT, group="the present one without", label=label, equations=equations, **off)  # type: ignore[arg-type]
+
+
+def _beside(label: str, reader: Reader, *, varied: bool = True) -> Variant:
+    return replace(_PRESENT, group="in its place", label=label, equations=_ALL, reader=reader, varied=varied)
+
 
 VARIANTS: tuple[Variant, ...] = (
     _PRINTED,
@@ -133,21 +115,21 @@ VARIANTS: tuple[Variant, ...] = (
     replace(_VARIED, equations=_ALL),
     replace(_PROJECTED, equations=_ALL),
     replace(_PRESENT, equations=_ALL),
-    replace(_WITHOUT, label="synchronous part removed", synchronous_out=False),
-    replace(_WITHOUT, label="lags beyond the excitation's memory", long_lags=False),
-    replace(_WITHOUT, label="normalisation", normalised=False),
-    replace(_WITHOUT, label="all references (y1 alone)", every_reference=False),
-    replace(_WITHOUT, label="tilt eliminated", tilt_out=False),
-    replace(_WITHOUT, label="powers of Ω among the inputs", equations=("29",), speed_powers=False),
-    replace(_WITHOUT, label="varied training (one condition)", equations=_ALL, varied=False),
-    replace(_WITHOUT, label="projection (MSD)", equations=_ALL, measure=Measure.MSD),
-    replace(_WITHOUT, label="block standard error", equations=_ALL, measure=Measure.PROJECTION),
-    replace(_BESIDE, label="as printed, trained while everything else varies", reader=Reader.PAPER, varied=True),
-    replace(_BESIDE, label="linear fit", reader=Reader.LINEAR),
-    replace(_BESIDE, label="linear fit, one condition", reader=Reader.LINEAR, varied=False),
-    replace(_BESIDE, label="shipped relation network", reader=Reader.SHIPPED),
-    replace(_BESIDE, label="amortised network", reader=Reader.AMORTISED),
-    replace(_BESIDE, label="likelihood", reader=Reader.LIKELIHOOD),
+    _without("synchronous part removed", synchronous_out=False),
+    _without("lags beyond the excitation's memory", long_lags=False),
+    _without("normalisation", normalised=False),
+    _without("all references (y1 alone)", every_reference=False),
+    _without("tilt eliminated", tilt_out=False),
+    _without("powers of Ω among the inputs", ("29",), speed_powers=False),
+    _without("varied training (one condition)", _ALL, varied=False),
+    _without("projection (MSD)", _ALL, measure=Measure.MSD),
+    _without("block standard error", _ALL, measure=Measure.PROJECTION),
+    _beside("as printed, trained while everything else varies", Reader.PAPER),
+    _beside("linear fit", Reader.LINEAR),
+    _beside("linear fit, one condition", Reader.LINEAR, varied=False),
+    _beside("shipped relation network", Reader.SHIPPED),
+    _beside("amortised network", Reader.AMORTISED),
+    _beside("likelihood", Reader.LIKELIHOOD),
 )
 """The rows of the table."""
 
@@ -165,14 +147,9 @@ class _LevelRows(EquationRows):
 
 @dataclass(frozen=True, slots=True)
 class VariantEquation(Equation):
-    """Equation 28 or 31 with some of its references, and in fixed units if it is not normalised.
+    """Equation 28 or 31 with the first few of its references y1, y2, z1, z2.
 
-    Attributes
-    ----------
-    references : int
-        How many of y1, y2, z1, z2.
-    unit : float or None
-        Unit of target, inputs and signatures; None divides every window by its own target.
+    A `unit` takes the place of every window's own norm in target, inputs and signatures.
     """
 
     references: int = 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from benchmarks.studies.other_methods import FeatureVector, Peer, SubspaceModes, reference_modes
+from benchmarks.studies.other_methods import FeatureVector, SubspaceModes, reference_modes
 from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import load_machine
@@ -49,7 +49,7 @@ def test_a_peer_learns_healthy_and_scores_a_large_change_above_its_limit() -> No
 
 
 def test_a_peer_that_has_learned_nothing_does_not_score() -> None:
-    peer: Peer = FeatureVector(LAB)
+    peer = FeatureVector(LAB)
     with pytest.raises(EstimationError, match="before any healthy window"):
         peer.score(np.zeros(72))
 

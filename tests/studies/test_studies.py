@@ -159,7 +159,6 @@ def test_another_hop_keeps_the_window() -> None:
 def test_files_tell_what_their_level_allows() -> None:
     for name in SUBJECTS:
         subject = subject_named(name)
-        assert subject.description
         for level in KnowledgeLevel:
             file = subject.file(level)
             assert (file is None) == (level is not KnowledgeLevel.NONE and name not in SHIPPED)
