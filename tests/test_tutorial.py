@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from tests.pins.pinned import differences
 from tests.service.preloaded import ran
 
 ROOT = Path(__file__).parents[1]
@@ -72,6 +73,12 @@ def test_the_changed_stiffness_is_named_alone_and_at_once(folder: Path) -> None:
     (alarm,) = alarms(folder, "changed")
     assert (alarm["name"], alarm["kind"]) == ("k_by", "raised")
     assert alarm["text"] in PAGE
+
+
+@pytest.mark.parametrize("name", ["healthy", "changed"])
+def test_what_is_said_of_it_is_what_was_said(folder: Path, name: str) -> None:
+    lines = (folder / f"{name}.jsonl").read_text(encoding="utf-8").splitlines()
+    assert differences(f"tutorial_{name}", lines) == []
 
 
 def test_what_the_commissioning_said_is_on_the_page(folder: Path) -> None:

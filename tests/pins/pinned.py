@@ -1,0 +1,44 @@
+"""What a version of the monitor said, kept: every later one says the same, or gives its reason for not doing so.
+
+``ROTORWATCH_PIN=1`` in the environment of a test that compares makes it write what it finds.
+"""
+
+import gzip
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = ["differences"]
+
+_FOLDER = Path(__file__).parent
+_NEAR = 1e-6
+"""Other processors round the last digits of a sum differently."""
+
+
+def differences(name: str, lines: Sequence[str]) -> list[str]:
+    """Where JSON lines are not what was kept under a name; floats may differ by a millionth."""
+    path = _FOLDER / f"{name}.jsonl.gz"
+    if os.environ.get("ROTORWATCH_PIN"):
+        path.write_bytes(gzip.compress("".join(f"{line}\n" for line in lines).encode(), mtime=0))
+    kept = gzip.decompress(path.read_bytes()).decode().splitlines()
+    if len(kept) != len(lines):
+        return [f"{len(lines)} lines instead of {len(kept)}"]
+    return [
+        found
+        for number, (old, new) in enumerate(zip(kept, lines, strict=True), 1)
+        for found in _between(json.loads(old), json.loads(new), f"line {number}")
+    ]
+
+
+def _between(old: Any, new: Any, where: str) -> list[str]:
+    if isinstance(old, dict) and isinstance(new, dict) and list(old) == list(new):
+        return [found for key in old for found in _between(old[key], new[key], f"{where}.{key}")]
+    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        pairs = enumerate(zip(old, new, strict=True))
+        return [found for number, (a, b) in pairs for found in _between(a, b, f"{where}[{number}]")]
+    if isinstance(old, float) and isinstance(new, float) and math.isclose(old, new, rel_tol=_NEAR, abs_tol=1e-12):
+        return []
+    return [] if type(old) is type(new) and old == new else [f"{where}: {new!r} instead of {old!r}"]
