@@ -11,7 +11,7 @@ from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording,
 
 SLOW = LAB.operation.speed_rpm
 FAST = 1.15 * SLOW
-LENGTH_S = 190.0
+LENGTH_S = 130.0
 
 
 def made_of(*conditions: tuple[str, int, tuple[Event, ...]]) -> Commissioning:
@@ -74,7 +74,7 @@ def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
 @pytest.mark.slow
 def test_recordings_that_differ_at_one_speed_are_refused() -> None:
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
-    made = made_of(("monday.mcap", 91, ()), ("friday.mcap", 92, (softer,)))
+    made = made_of(("monday.mcap", 91, (at(SLOW),)), ("friday.mcap", 92, (at(SLOW), softer)))
     assert made.commissioned is None
     verdict, text = verdict_of(made)
     assert verdict == "refused"

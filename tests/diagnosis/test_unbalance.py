@@ -1,6 +1,7 @@
 """The unbalance as a vector: size and direction of the change, and the number that alarms decide on."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ SEED = 7_700_021
 MACHINE = load_machine("lab")
 
 
+@cache
 def drawn(number: int, e: float = 0.0, layout: Layout = Layout.INDEPENDENT) -> WindowStatistics:
     return simulate_window(Draw(MACHINE, SEED, Purpose.EVALUATION, 0, faults={"e": e}, layout=layout), number)
 
@@ -84,9 +86,11 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
 def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
-    """Size and direction of 24 windows: rms of z within 1 + 4/√48, but for a tenth."""
+    """Size and direction of 12 windows: rms of all 24 z within 1 + 4/√48, of each alone within 1 + 4/√24, but for a
+    tenth.
+    """
     z = []
-    for number in range(24):
+    for number in range(12):
         vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0)).vector
         assert vector is not None
         assert vector.turned_deg is not None
@@ -97,5 +101,6 @@ def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
                 (vector.turned_deg - 60) / vector.turned_error_deg,
             )
         )
-    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 1.7)
-    assert np.all(np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(24) * 1.1)
+    assert np.sqrt(np.mean(np.square(z))) < 1.7
+    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 2.0)
+    assert np.all(np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(12) * 1.1)

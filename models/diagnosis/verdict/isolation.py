@@ -25,7 +25,7 @@ from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = ["Isolation", "isolate", "isolate_window", "outside_confidence", "reading_of", "restricted"]
+__all__ = ["Isolation", "isolate", "isolate_window", "model_test", "outside_confidence", "reading_of", "restricted"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,21 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
     return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
 
 
+def model_test(stretch: Stretch, thresholds: Thresholds) -> tuple[bool, float | None]:
+    """Say of a stretch whether it is outside the model, and with what confidence; see `Isolation`.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What it says.
+    thresholds : Thresholds
+        From the declared rate.
+    """
+    if stretch.misfit_z is None or not math.isfinite(stretch.misfit_z):
+        return False, None
+    return stretch.misfit_z > thresholds.outside, outside_confidence(stretch.misfit_z)
+
+
 def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:
     """Decide a stretch of data.
 
@@ -104,10 +119,7 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
         Who said it; the readings carry the name.
     """
     known = stretch.known
-    outside, confidence = False, None
-    if stretch.misfit_z is not None and math.isfinite(stretch.misfit_z):
-        outside = stretch.misfit_z > thresholds.outside
-        confidence = outside_confidence(stretch.misfit_z)
+    outside, confidence = model_test(stretch, thresholds)
     probability = np.zeros(len(PARAMETERS))
     if not known:
         return Isolation((), 1.0, tuple(probability.tolist()), (), outside, confidence)

@@ -23,7 +23,7 @@ import numpy as np
 from models.checkpoint import checked
 from models.diagnosis.readings import ParameterReading
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
-from models.diagnosis.verdict.isolation import Isolation, isolate, reading_of, restricted
+from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of, restricted
 from models.diagnosis.verdict.stretch import Stretch, added
 from models.errors import CheckpointError
 from models.machine import MachineFile
@@ -323,7 +323,9 @@ class SequentialTest:
         clean = {hops: look for hops, look in every.items() if self._is_clean(look)}
         deciding = [hops for hops in clean if hops <= window_hops]
         # The model is tested on the clean data of one window at most: a straddled change would look like a misfit.
-        tested = self._isolate(deciding[-1], clean[deciding[-1]]) if deciding else None
+        outside, confidence = False, None
+        if deciding:
+            outside, confidence = model_test(clean[deciding[-1]], self._thresholds[deciding[-1]])
         unexplained = clean[deciding[-1]].unexplained if deciding else ""
         loud = {hops: self._isolate(hops, look) for hops, look in every.items() if self._is_loud(hops, look)}
         verdicts = {hops: verdict for hops, verdict in loud.items() if verdict.changed}
@@ -336,8 +338,8 @@ class SequentialTest:
         current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
         isolation = replace(
             isolation,
-            outside=bool(unexplained) or (tested is not None and tested.outside),
-            outside_confidence=None if tested is None else tested.outside_confidence,
+            outside=bool(unexplained) or outside,
+            outside_confidence=confidence,
         )
         return SequentialVerdict(
             detected=bool(verdicts) and not unexplained,
@@ -390,7 +392,7 @@ class SequentialTest:
         for at, (hops, short, part) in enumerate(clean):
             if hops > self.settings.window_hops:
                 return
-            explained = short.known and not short.unexplained and not self._isolate(hops, short).outside
+            explained = short.known and not short.unexplained and not model_test(short, self._thresholds[hops])[0]
             for _, longer, whole in reversed(clean[at + 1 :]):
                 if _worst(part, whole) > self._contradiction or (explained and longer.unexplained):
                     inside = hops < self.settings.window_hops
