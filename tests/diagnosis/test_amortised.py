@@ -1,4 +1,4 @@
-"""Amortised networks: drawn spectra against simulated ones, features, readings, refusals, and training in small."""
+"""Amortised networks: drawn spectra against simulated ones, features, readings, and refusals."""
 
 from dataclasses import replace
 from functools import cache
@@ -6,18 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.amortised import OWN, AmortisedNetworks, Calibration, NetworkDiagnostician
-from models.diagnosis.networks.amortised_training import calibrate_networks, train_networks
+from models.diagnosis.networks.amortised import AmortisedNetworks, NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import WindowStatistics
-from models.errors import EstimationError
 from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt
-from simulator.training.feature_draws import FeatureDraws, batches
-from simulator.training.spectral_draws import LOG_RATIO, SpectralDraws
+from simulator.training.spectral_draws import SpectralDraws
 
 SEED = 7_700_041
 LAB = load_machine("lab")
@@ -36,11 +33,6 @@ def shipped() -> AmortisedNetworks:
     amortised = load_bundle("lab", LAB).amortised
     assert amortised is not None
     return amortised
-
-
-@cache
-def recipe() -> FeatureDraws:
-    return FeatureDraws.for_machine(LAB, SEED, 120)
 
 
 def test_drawn_spectra_scatter_around_their_expectation_like_averaged_segments() -> None:
@@ -64,7 +56,7 @@ def test_drawn_spectra_scatter_around_their_expectation_like_averaged_segments()
 def test_simulated_windows_look_like_drawn_ones() -> None:
     reader = NetworkDiagnostician(LAB, shipped())
     novelty = []
-    for number in range(8):
+    for number in range(5):
         for layout in Layout:
             inputs = reader.inputs(window("", number, layout))
             assert inputs is not None
@@ -89,68 +81,13 @@ def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
 
 
 @pytest.mark.slow
-def test_a_batch_depends_on_seed_and_number_alone() -> None:
-    draws = replace(recipe(), conditions=24)
-    several = list(batches(draws, 2, processes=1))
-    again = draws.batch(1)
-    np.testing.assert_array_equal(several[1][0], again[0])
-    assert several[0][0].shape == (draws.windows, 525)
-    assert not np.array_equal(several[0][1], several[1][1])
-    assert np.abs(again[1]).max() <= LOG_RATIO
-
-
-def small_training() -> AmortisedNetworks:
-    draws = recipe()
-    return train_networks(
-        LAB,
-        ForceFeatures(LAB).states,
-        (draws.mean, draws.directions),
-        draws.n_common,
-        batches(draws, 6, processes=1),
-        6 * draws.windows,
-        LOG_RATIO,
-        SEED,
-    )
-
-
-@pytest.mark.slow
-def test_training_is_reproducible_and_learns() -> None:
-    first, second = small_training(), small_training()
-    for one, other in zip(first.networks, second.networks, strict=True):
-        np.testing.assert_array_equal(one.weights[0], other.weights[0])
-        np.testing.assert_array_equal(one.direct, other.direct)
-    draws = recipe()
-    features, log_ratio = draws.batch(1000)
-    inputs = first.basis.standardised(features)[:, : draws.n_common]
-    mean, factor = first.networks[0](np.clip(inputs, -8, 8))
-    assert np.corrcoef(mean[:, 0], log_ratio[:, 0])[0, 1] > 0.25  # eight steps; chance gives 0 ± 0.05
-    assert np.all(factor[:, [0, 1], [0, 1]] > 0)
-
-
-@pytest.mark.slow
-def test_too_few_windows_are_refused() -> None:
-    draws = recipe()
-    with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
-        train_networks(
-            LAB,
-            ForceFeatures(LAB).states,
-            (draws.mean, draws.directions),
-            draws.n_common,
-            [],
-            1000,
-            LOG_RATIO,
-            SEED,
-        )
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "parameter", [one if one in ("k_by", "c_bz") else pytest.param(one, marks=pytest.mark.long) for one in FAULTS]
 )
 def test_the_shipped_networks_find_and_size_faults_on_new_windows(parameter: str) -> None:
     reader = NetworkDiagnostician(LAB, shipped())
     read, z_others = [], []
-    for number in range(10):
+    for number in range(6):
         diagnosis = reader.diagnose(window(parameter, number))
         by_name = {reading.name: reading for reading in diagnosis.parameters}
         assert tuple(by_name) == ("k_by", "c_by", "e", "EI", "k_bz", "c_bz")
@@ -212,16 +149,6 @@ def test_tilt_sensors_beside_the_trained_ones_do_no_harm() -> None:
     assert len(seen.states) == 12
     diagnosis = NetworkDiagnostician(rig, shipped()).diagnose(seen)
     assert len(diagnosis.evaluable) == len(PARAMETERS)
-
-
-@pytest.mark.slow
-def test_calibration_finds_the_true_size_of_the_errors() -> None:
-    held_out = [[(window("", number, layout), dict[str, float]()) for number in range(8)] for layout in Layout]
-    calibrated = calibrate_networks(LAB, replace(shipped(), calibration={}), held_out)
-    assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
-    assert all(0.1 < scale < 8 for one in calibrated.calibration.values() for scale in one.z_scale)
-    doubled = Calibration(0.0, (-5.0, -3.0), (2.0, 4.0))
-    np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])
 
 
 def test_relations_speak_the_common_language() -> None:

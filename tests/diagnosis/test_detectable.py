@@ -20,14 +20,14 @@ def healthy(seed: int) -> Stretch:
 
 
 def power(cov: FloatArray, name: str, seed: int) -> list[float]:
-    """Share of 3000 windows in which the minimum detectable loss and gain are named."""
+    """Share of 1200 windows in which the minimum detectable loss and gain are named."""
     rng, thresholds, shares = np.random.default_rng(seed), window_thresholds(0.01, 6), []
     stretch = stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
     (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
     for change in (found.loss, found.gain):
         true = np.zeros(6)
         true[PARAMETERS.index(name)] = to_scale(name, change)
-        values = rng.multivariate_normal(true, cov, size=3000)
+        values = rng.multivariate_normal(true, cov, size=1200)
         shares.append(
             float(
                 np.mean([name in isolate(stretch_of(window(value, cov), 0, 1), thresholds).changed for value in values])
@@ -39,13 +39,13 @@ def power(cov: FloatArray, name: str, seed: int) -> list[float]:
 @pytest.mark.parametrize("name", ["c_by", "e"])
 def test_the_change_is_found_in_95_of_100_windows(name: str) -> None:
     cov = np.diag(np.geomspace(0.001, 0.02, 6) ** 2)
-    assert power(cov, name, SEED) == pytest.approx([0.95, 0.95], abs=0.015)
+    assert power(cov, name, SEED) == pytest.approx([0.95, 0.95], abs=0.025)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_correlated_parameters_are_found_more_often_never_less(seed: int) -> None:
     cov = covariance(np.random.default_rng(SEED + seed))
-    assert min(power(cov, "k_bz", SEED + seed)) > 0.935
+    assert min(power(cov, "k_bz", SEED + seed)) > 0.925
 
 
 def test_loss_and_gain_are_ratios_of_each_other() -> None:

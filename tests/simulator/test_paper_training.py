@@ -1,0 +1,103 @@
+"""The paper's own diagnostician on independent windows."""
+
+import numpy as np
+import pytest
+
+from models.diagnosis.networks.paper import (
+    PAPER_EQUATIONS,
+    PaperDiagnostician,
+    PaperNetwork,
+    calibrate_paper,
+    mean_squared_deviation,
+    paper_rows,
+)
+from models.diagnosis.networks.paper_training import train_paper_network
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine, load_machine
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt
+
+pytestmark = pytest.mark.slow
+
+_SEED = 4711
+
+
+@pytest.fixture(scope="module")
+def rig() -> Machine:
+    """With windows of a third of the usual length: most of the time goes into simulating them."""
+    lab = load_machine("lab")
+    return with_tilt(lab.model_copy(update={"window": lab.window.model_copy(update={"length_s": 20.0})}))
+
+
+def _windows(rig: Machine, numbers: range) -> list[WindowStatistics]:
+    """One operating condition for all, as in the paper; the realisations differ by number."""
+    draw = Draw(rig, _SEED, Purpose.TRAINING, layout=Layout.ONE_SOURCE, fixed_condition=True)
+    return [simulate_window(draw, number) for number in numbers]
+
+
+@pytest.fixture(scope="module")
+def training(rig: Machine) -> list[WindowStatistics]:
+    return _windows(rig, range(3))
+
+
+@pytest.fixture(scope="module")
+def healthy(rig: Machine) -> list[WindowStatistics]:
+    return _windows(rig, range(10, 22))
+
+
+@pytest.fixture(scope="module")
+def networks(rig: Machine, training: list[WindowStatistics]) -> list[PaperNetwork]:
+    return [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
+
+
+def test_rows_are_the_papers_from_lag_zero(rig: Machine, training: list[WindowStatistics]) -> None:
+    for equation, n_inputs in zip(PAPER_EQUATIONS, (3, 3, 2, 3), strict=True):
+        inputs, target = paper_rows(equation, training[0], rig)
+        assert inputs.shape == (training[0].lags_s.size, n_inputs)
+        assert training[0].lags_s[0] == 0
+        assert target.shape == (training[0].lags_s.size,)
+
+
+def test_training_fits_its_own_windows_and_is_repeatable(
+    rig: Machine, networks: list[PaperNetwork], training: list[WindowStatistics]
+) -> None:
+    first = networks[0]
+    again = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
+    assert np.array_equal(first.network.W1, again.network.W1)
+    assert np.mean([mean_squared_deviation(first, window, rig) for window in training]) < 0.05
+
+
+def test_diagnostician_names_equations_and_no_sizes(
+    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
+) -> None:
+    limits = calibrate_paper(networks, healthy, rig, false_alarm_rate=0.1)
+    paper = PaperDiagnostician(rig, networks, limits)
+    # As calibrated: of the twelve windows exactly the largest score is at the limit, none above it.
+    assert not any(paper.flagged_equations(paper.diagnose(window)) for window in healthy)
+    changed = Draw(rig, _SEED, Purpose.TRAINING, faults={"k_by": -0.6}, layout=Layout.ONE_SOURCE, fixed_condition=True)
+    diagnosis = paper.diagnose(simulate_window(changed, 50))
+    assert diagnosis.by == "paper"
+    assert [reading.equation for reading in diagnosis.equations] == ["28", "29", "30", "31"]
+    assert all(reading.msd is not None and reading.msd_healthy is not None for reading in diagnosis.equations)
+    assert all(reading.change is None and reading.reason for reading in diagnosis.parameters)
+    assert "28" in paper.flagged_equations(diagnosis)
+
+
+def test_an_equation_without_its_channels_is_not_evaluated(
+    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
+) -> None:
+    paper = PaperDiagnostician(rig, networks, calibrate_paper(networks, healthy, rig, false_alarm_rate=0.2))
+    lab = load_machine("lab")
+    diagnosis = paper.diagnose(simulate_window(Draw(lab, _SEED, Purpose.EVALUATION), 0))
+    tilt = diagnosis.equations[2]
+    assert not tilt.evaluable
+    assert "psi_dot" in tilt.reason
+    assert tilt.msd is None
+    assert "30" not in paper.flagged_equations(diagnosis)
+
+
+def test_too_few_windows_for_the_declared_rate_are_refused(
+    rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
+) -> None:
+    with pytest.raises(EstimationError, match="expected at least 99"):
+        calibrate_paper(networks[:1], healthy, rig, false_alarm_rate=0.01)

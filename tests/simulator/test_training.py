@@ -1,0 +1,143 @@
+"""Training in small: the bundle that it writes, that it is repeatable, and that the networks learn."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models.diagnosis.networks.amortised import OWN, Calibration
+from models.diagnosis.networks.amortised_training import calibrate_networks, train_networks
+from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.diagnosis.networks.equations import EQUATIONS
+from models.diagnosis.networks.features import ForceFeatures
+from models.diagnosis.networks.relation import read_equation
+from models.diagnosis.networks.relation_training import calibrate, train_network
+from models.errors import EstimationError
+from models.machine import Machine, load_machine
+from simulator.training.command import train_for
+from simulator.training.draws import Draw, Layout, Purpose, simulate_window
+from simulator.training.feature_draws import FeatureDraws, batches
+from simulator.training.spectral_draws import LOG_RATIO
+
+pytestmark = pytest.mark.slow
+
+SEED = 7_700_003
+LAB = load_machine("lab")
+SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
+"""Most of the time of a training goes into simulating its windows."""
+DRAWS = 400
+"""Of which a training makes eight batches."""
+
+
+def windows(machine: Machine, purpose: Purpose, stream: int, count: int, kept: tuple[str, ...]) -> list[Any]:
+    draw = Draw(machine, SEED, purpose, stream, kept)
+    return [simulate_window(draw, number) for number in range(count)]
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    """As the command makes it, of fewer windows than it admits."""
+    folder: Path = tmp_path_factory.mktemp("trained") / "bundle"
+    train_for(SHORT, folder, 4, DRAWS, SEED, 1)
+    return load_bundle(folder, SHORT)
+
+
+@pytest.fixture(scope="module")
+def recipe(bundle: Bundle) -> FeatureDraws:
+    """As the training made it."""
+    assert bundle.amortised is not None
+    basis = bundle.amortised.basis
+    return FeatureDraws(SHORT, SEED, DRAWS // 8, basis.mean, basis.directions)
+
+
+def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_trained(bundle: Bundle) -> None:
+    assert {one.equation.number for one in bundle.networks} == {"28", "29", "30", "31"}
+    assert bundle.amortised is not None
+    assert {one.equation for one in bundle.amortised.networks} == {"28", "29", "30", "31"}
+    made = bundle.manifest.training
+    assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 4, 2, DRAWS)
+
+
+def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_told(bundle: Bundle) -> None:
+    equation, told = EQUATIONS[1], list[float]()
+    material = windows(SHORT, Purpose.TRAINING, 1, 4, equation.kept_nominal)
+    again = train_network(equation, material, SHORT, SEED, told.append)
+    first = next(one for one in bundle.networks if one.equation.number == equation.number)
+    np.testing.assert_array_equal(first.network.W1, again.network.W1)
+    assert told[-1] == 1.0
+    assert told == sorted(told)
+
+
+def test_amortised_networks_learn_and_are_trained_again_to_the_last_bit(bundle: Bundle, recipe: FeatureDraws) -> None:
+    draws = recipe
+    again = train_networks(
+        SHORT,
+        ForceFeatures(SHORT).states,
+        (draws.mean, draws.directions),
+        draws.n_common,
+        batches(draws, 8, processes=1),
+        8 * draws.windows,
+        LOG_RATIO,
+        SEED,
+    )
+    first = bundle.amortised
+    assert first is not None
+    for one, other in zip(first.networks, again.networks, strict=True):
+        np.testing.assert_array_equal(one.weights[0], other.weights[0])
+        np.testing.assert_array_equal(one.direct, other.direct)
+    features, log_ratio = draws.batch(1000)
+    inputs = first.basis.standardised(features)[:, : draws.n_common]
+    mean, factor = first.networks[0](np.clip(inputs, -8, 8))
+    assert np.corrcoef(mean[:, 0], log_ratio[:, 0])[0, 1] > 0.25  # a few steps; chance gives 0 ± 0.05
+    assert np.all(factor[:, [0, 1], [0, 1]] > 0)
+
+
+def test_a_batch_depends_on_seed_and_number_alone(recipe: FeatureDraws) -> None:
+    draws = replace(recipe, conditions=24)
+    several = list(batches(draws, 2, processes=1))
+    again = draws.batch(1)
+    np.testing.assert_array_equal(several[1][0], again[0])
+    assert several[0][0].shape == (draws.windows, 525)
+    assert not np.array_equal(several[0][1], several[1][1])
+    assert np.abs(again[1]).max() <= LOG_RATIO
+
+
+def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
+    draws = recipe
+    with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
+        train_networks(
+            SHORT,
+            ForceFeatures(SHORT).states,
+            (draws.mean, draws.directions),
+            draws.n_common,
+            [],
+            1000,
+            LOG_RATIO,
+            SEED,
+        )
+
+
+def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
+    equation = EQUATIONS[0]
+    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 24, equation.kept_nominal), SHORT, SEED)
+    trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 10, equation.kept_nominal), SHORT)
+    draw = Draw(SHORT, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
+    readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(8)]
+    k_by = np.array([reading[0].change for reading in readings], dtype=np.float64)
+    assert np.median(k_by) == pytest.approx(-0.2, abs=0.04)
+    assert all((reading[0].z or 0.0) < -2 for reading in readings)
+    assert abs(np.median([reading[1].z or 0.0 for reading in readings])) < 2  # c_by did not change
+
+
+def test_calibration_finds_the_true_size_of_the_errors() -> None:
+    shipped = load_bundle("lab", LAB).amortised
+    assert shipped is not None
+    draws = (Draw(LAB, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
+    held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(8)] for draw in draws]
+    calibrated = calibrate_networks(LAB, replace(shipped, calibration={}), held_out)
+    assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
+    assert all(0.1 < scale < 8 for one in calibrated.calibration.values() for scale in one.z_scale)
+    doubled = Calibration(0.0, (-5.0, -3.0), (2.0, 4.0))
+    np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])
