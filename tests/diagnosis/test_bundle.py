@@ -32,8 +32,8 @@ def test_round_trip(tmp_path: Path) -> None:
     again = load_bundle(tmp_path / "bundle", LAB)
     assert again.identity == saved.identity
     assert again.manifest == saved.manifest
-    x = np.random.default_rng(0).standard_normal((5, 4))
-    np.testing.assert_array_equal(again.networks[0].network(x), shipped.networks[0].network(x))
+    one = np.random.default_rng(0).standard_normal((5, 4))
+    np.testing.assert_array_equal(again.networks[0].network(one), shipped.networks[0].network(one))
     assert again.networks[0].healthy == shipped.networks[0].healthy
     loaded = again.amortised
     assert loaded is not None
