@@ -9,34 +9,12 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.studies import results as r
+from benchmarks.studies import variants as v
 from benchmarks.studies.opinions import LAYOUTS, changed_in
-from benchmarks.studies.results import (
-    Estimate,
-    Record,
-    Table,
-    Value,
-    floats,
-    grouped,
-    limit_of,
-    median,
-    middle,
-    rate,
-    robust,
-    share,
-    where,
-)
+from benchmarks.studies.results import Estimate, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
-from benchmarks.studies.variants import (
-    VARIANTS,
-    Measure,
-    Reader,
-    Variant,
-    VariantEquation,
-    as_seen,
-    equation_numbered,
-    linear_fit,
-    variant_equation,
-)
+from benchmarks.studies.variants import VARIANTS, Measure, Reader, Variant
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -52,16 +30,9 @@ from models.machine import Machine, load_machine
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 _FAULTS: tuple[dict[str, float], ...] = (
-    {},
-    {"k_by": -0.2},
-    {"k_by": -0.05},
-    {"c_by": -0.2},
-    {"k_bz": -0.2},
-    {"k_bz": -0.05},
-    {"c_bz": -0.2},
-    {"e": 0.2},
-    {"e": 0.05},
-)
+    {}, {"k_by": -0.2}, {"k_by": -0.05}, {"c_by": -0.2}, {"k_bz": -0.2}, {"k_bz": -0.05}, {"c_bz": -0.2},
+    {"e": 0.2}, {"e": 0.05},
+)  # fmt: skip
 """True changes; their place is part of the seed."""
 _NUMBERS = ("28", "29", "31")
 _OWN = {equation.number: equation.parameters for equation in EQUATIONS}
@@ -89,20 +60,13 @@ _Networks = dict[tuple[Variant, str], _Trained]
 
 def _learn(machine: Machine, options: Options, over: Over) -> _Networks:
     count = 4 if options.small else 60
-    draws = {
-        number: Draw(
-            machine, options.seed, Purpose.TRAINING, int(number), kept_nominal=equation_numbered(number).kept_nominal
-        )
-        for number in _NUMBERS
+    drawn = partial(Draw, machine, options.seed, Purpose.TRAINING)
+    draws = {n: drawn(int(n), kept_nominal=v.equation_numbered(n).kept_nominal) for n in _NUMBERS}
+    draws["one"] = drawn(_FIXED_STREAM, layout=Layout.ONE_SOURCE, fixed_condition=True)
+    training = {
+        name: over(f"training windows, {name}", _training_window, [(draw, k) for k in range(count)])
+        for name, draw in draws.items()
     }
-    draws["one"] = Draw(
-        machine, options.seed, Purpose.TRAINING, _FIXED_STREAM, layout=Layout.ONE_SOURCE, fixed_condition=True
-    )
-    jobs = [(name, draw, k) for name, draw in draws.items() for k in range(count)]
-    simulated = over("training windows", _training_window, [(draw, k) for _, draw, k in jobs])
-    training: dict[str, list[WindowStatistics]] = {name: [] for name in draws}
-    for (name, _, _), window in zip(jobs, simulated, strict=True):
-        training[name].append(window)
     fits = dict.fromkeys(
         (variant.network_key, number)
         for variant in VARIANTS
@@ -133,13 +97,15 @@ def _train(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) 
     if not variant.long_lags:
         settings = machine.window.model_copy(update={"lag_from_s": 0.0})
         machine = machine.model_copy(update={"window": settings})
-    windows = [as_seen(variant, window) for window in windows]
-    equation = variant_equation(variant, number)
-    if isinstance(equation, VariantEquation) and not variant.normalised:
+    windows = [v.as_seen(variant, window) for window in windows]
+    equation = v.variant_equation(variant, number)
+    if isinstance(equation, v.VariantEquation) and not variant.normalised:
         norms = [equation.rows(window_view(window, machine), machine).norm for window in windows]
         equation = replace(equation, unit=float(np.sqrt(np.mean(np.square(norms)))))
     if variant.reader is Reader.LINEAR:
-        return _Trained(variant, machine, EquationNetwork(equation, linear_fit(equation, windows, machine), None), None)
+        return _Trained(
+            variant, machine, EquationNetwork(equation, v.linear_fit(equation, windows, machine), None), None
+        )
     return _Trained(variant, machine, train_network(equation, windows, machine, seed), None)
 
 
@@ -175,7 +141,7 @@ def _values(one: _Trained, window: WindowStatistics) -> dict[Measure, _Values]:
     if one.paper is not None:
         return {Measure.MSD: {"msd": (mean_squared_deviation(one.paper, window, one.machine), None)}}
     assert one.relation is not None  # noqa: S101  # one of the two is there by construction
-    window = as_seen(one.variant, window)
+    window = v.as_seen(one.variant, window)
     reading = read_equation(one.relation, window, one.machine)
     rows = one.relation.equation.rows(window_view(window, one.machine), one.machine)
     power = float(np.mean((rows.target / rows.norm) ** 2))  # 1 where the window is normalised
@@ -211,7 +177,7 @@ def _test_values(row: Record) -> dict[str, float]:
 
 def _judged(false_alarm_rate: float, records: Sequence[Record]) -> Iterator[Record]:
     """Evaluation windows with the verdict of the limit that the calibration windows of the same row set."""
-    for rows in grouped(records, "layout", "equation", "group", "variant").values():
+    for rows in r.grouped(records, "layout", "equation", "group", "variant").values():
         healthy = [_test_values(row) for row in rows if row["purpose"] == "calibration"]
         # Every test value in units of its own upper quantile: no parameter decides the limits of another.
         scale = {
@@ -219,7 +185,7 @@ def _judged(false_alarm_rate: float, records: Sequence[Record]) -> Iterator[Reco
             for name in sorted({name for one in healthy for name in one})
         }
         leading = [max((value / scale[name] for name, value in one.items()), default=0.0) for one in healthy]
-        limit = limit_of(np.array(leading), false_alarm_rate) * (1 + 1e-12)
+        limit = r.limit_of(np.array(leading), false_alarm_rate) * (1 + 1e-12)
         for row in rows:
             if row["purpose"] != "calibration":
                 ratios = {name: value / scale[name] for name, value in _test_values(row).items()}
@@ -243,24 +209,24 @@ def _changed(row: Record) -> tuple[str, str]:
 
 
 def _found(kind: str, rows: Sequence[Record]) -> Estimate | None:
-    return share("alarm")(where(rows, kind=kind, own=True))
+    return r.share("alarm")(r.where(rows, kind=kind, own=True))
 
 
 def _elsewhere(rows: Sequence[Record]) -> Estimate | None:
-    return rate(row["alarm"] for row in rows if str(row["kind"]).endswith("20%") and not row["own"])
+    return r.rate(row["alarm"] for row in rows if str(row["kind"]).endswith("20%") and not row["own"])
 
 
 def _reads(rows: Sequence[Record]) -> str:
     """Median readings of own parameters that changed by 20 %, in the order of the changes."""
-    own = [row for row in where(rows, own=True) if str(row["kind"]).endswith("20%")]
-    found = [median(row["read"] for row in group) for group in grouped(own, "changed").values()]
+    own = [row for row in r.where(rows, own=True) if str(row["kind"]).endswith("20%")]
+    found = [r.median(row["read"] for row in group) for group in r.grouped(own, "changed").values()]
     return ", ".join(f"{100 * one:+.1f} %" for one in found if one is not None)
 
 
 def _spread(rows: Sequence[Record]) -> str:
-    healthy = where(rows, changed="healthy")
-    values = {name: floats(row.get(name) for row in healthy) for name in _OWN[str(rows[0]["equation"])]}
-    return ", ".join(f"{name} {100 * float(robust(x)):.2f} %" for name, x in values.items() if x.size)
+    healthy = r.where(rows, changed="healthy")
+    values = {name: r.floats(row.get(name) for row in healthy) for name in _OWN[str(rows[0]["equation"])]}
+    return ", ".join(f"{name} {100 * float(r.robust(x)):.2f} %" for name, x in values.items() if x.size)
 
 
 def _short(rows: Sequence[Record]) -> str:
@@ -272,26 +238,26 @@ def _short(rows: Sequence[Record]) -> str:
 
 def _tables(false_alarm_rate: float) -> tuple[Table, ...]:
     rows = partial(_judged, false_alarm_rate)
-    wrong = {"false alarms": lambda rows: share("alarm")(where(rows, changed="healthy")), "elsewhere": _elsewhere}
+    wrong = {"false alarms": lambda rows: r.share("alarm")(r.where(rows, changed="healthy")), "elsewhere": _elsewhere}
     by = ("layout", "equation", "group", "variant")
     kinds = ("k -20%", "k -5%", "c -20%", "e +20%", "e +5%")
-    figures = {"spread": _spread, "reads": _reads, "refused": share("refused")}
+    figures = {"spread": _spread, "reads": _reads, "refused": r.share("refused")}
     return (
         Table("ablation", by, {**{kind: partial(_found, kind) for kind in kinds}, **wrong, **figures}, rows),
         Table(
             "ablation-changes",
             (*by, "changed"),
-            {"alarm": share("alarm"), "alarm, the changed one leading": share("right"), "reads": middle("read")},
-            lambda records: where(rows(records), own=True),
+            {"alarm": r.share("alarm"), "alarm, the changed one leading": r.share("right"), "reads": r.middle("read")},
+            lambda records: r.where(rows(records), own=True),
         ),
         Table(
             "ablation-short",
             ("group", "variant"),
             {
-                **{f"equation {n}": partial(lambda n, rows: _short(where(rows, equation=n)), n) for n in _NUMBERS},
+                **{f"equation {n}": partial(lambda n, rows: _short(r.where(rows, equation=n)), n) for n in _NUMBERS},
                 **wrong,
             },
-            lambda records: where(rows(records), layout=LAYOUTS[None]),
+            lambda records: r.where(rows(records), layout=LAYOUTS[None]),
             "Both layouts mixed: per cent of windows in which k −20 % / c −20 % (28, 31) or e +20 % (29) is found, and "
             "the median readings; *elsewhere*: alarms at 20 % of another equation's parameter.",
         ),

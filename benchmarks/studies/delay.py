@@ -1,38 +1,24 @@
-"""Time to detection of step changes: streams, the same test on Gaussian hops, and the bound's time beside them.
+"""Time to detection of step changes on streams, and the bound's time beside them.
 
 A stream is simulated sample by sample and fed to the sliding window, the likelihood and the sequential test as the
 monitor feeds them. The bound's time is the data that a test of one fixed length needs for a power of 95 % if it reads
-the parameter with the Cramér-Rao standard error, which falls as 1/√T. The Gaussian hops have that standard error: what
-they need beyond the bound's time is the price of looking at every hop and of the hop itself.
+the parameter with the Cramér-Rao standard error, which falls as 1/√T.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.studies import results as r
 from benchmarks.studies.evaluate import true_condition
 from benchmarks.studies.opinions import LAYOUTS, SEVERAL
-from benchmarks.studies.results import (
-    Chart,
-    Estimate,
-    Goal,
-    Record,
-    Table,
-    Value,
-    each,
-    grouped,
-    middle,
-    share,
-    where,
-    within,
-)  # fmt: skip
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.likelihood.bound import cramer_rao
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
-from models.diagnosis.verdict.delay import detection_delays
 from models.diagnosis.verdict.determined import determined
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
@@ -46,8 +32,6 @@ from simulator.training.draws import Draw, Layout, Purpose, draw_condition
 
 _CHANGES = (("k_by", -0.05), ("c_by", -0.2), ("c_by", -0.1), ("e", 0.2))
 """Steps that are timed; their place is part of the seed."""
-_GAUSSIAN = ((5.0, (2, 4)), (5.0, (2, 4, 7)), (2.5, (2, 4, 7)), (2.5, (2, 4, 8, 14)))
-"""Hop lengths and short stretches that are compared on Gaussian hops."""
 _POWER = 1.644854
 """Normal quantile of 95 %: how far above its threshold a change must lie to be found that often."""
 _HEALTHY_HOPS = 3
@@ -67,8 +51,8 @@ class _Case:
     parameter: str
     change: float
 
-    def trial(self, number: int) -> tuple[Scenario, Scenario, float, dict[str, float]]:
-        """Condition without the step, the stream with it, when it comes, and the bound of a window."""
+    def trial(self, number: int) -> tuple[Scenario, float, dict[str, float]]:
+        """The stream with its step, when that comes, and the bound of a window of the unchanged machine."""
         draw = Draw(self.machine, self.seed, Purpose.EVALUATION, self.stream, layout=self.layout)
         healthy = draw_condition(draw, number)
         rng = np.random.default_rng([self.seed, Purpose.EVALUATION, self.stream, number, _STREAM])
@@ -76,7 +60,7 @@ class _Case:
         step = Event(at_s=step_s, parameter=self.parameter, relative_change=self.change)
         states, length_s = plan_for(self.machine).states, self.machine.window.length_s
         bound = cramer_rao(self.machine, states, true_condition(healthy, self.machine), length_s)
-        return healthy, healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound
+        return healthy.overridden(duration_s=step_s + _AFTER_S, faults=[step]), step_s, bound
 
     def times(self, settings: SequentialSettings, bound: dict[str, float]) -> dict[str, Value]:
         """The bound's time at the threshold of a test of the window alone, and at this test's."""
@@ -138,11 +122,9 @@ def _rates(machine: Machine) -> dict[str, float]:
 
 
 def _measure(_: None, cell: Cell, number: int) -> list[dict[str, Value]]:
-    case, gaussian = cell.given
-    if gaussian is not None:
-        return _gaussian(case, gaussian, number)
+    case: _Case = cell.given
     machine, plan = case.machine, plan_for(case.machine)
-    _, scenario, step_s, bound = case.trial(number)
+    scenario, step_s, bound = case.trial(number)
     settings = [SequentialSettings.for_machine(machine, rate) for rate in _rates(machine).values()]
     window, whole, fits = SlidingWindow(plan), plan.hops, LengthFits(machine)
     watches: list[_Watch] = []
@@ -187,32 +169,6 @@ def _measure(_: None, cell: Cell, number: int) -> list[dict[str, Value]]:
     ]
 
 
-def _gaussian(case: _Case, given: tuple[int, float, tuple[int, ...], int], at: int) -> list[dict[str, Value]]:
-    """The same change on Gaussian hops with the median Cramér-Rao standard errors of the streams' conditions."""
-    trials, hop_s, short, count = given
-    bounds = [case.trial(number)[3] for number in range(trials)]
-    error = {name: float(np.median([bound[name] for bound in bounds])) for name in PARAMETERS}
-    rate, per_month = list(_rates(case.machine).items())[at]
-    own = SequentialSettings.for_machine(case.machine, per_month)
-    bound_s = np.median([float(case.times(own, bound)["bound_s"] or 0) for bound in bounds])
-    settings = SequentialSettings.for_machine(with_hop(case.machine, hop_s), per_month)
-    settings = replace(settings, short_hops=short)
-    found = detection_delays(
-        settings,
-        np.diag(np.array([error[name] for name in PARAMETERS]) ** 2),
-        {case.parameter: case.change},
-        trials=count,
-        seed=case.seed,
-        before_hops=settings.window_hops + _HEALTHY_HOPS,
-        after_hops=round(min(_AFTER_S, max(30.0, 4 * bound_s)) / settings.hop_s),
-    )
-    times = {"rate": rate, "early": False, **case.times(settings, error)}
-    return [
-        {**times, "detected_s": _rounded(detected), "named_s": _rounded(named), "wrong": at_ < found.wrong}
-        for at_, (detected, named) in enumerate(zip(found.detected_s, found.named_s, strict=True))
-    ]
-
-
 def _rounded(value: float | None) -> float | None:
     return None if value is None or not np.isfinite(value) else float(f"{value:.5g}")
 
@@ -237,23 +193,23 @@ def _quantile(column: str, level: float) -> Callable[[Sequence[Record]], str]:
 
 
 _COLUMNS = {
-    "bound's time, median s": middle("bound_s"),
+    "bound's time, median s": r.middle("bound_s"),
     "detected, median s": _quantile("found", 0.5),
     "95 %, s": _quantile("found", 0.95),
     "named, 95 %, s": _quantile("named", 0.95),
     "over bound's time, 50 %": _quantile("ratio", 0.5),
     "95 %": _quantile("ratio", 0.95),
-    "within twice": share("within"),
+    "within twice": r.share("within"),
 }
 _TABLES = (
     Table(
         "delay",
-        ("source", "layout", "changed", "rate", "hop_s", "short_s"),
+        ("layout", "changed", "rate", "hop_s", "short_s"),
         _COLUMNS
         | {
             "95 %, fixed threshold": _quantile("fixed ratio", 0.95),
-            "wrong name": share("wrong"),
-            "alarm before the step": share("early"),
+            "wrong name": r.share("wrong"),
+            "alarm before the step": r.share("early"),
         },
         _judged,
     ),
@@ -261,35 +217,35 @@ _TABLES = (
         "delay-own-hop",
         ("changed", "rate"),
         _COLUMNS,
-        lambda records: _judged(where(records, source="stream", hop_s=5.0, layout=SEVERAL)),
+        lambda records: _judged(r.where(records, hop_s=5.0, layout=SEVERAL)),
         "Streams with independent sources, hop of 5 s:",
     ),
 )
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    streams = list(_judged(where(records, source="stream")))
-    several = where(streams, layout=SEVERAL, hop_s=5.0, early=False)
-    for (declared,), rows in grouped(several, "rate").items():
-        within_twice = each(rows, ("changed",), share("within"))
-        yield within(f"found within twice the bound's time, {declared}", within_twice, 0.95, 1.0)
-    yield within("a wrong name on the way", each(streams, ("layout",), share("wrong")), 0.0, 0.01)
-    yield within("an alarm before the step", each(streams, ("layout",), share("early")), 0.0, 0.01)
+    streams = list(_judged(records))
+    several = r.where(streams, layout=SEVERAL, hop_s=5.0, early=False)
+    for (declared,), rows in r.grouped(several, "rate").items():
+        within_twice = r.each(rows, ("changed",), r.share("within"))
+        yield r.within(f"found within twice the bound's time, {declared}", within_twice, 0.95, 1.0)
+    yield r.within("a wrong name on the way", r.each(streams, ("layout",), r.share("wrong")), 0.0, 0.01)
+    yield r.within("an alarm before the step", r.each(streams, ("layout",), r.share("early")), 0.0, 0.01)
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-    for (changed, declared), rows in grouped(
-        _judged(where(records, layout=SEVERAL, early=False)), "changed", "rate"
+    for (changed, declared), rows in r.grouped(
+        _judged(r.where(records, layout=SEVERAL, early=False)), "changed", "rate"
     ).items():
         panel = panels.setdefault(f"{changed}, {declared}", {})
-        for (source, hop_s, short), group in grouped(rows, "source", "hop_s", "short_s").items():
+        for (hop_s,), group in r.grouped(rows, "hop_s").items():
             found = np.sort([float(row["found"] or 0.0) for row in group])
-            points = [(float(x), (n + 1) / found.size) for n, x in enumerate(found) if np.isfinite(x)]
-            if source == "stream" or short == "10+20+35 s":
-                panel[f"{source}, hop {hop_s:g} s"] = list(points)
+            panel[f"hop {hop_s:g} s"] = [
+                (float(x), (n + 1) / found.size) for n, x in enumerate(found) if np.isfinite(x)
+            ]
     yield Chart(
-        "delay", "Share found over the time since the change: streams, and Gaussian hops at the bound",
+        "delay", "Share of streams in which the change is found, over the time since",
         panels, "time since the change, s", "found", steps=True, lines=(0.95,),
     )  # fmt: skip
 
@@ -298,30 +254,26 @@ def delay(options: Options) -> Study:
     """Step changes on streams and on Gaussian hops."""
     machine = load_machine((options.machines or ("lab",))[0])
     own = machine.window.hop_s
-    hops = [own, own / 2] if (own / machine.window.segment_s).is_integer() else [own]
+    hops = [own / 2] if (own / machine.window.segment_s).is_integer() else []  # a hop holds whole half segments
     cells = []
-    for hop_s in hops:
-        layouts = (Layout.INDEPENDENT, Layout.ONE_SOURCE) if hop_s == own else (Layout.INDEPENDENT,)
-        for layout in layouts:
-            for at, (parameter, change) in enumerate(_CHANGES):
-                case = _Case(
-                    with_hop(machine, hop_s), options.seed, _STREAM + 10 * layout + at, layout, parameter, change
-                )
-                most = hop_s == own and layout is Layout.INDEPENDENT
-                trials = options.windows if most or options.small else max(2, round(0.4 * options.windows))
-                keys = {"source": "stream", "layout": LAYOUTS[layout], "changed": f"{parameter} {change:+.0%}"}
-                short = SequentialSettings.for_machine(case.machine, 1.0).short_hops
-                cells.append(Cell(keys | {"hop_s": hop_s, "short_s": _seconds(short, hop_s)}, trials, (case, None)))
-                if most:
-                    cells += [
-                        # One source is limited by sensor noise alone: its bound says nothing of a test on hops.
-                        Cell(
-                            keys | {"source": "Gaussian hops", "hop_s": other, "short_s": _seconds(lengths, other)},
-                            len(_rates(machine)),
-                            (case, (trials, other, lengths, 4 if options.small else 100)),
-                        )
-                        for other, lengths in _GAUSSIAN
-                    ]
+    for hop_s, layout in (
+        (own, Layout.INDEPENDENT),
+        (own, Layout.ONE_SOURCE),
+        *((h, Layout.INDEPENDENT) for h in hops),
+    ):
+        one = with_hop(machine, hop_s)
+        most = options.small or (hop_s == own and layout is Layout.INDEPENDENT)
+        trials = options.windows if most else max(2, round(0.4 * options.windows))
+        short = "+".join(f"{n * hop_s:g}" for n in SequentialSettings.for_machine(one, 1.0).short_hops)
+        for at, (name, change) in enumerate(_CHANGES):
+            keys: dict[str, Value] = {
+                "layout": LAYOUTS[layout],
+                "changed": f"{name} {change:+.0%}",
+                "hop_s": hop_s,
+                "short_s": f"{short} s",
+            }
+            case = _Case(one, options.seed, _STREAM + 10 * layout + at, layout, name, change)
+            cells.append(Cell(keys, trials, case))
     return Study(
         name="delay",
         cells=tuple(cells),
@@ -331,7 +283,3 @@ def delay(options: Options) -> Study:
         charts=_charts,
         made_with={machine.name: machine.physics_hash},
     )
-
-
-def _seconds(short: tuple[int, ...], hop_s: float) -> str:
-    return "+".join(f"{hops * hop_s:g}" for hops in short) + " s"

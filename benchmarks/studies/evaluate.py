@@ -21,7 +21,7 @@ from benchmarks.studies.opinions import (
     readings,
     truth,
 )  # fmt: skip
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value, each, rate, where, within
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.diagnosis.likelihood.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
@@ -193,12 +193,12 @@ _TABLES = (
         {
             "bound, median": lambda rows: f"{100 * (r.middle('bound')(rows) or 0):.2g} %",
             **{
-                f"{TITLES[by]}: {text}": partial(lambda by, figure, rows: figure(where(rows, method=by)), by, figure)
+                f"{TITLES[by]}: {text}": partial(lambda by, figure, rows: figure(r.where(rows, method=by)), by, figure)
                 for text, figure in (("spread / bound", r.scatter("in bounds")), ("95 % covers", r.share("covered")))
                 for by in ("likelihood", "network")
             },
         },
-        lambda records: readings(where(records, machine="lab", topic="healthy", layout=SEVERAL)),
+        lambda records: readings(r.where(records, machine="lab", topic="healthy", layout=SEVERAL)),
         "Sharpness on healthy windows of `lab`, independent sources:",
     ),
     Table(
@@ -245,15 +245,15 @@ _READ = ("k_by", "k_bz", "c_by", "c_bz", "e")
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     """The declared goals; what asked for more than the bound allows is held to what a reading at the bound finds."""
     rows, windows = list(readings(records)), list(judged(records))
-    asked = [by for by in ("likelihood", "network") if where(records, method=by)]
-    lab, whole = where(rows, machine="lab"), where(windows, machine="lab")
+    asked = [by for by in ("likelihood", "network") if r.where(records, method=by)]
+    lab, whole = r.where(rows, machine="lab"), r.where(windows, machine="lab")
     if lab:
         yield from _detection(lab, asked)
         for by in asked:
-            least, exact = (0.99 if by == "likelihood" else 0.95), where(whole, topic="paper", method=by)
-            yield within(f"{by}: exactly the changed ones named, paper's eight conditions",
-                         each(exact, ("layout",), r.share("exact")), least, 1.0)  # fmt: skip
-        wrong = r.share("wrong")(where(whole, topic="paper", method="likelihood"))
+            least, exact = (0.99 if by == "likelihood" else 0.95), r.where(whole, topic="paper", method=by)
+            yield r.within(f"{by}: exactly the changed ones named, paper's eight conditions",
+                         r.each(exact, ("layout",), r.share("exact")), least, 1.0)  # fmt: skip
+        wrong = r.share("wrong")(r.where(whole, topic="paper", method="likelihood"))
         yield r.at_most("likelihood: an unchanged one named, paper's eight conditions", wrong, 0.005)
     for machine, by, layout, names, column, most in (
         ("lab", "likelihood", SEVERAL, _READ, "in bounds", 1.15),
@@ -263,25 +263,25 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
         ("lab", "likelihood", ONE, ("k_by", "k_bz"), "off", 0.0008),
         ("lab", "likelihood", ONE, ("c_by", "c_bz"), "off", 0.003),
     ):
-        own = where(rows, topic="healthy", machine=machine, method=by, layout=layout)
-        spreads = each([row for row in own if row["parameter"] in names], ("parameter",), r.scatter(column))
+        own = r.where(rows, topic="healthy", machine=machine, method=by, layout=layout)
+        spreads = r.each([row for row in own if row["parameter"] in names], ("parameter",), r.scatter(column))
         over = " over the bound" if column == "in bounds" else ""
         if own:
-            yield within(f"{by}: spread{over}, {layout}, {machine}", spreads, 0.0, most)
+            yield r.within(f"{by}: spread{over}, {layout}, {machine}", spreads, 0.0, most)
     for by in asked:
         for column, declared in zip(("any", "strict any"), RATES, strict=True):
-            alarms = each(where(windows, topic="healthy", method=by), ("machine",), r.share(column))
+            alarms = r.each(r.where(windows, topic="healthy", method=by), ("machine",), r.share(column))
             yield r.holding(f"{by}: false alarms of healthy windows", alarms, declared)
         for text, topics in (("healthy", ("healthy",)), ("changed", ("small", "paper"))):
-            own = [row for row in where(rows, method=by) if row["topic"] in topics]
-            covered = each(own, ("parameter", "machine", "layout"), r.share("covered"))
-            yield within(f"{by}: 95 % intervals cover, {text} windows", covered, 0.93, 0.97)
+            own = [row for row in r.where(rows, method=by) if row["topic"] in topics]
+            covered = r.each(own, ("parameter", "machine", "layout"), r.share("covered"))
+            yield r.within(f"{by}: 95 % intervals cover, {text} windows", covered, 0.93, 0.97)
     if lab:
         yield from _strained(lab)
-        outside = where(whole, topic="outside", method="likelihood")
-        claimed = each(outside, ("anomaly",), r.share("claimed"))
-        yield within("likelihood: outside the model, bearing or unbalance claimed all the same", claimed, 0.0, 0.05)
-        seen = "; ".join(f"{name} {one}" for name, one in each(outside, ("anomaly",), r.share("noticed")).items())
+        outside = r.where(whole, topic="outside", method="likelihood")
+        claimed = r.each(outside, ("anomaly",), r.share("claimed"))
+        yield r.within("likelihood: outside the model, bearing or unbalance claimed all the same", claimed, 0.0, 0.05)
+        seen = "; ".join(f"{name} {one}" for name, one in r.each(outside, ("anomaly",), r.share("noticed")).items())
         yield Goal("likelihood: called outside the model, or a suspect named", "", seen, "–")
 
 
@@ -291,39 +291,39 @@ def _detection(lab: Sequence[Record], asked: Sequence[str]) -> Iterator[Goal]:
         declared = f"≥ {100 * possible:.1f} %, as at the bound"
         yield r.at_least(f"likelihood: {name} {true:+.0%} detected, {SEVERAL}", found, possible, declared)
     one = {f"{name} {true:+.0%}": _found(lab, "likelihood", ONE, name, true) for name, true in _SMALL}
-    yield within(f"likelihood: the same changes, {ONE}", one, 0.99, 1.0)
+    yield r.within(f"likelihood: the same changes, {ONE}", one, 0.99, 1.0)
     for layout in (SEVERAL, ONE) if "network" in asked else ():
         rates = {f"{name} {true:+.0%}": _found(lab, "network", layout, name, true) for name, true in _NETWORK}
-        yield within(f"network: k −5 %, c −20 %, e +20 % detected, {layout}", rates, 0.99, 1.0)
+        yield r.within(f"network: k −5 %, c −20 %, e +20 % detected, {layout}", rates, 0.99, 1.0)
 
 
 def _strained(lab: Sequence[Record]) -> Iterator[Goal]:
     """The likelihood at the quoted minimum detectable change, under other excitations, in windows of other lengths."""
-    own = where(lab, method="likelihood")
-    power = rate(row["is named"] for row in where(own, topic="detectable") if row["true"])
-    yield within("likelihood: found at the quoted minimum detectable change", {"all": power}, 0.92, 0.98)
-    untold = [row for row in where(own, topic="excitation") if row["parameter"] != "EI"]
+    own = r.where(lab, method="likelihood")
+    power = r.rate(row["is named"] for row in r.where(own, topic="detectable") if row["true"])
+    yield r.within("likelihood: found at the quoted minimum detectable change", {"all": power}, 0.92, 0.98)
+    untold = [row for row in r.where(own, topic="excitation") if row["parameter"] != "EI"]
     for what, figure, low, high in (
         ("95 % intervals cover", r.share("covered"), 0.93, 0.97),
         ("bias / stated error", _biased, -0.5, 0.5),
         ("spread / stated error", r.scatter("in errors"), 0.0, 1.5),
     ):
-        figures = each(untold, ("parameter", "excitation", "layout"), figure)
-        yield within(f"likelihood: {what}, another excitation than assumed", figures, low, high)
+        figures = r.each(untold, ("parameter", "excitation", "layout"), figure)
+        yield r.within(f"likelihood: {what}, another excitation than assumed", figures, low, high)
     lengths = [row for row in own if "bound" in row and row["parameter"] != "EI"]
-    exponents = each(lengths, ("parameter", "layout"), _exponent)
-    yield within("likelihood: exponent of the window length in the spread", exponents, -0.6, -0.4)
+    exponents = r.each(lengths, ("parameter", "layout"), _exponent)
+    yield r.within("likelihood: exponent of the window length in the spread", exponents, -0.6, -0.4)
 
 
 def _found(rows: Iterable[Record], by: str, layout: str, name: str, true: float) -> Estimate | None:
     """Windows in which a change is named; alone, where that was measured: beside another it needs stronger evidence."""
     same = [
         row
-        for row in where(rows, method=by, layout=layout, parameter=name, true=true)
+        for row in r.where(rows, method=by, layout=layout, parameter=name, true=true)
         if row["topic"] in ("small", "paper")
     ]
     alone = [row for row in same if sum(bool(row[f"{other} true"]) for other in PARAMETERS) == 1]
-    return r.share("is named")(alone or where(same, topic="small"))
+    return r.share("is named")(alone or r.where(same, topic="small"))
 
 
 def _found_at_bound(rows: Iterable[Record], layout: str, name: str, true: float) -> float:
@@ -331,7 +331,7 @@ def _found_at_bound(rows: Iterable[Record], layout: str, name: str, true: float)
 
     Over the conditions of the healthy windows, which are drawn as those of the changed ones are.
     """
-    healthy = where(rows, method="likelihood", layout=layout, parameter=name, topic="healthy")
+    healthy = r.where(rows, method="likelihood", layout=layout, parameter=name, topic="healthy")
     threshold = window_thresholds(RATES[0], len(PARAMETERS)).first
     z = abs(to_scale(name, true)) / r.floats(row.get("bound") for row in healthy)
     return float(np.mean(ndtr(z - threshold) + ndtr(-z - threshold)))
@@ -343,7 +343,7 @@ def _exponent(rows: Sequence[Record]) -> Estimate | None:
     Fitted to the spread over the bound, which is itself proportional to 1/√T, so that windows of different conditions
     can be compared. None with fewer than three lengths.
     """
-    points = {float(length): one for length, one in each(rows, ("length_s",), r.scatter("in bounds")).items() if one}
+    points = {float(length): one for length, one in r.each(rows, ("length_s",), r.scatter("in bounds")).items() if one}
     known = {length: one for length, one in points.items() if one.low > 0}
     if len(known) < 3:
         return None
@@ -357,7 +357,7 @@ def _exponent(rows: Sequence[Record]) -> Estimate | None:
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """What is named over the size of the change, and what would be named at the bound."""
-    lab = list(readings(where(records, machine="lab")))
+    lab = list(readings(r.where(records, machine="lab")))
     panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {SEVERAL: {}, ONE: {}}
     for layout, panel in panels.items() if lab else ():
         for name, true in (*_SMALL, *_NETWORK):

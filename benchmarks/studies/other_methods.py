@@ -9,7 +9,6 @@ backward whirl are, and a damping limit of 10 % throws out well-damped bearings.
 """
 
 import logging
-import os
 
 import numpy as np
 import scipy.optimize
@@ -180,8 +179,7 @@ def _without_rotation(samples: FloatArray, n_states: int, has_angle: bool) -> tu
 
 def _poles(x: FloatArray, block_rows: int, most: int, rate_hz: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Frequencies, damping ratios and shapes of all poles, one column for each even order from 0 on."""
-    os.environ.setdefault("TQDM_DISABLE", "1")  # the library draws progress bars otherwise
-    with np.errstate():  # and changes numpy's error state on import
+    with np.errstate():  # the library changes numpy's error state on import
         from pyoma2.functions.ssi import SSI_fast, SSI_poles, build_hank  # noqa: PLC0415  # for the reason above
 
         logging.getLogger("pyoma2").setLevel(logging.WARNING)  # it reports every step

@@ -10,21 +10,10 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.studies import results as r
 from benchmarks.studies.opinions import TITLES, changed_in, diagnosticians, named_in, opinion
 from benchmarks.studies.other_methods import FeatureVector, SubspaceModes
-from benchmarks.studies.results import (
-    Chart,
-    Estimate,
-    Goal,
-    Record,
-    Table,
-    Value,
-    each,
-    grouped,
-    limit_of,
-    share,
-    where,
-)
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -106,7 +95,7 @@ def _looked(machine: Machine, seed: int, job: tuple[_Series, int]) -> tuple[tupl
 
 def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Learned]:
     """Both settings, on as many healthy windows to learn from as for the limits."""
-    count = 9 if options.small else 199
+    count = 19 if options.small else 199
     found = {}
     for setting in _SETTINGS:
         look = partial(_looked, machine, options.seed)
@@ -117,7 +106,7 @@ def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Lear
         methods, limits = _methods(machine), []
         for n, peer in enumerate(methods):
             peer.fit(np.stack([features[n] for features, _ in fit]))
-            limits.append(limit_of(np.array([peer.score(features[n]) for features, _ in limit]), options.rate))
+            limits.append(r.limit_of(np.array([peer.score(features[n]) for features, _ in limit]), options.rate))
         windows = [window for _, window in fit]
         measured = {*windows[0].states, *(() if windows[0].synchronous is None else ("theta",))}
         networks = [
@@ -159,7 +148,7 @@ _HEADS = {"SSI-cov": "SSI-cov", "features": "features, T²", **TITLES}
 
 def _short(method: str, rows: Sequence[Record]) -> str:
     """Detected, and behind it named exactly where the method says what changed; per cent."""
-    figures = [share(column)(where(rows, method=method)) for column in ("detected", "exact")]
+    figures = [r.share(column)(r.where(rows, method=method)) for column in ("detected", "exact")]
     return " / ".join(f"{100 * one.value:.0f}" for one in figures if one is not None)
 
 
@@ -167,7 +156,7 @@ _TABLES = (
     Table(
         "peers",
         ("setting", "changed", "method"),
-        {"detected": share("detected"), "exactly named": share("exact"), "refused": share("refused")},
+        {"detected": r.share("detected"), "exactly named": r.share("exact"), "refused": r.share("refused")},
     ),
     Table(
         "peers-short",
@@ -183,8 +172,8 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     """Where another method notices a change more often than the likelihood."""
     lost = []
     changed = [row for row in records if row["changed"] != "healthy"]
-    for (setting, change), rows in grouped(changed, "setting", "changed").items():
-        shares = each(rows, ("method",), share("detected"))
+    for (setting, change), rows in r.grouped(changed, "setting", "changed").items():
+        shares = r.each(rows, ("method",), r.share("detected"))
         own = shares["likelihood"]
         for name in ("SSI-cov", "features", "paper"):
             other = shares[name]
@@ -196,9 +185,9 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-    for (setting, changed, method), rows in grouped(records, "setting", "changed", "method").items():
+    for (setting, changed, method), rows in r.grouped(records, "setting", "changed", "method").items():
         for column, title in (("detected", "something changed"), ("exact", "exactly the right set")):
-            found = share(column)(rows)
+            found = r.share(column)(rows)
             if found is not None:
                 panel = panels.setdefault(f"{setting}: {title}", {})
                 panel.setdefault(_HEADS[str(method)], []).append((str(changed), found))

@@ -11,21 +11,9 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.studies import results as r
 from benchmarks.studies.opinions import TITLES, diagnosticians, named_in
-from benchmarks.studies.results import (
-    Chart,
-    Estimate,
-    Goal,
-    Record,
-    Table,
-    Value,
-    each,
-    floats,
-    grouped,
-    rate,
-    share,
-    where,
-)
+from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -203,11 +191,11 @@ def _judged(records: Iterable[Record]) -> Iterator[Record]:
 
 
 def _eight(records: Sequence[Record]) -> Iterator[Record]:
-    return _judged(where(records, part="conditions"))
+    return _judged(r.where(records, part="conditions"))
 
 
 def _quantile(number: str, level: float, rows: Sequence[Record]) -> float | None:
-    found = floats(row.get(f"msd {number}") for row in rows)
+    found = r.floats(row.get(f"msd {number}") for row in rows)
     return float(np.quantile(found, level)) if found.size else None
 
 
@@ -216,12 +204,12 @@ _TABLES = (
         "reproduction",
         ("realisation", "method"),
         {
-            "exactly the changed equations": share("exact"),
-            "changed equations named": lambda rows: rate(
+            "exactly the changed equations": r.share("exact"),
+            "changed equations named": lambda rows: r.rate(
                 row[f"own ({n})"] for row in rows for n in _EQUATIONS if row[f"own ({n})"] is not None
             ),
-            "an unchanged one named": share("wrong"),
-            "healthy windows flagged": share("flagged"),
+            "an unchanged one named": r.share("wrong"),
+            "healthy windows flagged": r.share("flagged"),
         },
         _eight,
         "Who finds what, over the eight conditions and all cutoffs:",
@@ -229,14 +217,14 @@ _TABLES = (
     Table(
         "reproduction-equations",
         ("realisation", "method", "condition", "own"),
-        {f"({number}) named": share(f"({number})") for number in _EQUATIONS},
+        {f"({number}) named": r.share(f"({number})") for number in _EQUATIONS},
         _eight,
     ),
     Table(
         "reproduction-noise",
         ("realisation", "method", "noise"),
-        {"healthy windows flagged": share("flagged")},
-        lambda records: _judged(where(records, part="noise")),
+        {"healthy windows flagged": r.share("flagged")},
+        lambda records: _judged(r.where(records, part="noise")),
     ),
     Table(
         "reproduction-msd",
@@ -252,7 +240,7 @@ _TABLES = (
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    exact = each(where(_eight(records), method=TITLES["paper"]), ("realisation",), share("exact"))
+    exact = r.each(r.where(_eight(records), method=TITLES["paper"]), ("realisation",), r.share("exact"))
     text = "; ".join(f"{kind} {one}" for kind, one in exact.items())
     yield Goal("networks as printed: exactly the changed equations named", "the paper: all", text, "–")
 
@@ -261,8 +249,8 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """The paper's Figs. 5 and 6: MSD of every printed network over the cutoff, for every condition."""
     for realisation in _REALISATIONS:
         panels: dict[str, dict[str, list[tuple[str | float, Estimate | float]]]] = {}
-        rows = where(records, part="conditions", method="paper", realisation=realisation)
-        for (condition, cutoff_hz), group in grouped(rows, "condition", "cutoff_hz").items():
+        rows = r.where(records, part="conditions", method="paper", realisation=realisation)
+        for (condition, cutoff_hz), group in r.grouped(rows, "condition", "cutoff_hz").items():
             for number in _EQUATIONS:
                 low, middle, high = (_quantile(number, level, group) or 0.0 for level in (0.05, 0.5, 0.95))
                 series = panels.setdefault(str(condition), {}).setdefault(f"equation {number}", [])

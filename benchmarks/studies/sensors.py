@@ -5,8 +5,9 @@ from functools import lru_cache, partial
 
 import numpy as np
 
+from benchmarks.studies import results as r
 from benchmarks.studies.opinions import opinion
-from benchmarks.studies.results import Estimate, Goal, Record, Table, Value, each, share, where, within
+from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
 from models.commissioning.knowledge import KnowledgeLevel
@@ -112,21 +113,21 @@ def _judged(records: Sequence[Record]) -> Iterator[Record]:
 
 
 _COLUMNS = {
-    "fault and channel named": share("right"),
-    "said to be the data": share("data"),
-    "machine blamed": share("blamed"),
+    "fault and channel named": r.share("right"),
+    "said to be the data": r.share("data"),
+    "machine blamed": r.share("blamed"),
 }
 
 
 def _at(level: str, figure: Callable[[Sequence[Record]], Estimate | None], rows: Sequence[Record]) -> Estimate | None:
-    return figure(where(rows, level=level))
+    return figure(r.where(rows, level=level))
 
 
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     rows, by = list(_judged(records)), ("machine", "fault", "level")
     healthy, faulty = ([row for row in rows if row["at fault"] is one] for one in (False, True))
-    yield within("a healthy sensor said to be at fault", each(healthy, by, share("data")), 0.0, 0.01)
-    yield within("a faulty sensor taken for a fault of the machine", each(faulty, by, share("blamed")), 0.0, 0.01)
+    yield r.within("a healthy sensor said to be at fault", r.each(healthy, by, r.share("data")), 0.0, 0.01)
+    yield r.within("a faulty sensor taken for a fault of the machine", r.each(faulty, by, r.share("blamed")), 0.0, 0.01)
 
 
 def sensors(options: Options) -> Study:
@@ -153,7 +154,7 @@ def sensors(options: Options) -> Study:
                 {
                     # Sensors are checked before the machine is read: both levels have the same findings.
                     **{name: partial(_at, KnowledgeLevel.FULL, of) for name, of in list(_COLUMNS.items())[:2]},
-                    **{f"machine blamed, {level}": partial(_at, level, share("blamed")) for level in _LEVELS},
+                    **{f"machine blamed, {level}": partial(_at, level, r.share("blamed")) for level in _LEVELS},
                 },
                 _judged,
                 "All machines:",

@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import LAYOUTS, changed_in, judged, opinion, readings, truth
-from benchmarks.studies.results import Estimate, Goal, Record, Table, Value, each, where, within
+from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SUBJECTS, Later, commissioned, subject_named
 from models.commissioning.knowledge import KnowledgeLevel
@@ -61,7 +61,7 @@ def _among_changed(column: str, rows: Sequence[Record]) -> Estimate | None:
 
 
 def _false_alarms(rows: Sequence[Record]) -> Estimate | None:
-    return r.share("any")(where(rows, changed="healthy"))
+    return r.share("any")(r.where(rows, changed="healthy"))
 
 
 _TABLES = (
@@ -87,7 +87,7 @@ _TABLES = (
             "exactly right": r.share("exact"),
             # Windows of one commissioning share its error.
             "least commissioning": lambda rows: min(
-                one.value for one in each(rows, ("commissioning",), r.share("exact")).values() if one
+                one.value for one in r.each(rows, ("commissioning",), r.share("exact")).values() if one
             ),
             "another named": r.share("wrong"),
             "called outside": r.share("outside"),
@@ -107,10 +107,10 @@ _TABLES = (
 def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     rows, by = list(judged(records)), ("machine", "level")
     for kind in ("k_by, k_bz −10 %", "c_by, c_bz −30 %"):
-        yield within(f"{kind} located", each(rows, by, partial(_located, kind[:2])), 0.95, 1.0)
+        yield r.within(f"{kind} located", r.each(rows, by, partial(_located, kind[:2])), 0.95, 1.0)
     bearing = [row for row in rows if str(row["changed"])[0] in "kc"]
-    yield within("bearing changed, another parameter named", each(bearing, by, r.share("wrong")), 0.0, 0.01)
-    yield within("false alarms of healthy windows", each(rows, by, _false_alarms), 0.0, 0.01)
+    yield r.within("bearing changed, another parameter named", r.each(bearing, by, r.share("wrong")), 0.0, 0.01)
+    yield r.within("false alarms of healthy windows", r.each(rows, by, _false_alarms), 0.0, 0.01)
 
 
 def unknown(options: Options) -> Study:
