@@ -9,11 +9,11 @@ import typer
 from benchmarks.studies.ablation import ablation
 from benchmarks.studies.delay import delay
 from benchmarks.studies.evaluate import evaluate
-from benchmarks.studies.pages import TEXTS, Measured, write_page
+from benchmarks.studies.pages import write_page
 from benchmarks.studies.peers import peers
 from benchmarks.studies.reproduction import reproduction
 from benchmarks.studies.sensors import sensors
-from benchmarks.studies.study import Options, options_of, read, run
+from benchmarks.studies.study import Options, read, run
 from benchmarks.studies.unknown import unknown
 from models.errors import RotorwatchError
 
@@ -40,9 +40,7 @@ def main(
     seed: Annotated[int, typer.Option(min=0)] = 20261122,
     processes: Annotated[int, typer.Option(min=1)] = os.cpu_count() or 1,
     small: Annotated[bool, typer.Option("--small", help="The smallest plan: a check, not a result.")] = False,
-    docs: Annotated[
-        Path | None, typer.Option(help="Write the pages of these studies into this folder, from all records in --out.")
-    ] = None,
+    docs: Annotated[Path | None, typer.Option(help="Write the pages of these studies into this folder.")] = None,
 ) -> None:
     """Run studies on simulated windows; records are kept, and an interrupted study carries on where it stopped.
 
@@ -59,22 +57,14 @@ def main(
     options = Options(tuple(machine or ()), windows, seed, small)
     try:
         for name in chosen:
-            typer.echo(f"written: {run(STUDIES[name](options), options, out, processes)}")
-        for page, of in TEXTS["pages"].items() if docs is not None else ():
-            if set(of["studies"]) & set(chosen):
-                parts = [_measured(name, out) for name in of["studies"] if (out / f"{name}.jsonl").exists()]
-                for path in write_page(page, parts, docs or out):
-                    typer.echo(f"written: {path}")
+            study = STUDIES[name](options)
+            written = [run(study, options, out, processes)]
+            if docs is not None:
+                written += write_page(study, options, read(study, out), docs)
+            typer.echo("written: " + ", ".join(map(str, written)))
     except RotorwatchError as error:
         typer.echo(f"studies: {error}", err=True)
         raise typer.Exit(2) from error
-
-
-def _measured(name: str, out: Path) -> Measured:
-    """A study as its file of records says that it was run."""
-    options = options_of(out / f"{name}.jsonl")
-    study = STUDIES[name](options)
-    return Measured(study, options, read(study, out))
 
 
 if __name__ == "__main__":

@@ -192,7 +192,7 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
                 panel = panels.setdefault(f"{setting}: {title}", {})
                 panel.setdefault(_HEADS[str(method)], []).append((str(changed), found))
     text = "Every method on the same windows, with 95 % intervals"
-    yield Chart("results-peers", text, panels, "true change", "share of windows")
+    yield Chart("peers", text, panels, "true change", "share of windows")
 
 
 def peers(options: Options) -> Study:

@@ -32,7 +32,7 @@ _ACROSS, _WIDE_IN, _HIGH_IN = 4, 3.1, 2.4
 
 def draw(chart: Chart, folder: Path) -> Path:
     """Draw a chart into a folder as PNG; returns its path."""
-    columns = min(_ACROSS, len(chart.panels))
+    columns = 3 if len(chart.panels) % 3 == 0 else min(_ACROSS, len(chart.panels))
     rows = -(-len(chart.panels) // columns)
     with mpl.rc_context(_STYLE):  # type: ignore[arg-type]  # the stub wants literal keys
         figure = Figure(figsize=(max(6.4, _WIDE_IN * columns), _HIGH_IN * rows + 0.8), layout="constrained")
@@ -83,7 +83,7 @@ def _points(axes: Axes, series: _Series, names: list[str]) -> None:
             capsize=2,
         )
     if words:
-        axes.set_xticks(range(len(words)), words, rotation=30 if max(map(len, words)) > 5 else 0)
+        axes.set_xticks(range(len(words)), words, rotation=35, ha="right")
 
 
 def _steps(axes: Axes, series: _Series, names: list[str]) -> None:

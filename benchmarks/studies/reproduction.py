@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import TITLES, diagnosticians, named_in
-from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
+from benchmarks.studies.results import Chart, Estimate, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -239,12 +239,6 @@ _TABLES = (
 )
 
 
-def _goals(records: Sequence[Record]) -> Iterator[Goal]:
-    exact = r.each(r.where(_eight(records), method=TITLES["paper"]), ("realisation",), r.share("exact"))
-    text = "; ".join(f"{kind} {one}" for kind, one in exact.items())
-    yield Goal("networks as printed: exactly the changed equations named", "the paper: all", text, "–")
-
-
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
     """The paper's Figs. 5 and 6: MSD of every printed network over the cutoff, for every condition."""
     for realisation in _REALISATIONS:
@@ -292,7 +286,6 @@ def reproduction(options: Options) -> Study:
         measure=partial(_measure, machine, bundle, options),
         learn=partial(_learn, machine, options.seed, options.windows, cutoffs, options),
         tables=_TABLES,
-        goals=_goals,
         charts=_charts,
         made_with={machine.name: f"{machine.physics_hash} {bundle.identity}", "windows": str(options.windows)},
     )

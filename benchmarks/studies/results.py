@@ -46,19 +46,12 @@ class Estimate:
 def rate(flags: Iterable[object]) -> Estimate | None:
     """Share of independent windows in which something holds, with its Clopper-Pearson interval; None without any."""
     held = [bool(flag) for flag in flags]
-    return _share(sum(held), len(held)) if held else None
-
-
-def _share(count: int, n: int) -> Estimate:
+    count, n = sum(held), len(held)
+    if not held:
+        return None
     low = 0.0 if count == 0 else float(scipy.stats.beta.ppf(0.025, count, n - count + 1))
     high = 1.0 if count == n else float(scipy.stats.beta.ppf(0.975, count + 1, n - count))
     return Estimate(count / n, low, high, n, count)
-
-
-def pooled(rates: Iterable[Estimate | None]) -> Estimate | None:
-    """One rate of all windows together; None without any."""
-    found = [one for one in rates if one is not None and one.count is not None]
-    return _share(sum(one.count or 0 for one in found), sum(one.n for one in found)) if found else None
 
 
 def resampled(statistic: Callable[[FloatArray], FloatArray], values: FloatArray) -> Estimate:

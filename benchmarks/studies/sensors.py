@@ -11,7 +11,6 @@ from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
 from models.commissioning.knowledge import KnowledgeLevel
-from models.diagnosis.readings import Diagnostician
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
 from models.errors import MachineFileError
@@ -38,17 +37,15 @@ _LEVELS = (KnowledgeLevel.NONE, KnowledgeLevel.FULL)
 
 
 @lru_cache(maxsize=2)
-def _learned(name: str, level: KnowledgeLevel, seed: int, healthy: int) -> tuple[Diagnostician, SensorReference]:
-    subject = subject_named(name)
-    windows = subject.healthy(seed, 0, healthy)
-    file = subject.file(level)
-    assert file is not None  # noqa: S101  # a shipped machine has a file at every level
-    return commissioned(level, file, windows), learn_sensor_reference(windows)
+def _reference(name: str, level: KnowledgeLevel, seed: int, healthy: int) -> SensorReference:
+    return learn_sensor_reference(commissioned(name, level, seed, 0, healthy)[1])
 
 
-def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
+def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
     name, level, fault = cell.given
-    diagnostician, reference = _learned(name, level, options.seed, 2 if options.small else 6)
+    made_with = (name, level, options.seed, 2 if options.small else 6)
+    reference, (diagnostician, _) = _reference(*made_with), commissioned(*made_with[:3], 0, made_with[3])
+    assert not isinstance(diagnostician, str)  # noqa: S101  # a shipped machine can be commissioned
     file = subject_named(name).file(KnowledgeLevel.FULL)
     assert isinstance(file, Machine)  # noqa: S101  # a shipped machine is known
     at = list(_FAULTS).index(fault)

@@ -167,21 +167,6 @@ def _of_plan(head: Mapping[str, Any]) -> Mapping[str, Any]:
     return {**head, "options": options}
 
 
-def options_of(path: Path) -> Options:
-    """What a file of records was made with.
-
-    Raises
-    ------
-    RecordingError
-        If its first line does not say so.
-    """
-    try:
-        options = _lines(path)[0]["options"]
-        return Options(**options | {"machines": tuple(options["machines"])})
-    except (IndexError, KeyError, TypeError) as error:
-        raise RecordingError(f"{path}: does not say what it was made with, expected the records of a study") from error
-
-
 def read(study: Study, folder: Path) -> list[Record]:
     """Records of all windows of the plan, with the keys of their cells; windows beyond the plan are left out.
 

@@ -7,9 +7,9 @@ purposes share a random number.
 
 import hashlib
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis, Diagnostician
 from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
 from models.machine import ConditionRange, Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
 from simulator.finite_elements.machines import ROTORS, rotor_named
@@ -83,14 +84,23 @@ class _Compared:
         return read if self.shared is None else with_shared_error(read, self.shared)
 
 
-def commissioned(level: KnowledgeLevel, file: MachineFile, windows: Sequence[WindowStatistics]) -> Diagnostician:
-    """Commission on healthy windows of one recording with what the machine file tells."""
-    if level is KnowledgeLevel.NONE:
-        return BaselineDiagnostician(learned_baseline(windows, ["recording 1"] * len(windows)))
-    if isinstance(file, Machine):
-        return _Compared(file, None)
-    identified = identify(file, windows)
-    return _Compared(identified.machine, identified.covariance)
+@lru_cache(maxsize=2)
+def commissioned(
+    name: str, level: KnowledgeLevel, seed: int, number: int, healthy: int
+) -> tuple[Diagnostician | str, tuple[WindowStatistics, ...]]:
+    """Commission a subject on healthy windows of one recording with what its file tells; or why that cannot be."""
+    subject = subject_named(name)
+    file, windows = subject.file(level), subject.healthy(seed, number, healthy)
+    assert file is not None  # noqa: S101  # no cell asks for a level that a subject has no file of
+    try:
+        if level is KnowledgeLevel.NONE:
+            return BaselineDiagnostician(learned_baseline(windows, ["recording 1"] * healthy)), windows
+        if isinstance(file, Machine):
+            return _Compared(file, None), windows
+        identified = identify(file, windows)
+        return _Compared(identified.machine, identified.covariance), windows
+    except EstimationError as error:
+        return f"not commissioned: {error}", windows
 
 
 def _generator(name: str, seed: int, commissioning: int, use: _Use, *which: int) -> np.random.Generator:

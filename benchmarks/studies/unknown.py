@@ -6,7 +6,7 @@ changed.
 """
 
 from collections.abc import Iterator, Sequence
-from functools import lru_cache, partial
+from functools import partial
 
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import LAYOUTS, changed_in, judged, opinion, readings, truth
@@ -14,8 +14,7 @@ from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SUBJECTS, Later, commissioned, subject_named
 from models.commissioning.knowledge import KnowledgeLevel
-from models.diagnosis.readings import Diagnostician
-from models.errors import EstimationError, MachineFileError
+from models.errors import MachineFileError
 from simulator.training.draws import Layout
 
 _CHANGES: tuple[dict[str, float], ...] = (
@@ -30,20 +29,9 @@ _CHANGES: tuple[dict[str, float], ...] = (
 _COMMISSIONINGS = 5
 
 
-@lru_cache(maxsize=2)
-def _commissioned(level: KnowledgeLevel, name: str, seed: int, commissioning: int, healthy: int) -> Diagnostician | str:
-    subject = subject_named(name)
-    file = subject.file(level)
-    assert file is not None  # noqa: S101  # the cells leave such machines out
-    try:
-        return commissioned(level, file, subject.healthy(seed, commissioning, healthy))
-    except EstimationError as error:
-        return f"not commissioned: {error}"
-
-
-def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
+def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
     level, name, commissioning, at = cell.given
-    diagnostician = _commissioned(level, name, options.seed, commissioning, 3 if options.small else 6)
+    diagnostician, _ = commissioned(name, level, options.seed, commissioning, 3 if options.small else 6)
     layout = Layout(number % 2)
     window, cutoff_hz = subject_named(name).later(Later(options.seed, commissioning, at, number, layout, _CHANGES[at]))
     known: dict[str, Value] = {"layout": LAYOUTS[layout], "cutoff_hz": cutoff_hz, **truth(_CHANGES[at])}
@@ -133,10 +121,4 @@ def unknown(options: Options) -> Study:
         for commissioning in range(commissionings)
         for at, changes in enumerate(_CHANGES)
     )
-    return Study(
-        name="unknown",
-        cells=cells,
-        measure=partial(_measure, options),
-        tables=_TABLES,
-        goals=_goals,
-    )
+    return Study(name="unknown", cells=cells, measure=partial(_measure, options), tables=_TABLES, goals=_goals)

@@ -12,7 +12,6 @@ from benchmarks.studies.results import (
     at_least,
     at_most,
     limit_of,
-    pooled,
     rate,
     resampled,
     robust,
@@ -32,7 +31,6 @@ def test_rates_have_clopper_pearson_intervals() -> None:
     assert (nothing.low, nothing.high) == pytest.approx((0.0, 0.0362), abs=1e-4)
     assert (some.low, some.high) == pytest.approx((0.0164, 0.1128), abs=1e-4)
     assert (everything.low, everything.high) == pytest.approx((0.9638, 1.0), abs=1e-4)
-    assert pooled([some, None, shares(7, 50)]) == shares(12, 150)
     assert rate([]) is None
 
 
