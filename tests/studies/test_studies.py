@@ -89,7 +89,7 @@ def test_the_page_has_figures_goals_and_how_to_run_it_again(tmp_path: Path) -> N
     assert "0 met, 1 missed, 0 missed within chance" in " ".join(text.split())
     assert "4 windows per fault" in " ".join(text.split())
     assert "--windows 4 --seed 7" in text
-    for target in re.findall(r"\]\(([^)]+)\)", text):
+    for target in re.findall(r"\]\(((?:figures|results)/[^)]+)\)", text):
         assert (tmp_path / target).exists()
     for block in re.findall(r"(?:^\|.*\n)+", text, re.MULTILINE):
         assert len({line.count("|") for line in block.splitlines()}) == 1, block
