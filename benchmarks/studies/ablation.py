@@ -73,7 +73,9 @@ def _learn(machine: Machine, options: Options, over: Over) -> _Networks:
         if variant.reader in (Reader.PAPER, Reader.NETWORK, Reader.LINEAR)
         for number in variant.equations
     )
-    tasks = [(one, number, training[number if one.varied else "one"], machine, options.seed) for one, number in fits]
+    tasks = [
+        (one, number, training[number if "varied" in one.has else "one"], machine, options.seed) for one, number in fits
+    ]
     return dict(zip(fits, over("networks", _train, tasks), strict=True))
 
 
@@ -94,12 +96,12 @@ def _train(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) 
     if variant.reader is Reader.PAPER:
         printed = next(equation for equation in PAPER_EQUATIONS if equation.number == number)
         return _Trained(variant, machine, None, train_paper_network(printed, windows, machine, seed))
-    if not variant.long_lags:
+    if "lags" not in variant.has:
         settings = machine.window.model_copy(update={"lag_from_s": 0.0})
         machine = machine.model_copy(update={"window": settings})
     windows = [v.as_seen(variant, window) for window in windows]
     equation = v.variant_equation(variant, number)
-    if isinstance(equation, v.VariantEquation) and not variant.normalised:
+    if isinstance(equation, v.VariantEquation) and "normalised" not in variant.has:
         norms = [equation.rows(window_view(window, machine), machine).norm for window in windows]
         equation = replace(equation, unit=float(np.sqrt(np.mean(np.square(norms)))))
     if variant.reader is Reader.LINEAR:

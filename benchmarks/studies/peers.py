@@ -37,13 +37,8 @@ _CHANGES: tuple[dict[str, float], ...] = (
 """Healthy, and bearing stiffness, bearing damping and unbalance changed by 5, 10 and 20 %."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Series:
-    """Windows of one purpose: 0 to learn from, 1 for the limits, 2 and up the cells."""
-
-    setting: str
-    number: int
-    faults: dict[str, float]
+_Series = tuple[str, int, dict[str, float]]
+"""Setting, purpose (0 to learn from, 1 for the limits, 2 and up the cells), true changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +56,14 @@ def _methods(machine: Machine) -> tuple[SubspaceModes | FeatureVector, ...]:
 
 def _simulate(machine: Machine, seed: int, series: _Series, number: int) -> tuple[FloatArray, WindowStatistics]:
     """SI samples and statistics of one window."""
-    if series.setting == "laboratory":
+    setting, at, faults = series
+    if setting == "laboratory":
         draw = Draw(machine, seed, Purpose.EVALUATION, layout=Layout.ONE_SOURCE, fixed_condition=True)
-        number += series.number * _APART
+        number += at * _APART
     else:
-        purpose = (Purpose.TRAINING, Purpose.CALIBRATION, Purpose.EVALUATION)[min(series.number, 2)]
-        draw = Draw(machine, seed, purpose, series.number)
-    events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in series.faults.items()]
+        purpose = (Purpose.TRAINING, Purpose.CALIBRATION, Purpose.EVALUATION)[min(at, 2)]
+        draw = Draw(machine, seed, purpose, at)
+    events = [Event(at_s=0, parameter=name, relative_change=change) for name, change in faults.items()]
     scenario = draw_condition(draw, number).overridden(faults=events)
     sizes = plan_for(machine)
     statistics = SlidingWindow(sizes)
@@ -100,7 +96,7 @@ def _learn(machine: Machine, options: Options, over: Over) -> Mapping[str, _Lear
     for setting in _SETTINGS:
         look = partial(_looked, machine, options.seed)
         fit, limit = (
-            over(f"{setting}, {label}", look, [(_Series(setting, at, {}), number) for number in range(count)])
+            over(f"{setting}, {label}", look, [((setting, at, {}), number) for number in range(count)])
             for at, label in enumerate(("healthy to learn", "healthy for the limits"))
         )
         methods, limits = _methods(machine), []
@@ -123,7 +119,7 @@ def _measure(
     machine: Machine, bundle: Bundle, options: Options, learned: Mapping[str, _Learned], cell: Cell, number: int
 ) -> list[dict[str, Value]]:
     series: _Series = cell.given
-    own = learned[series.setting]
+    own = learned[series[0]]
     samples, window = _simulate(machine, options.seed, series, number)
     rows: list[dict[str, Value]] = []
     for peer, limit in zip(own.peers, own.limits, strict=True):
@@ -132,12 +128,12 @@ def _measure(
         rows.append(
             {"method": peer.name, "score": score if judged else None, "detected": score > limit, "refused": not judged}
         )
-    equations = {equation.number for equation in PAPER_EQUATIONS if set(equation.parameters) & set(series.faults)}
+    equations = {equation.number for equation in PAPER_EQUATIONS if set(equation.parameters) & set(series[2])}
     flagged = own.paper.flagged_equations(own.paper.diagnose(window))
     said: list[dict[str, Value]] = [{"method": "paper", "named": " ".join(flagged), "refused": ""}]
     said += [opinion(one, window, (options.rate,)) for one in diagnosticians(machine, bundle)]
     for one in said:
-        named, true = named_in(one), equations if one["method"] == "paper" else set(series.faults)
+        named, true = named_in(one), equations if one["method"] == "paper" else set(series[2])
         row: dict[str, Value] = {"method": one["method"], "named": " ".join(sorted(named)), "detected": bool(named)}
         rows.append(row | {"exact": not one["refused"] and named == true, "refused": bool(one["refused"])})
     return rows
@@ -201,7 +197,7 @@ def peers(options: Options) -> Study:
     bundle = load_bundle(machine.name, machine)
     changes = (_CHANGES[0], _CHANGES[3], _CHANGES[6]) if options.small else _CHANGES
     cells = tuple(
-        Cell({"setting": setting, "changed": changed_in(faults)}, options.windows, _Series(setting, at + 2, faults))
+        Cell({"setting": setting, "changed": changed_in(faults)}, options.windows, (setting, at + 2, faults))
         for setting in _SETTINGS
         for at, faults in enumerate(changes)
     )

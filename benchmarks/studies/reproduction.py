@@ -6,7 +6,7 @@ one source of fixed direction and level, fixed speed, the paper's four cutoffs.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -63,16 +63,8 @@ def own_equations(parameters: Iterable[str]) -> tuple[str, ...]:
     return tuple(number for number in _EQUATIONS if number in named)
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
-    """One window: what has changed, cutoff and noise, and all that decides its random numbers beside the seed."""
-
-    faults: dict[str, float]
-    cutoff_hz: float
-    noise: float
-    realisation: tuple[int, ...]
-
-
+_Run = tuple[dict[str, float], float, float, tuple[int, ...]]
+"""True changes, cutoff, noise, and all that decides the random numbers beside the seed."""
 _Learned = tuple[tuple[PaperNetwork, ...], dict[str, PaperHealthy]]
 
 
@@ -95,18 +87,19 @@ def _source(machine: Machine, cutoff_hz: float) -> NamedSource:
     return unit.model_copy(update={"force_rms_N": level})
 
 
-def simulate(machine: Machine, seed: int, run: Run) -> WindowStatistics:
+def simulate(machine: Machine, seed: int, run: _Run) -> WindowStatistics:
     """Simulate one window, tilt included: equation 30 needs it, and the machine's own channels stay what they are."""
+    faults, cutoff_hz, noise, realisation = run
     rig = with_tilt(machine)
     sizes = plan_for(rig)
     scenario = Scenario(
-        name=f"study {run.realisation}",
+        name=f"study {realisation}",
         machine=rig.name,
-        seed=int(np.random.default_rng([seed, *run.realisation]).integers(2**62)),
+        seed=int(np.random.default_rng([seed, *realisation]).integers(2**62)),
         duration_s=(sizes.preamble + sizes.hops * sizes.hop) / sizes.rate_hz,
-        sources=(_source(machine, run.cutoff_hz),),
-        sensors=Sensors(noise_relative=run.noise, noise_corner_hz=_NOISE_CORNER_HZ),
-        events=tuple(Event(at_s=0, parameter=name, relative_change=change) for name, change in run.faults.items()),
+        sources=(_source(machine, cutoff_hz),),
+        sensors=Sensors(noise_relative=noise, noise_corner_hz=_NOISE_CORNER_HZ),
+        events=tuple(Event(at_s=0, parameter=name, relative_change=change) for name, change in faults.items()),
     )
     return simulate_scenario(scenario, rig)
 
@@ -116,15 +109,15 @@ def _learn(
 ) -> _Learned:
     """The printed networks on healthy windows, and the limits of their MSD."""
     count = 9 if options.small else 199
-    runs = [
-        Run({}, cutoff, _NOISE_LEVELS[0], (Purpose.TRAINING, n, r))
+    runs: list[_Run] = [
+        ({}, cutoff, _NOISE_LEVELS[0], (Purpose.TRAINING, n, r))
         for n, cutoff in enumerate(cutoffs)
         for r in range(windows)
     ]
     training = over("training windows", partial(simulate, machine, seed), runs)
     rig = with_tilt(machine)
     networks = tuple(train_paper_network(equation, training, rig, seed) for equation in PAPER_EQUATIONS)
-    runs = [Run({}, cutoffs[n % len(cutoffs)], _NOISE_LEVELS[0], (Purpose.CALIBRATION, n)) for n in range(count)]
+    runs = [({}, cutoffs[n % len(cutoffs)], _NOISE_LEVELS[0], (Purpose.CALIBRATION, n)) for n in range(count)]
     calibration = over("calibration windows", partial(simulate, machine, seed), runs)
     return networks, {
         # Who compares with the very runs that were trained on finds the largest healthy deviation among those.
@@ -138,7 +131,7 @@ def _measure(
 ) -> list[dict[str, Value]]:
     networks, limits = learned
     faults, realisation = cell.given
-    run = Run(faults, float(cell.keys["cutoff_hz"] or 0), float(cell.keys["noise"] or 0), (*realisation, number))
+    run = (faults, float(cell.keys["cutoff_hz"] or 0), float(cell.keys["noise"] or 0), (*realisation, number))
     whole = simulate(machine, options.seed, run)
     seen = _seen_by(machine, whole)
     paper = PaperDiagnostician(machine, networks, limits[str(cell.keys["realisation"])])

@@ -8,7 +8,6 @@ purposes share a random number.
 import hashlib
 import math
 from dataclasses import dataclass, replace
-from enum import IntEnum
 from functools import lru_cache
 
 import numpy as np
@@ -42,25 +41,6 @@ _ALIKE = (1.35, 1.65)
 """Level of a rotor with cubic stiffness, within a tenth of the commissioned one: at another level its stiffness is
 another one, which is no fault and no error of reading."""
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
-
-
-class _Use(IntEnum):
-    """Part of every seed."""
-
-    COMMISSIONING = 1
-    LATER = 2
-
-
-@dataclass(frozen=True, slots=True)
-class Later:
-    """Which window of a later day: read against which commissioning, of which cell and number, and what has changed."""
-
-    seed: int
-    commissioning: int
-    cell: int
-    number: int
-    layout: Layout
-    changes: dict[str, float]
 
 
 def subject_named(name: str) -> "Shipped | Beam":
@@ -103,15 +83,15 @@ def commissioned(
         return f"not commissioned: {error}", windows
 
 
-def _generator(name: str, seed: int, commissioning: int, use: _Use, *which: int) -> np.random.Generator:
+def _generator(name: str, seed: int, commissioning: int, *which: int) -> np.random.Generator:
+    """Random numbers of a commissioning (1, ...) or of a window of a later day (2, ...)."""
     own = int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big")
-    return np.random.default_rng([seed, own, commissioning, use, *which])
+    return np.random.default_rng([seed, own, commissioning, *which])
 
 
 def _commissioned_cutoff(name: str, seed: int, commissioning: int) -> float:
-    rng = _generator(name, seed, commissioning, _Use.COMMISSIONING, 1)
     low, high = np.log(_COMMISSIONED_CUTOFFS_HZ)
-    return float(np.exp(rng.uniform(low, high)))
+    return float(np.exp(_generator(name, seed, commissioning, 1, 1).uniform(low, high)))
 
 
 def _other_cutoff(limits: tuple[float, float], commissioned: float, rng: np.random.Generator) -> float:
@@ -135,21 +115,22 @@ class Beam:
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
         """Windows of 60 s of one commissioning, which do not overlap."""
         cutoff_hz = _commissioned_cutoff(self.rotor.name, seed, commissioning)
-        rng = _generator(self.rotor.name, seed, commissioning, _Use.COMMISSIONING)
+        rng = _generator(self.rotor.name, seed, commissioning, 1)
         limits = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz))
         return self._windows(SourceLayout.ONE_SOURCE, limits, {}, rng, count)
 
-    def later(self, which: Later) -> tuple[WindowStatistics, float]:
+    def later(
+        self, seed: int, commissioning: int, cell: int, number: int, changes: dict[str, float]
+    ) -> tuple[WindowStatistics, float]:
         """One window of 60 s, and the cutoff of its excitation, Hz."""
-        name = self.rotor.name
-        rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
-        commissioned = _commissioned_cutoff(name, which.seed, which.commissioning)
-        cutoff_hz = _other_cutoff(SceneRange().cutoff_hz, commissioned, rng)
-        layout = SourceLayout.ONE_SOURCE if which.layout is Layout.ONE_SOURCE else SourceLayout.INDEPENDENT
+        rng = _generator(self.rotor.name, seed, commissioning, 2, cell, number)
+        other = _commissioned_cutoff(self.rotor.name, seed, commissioning)
+        cutoff_hz = _other_cutoff(SceneRange().cutoff_hz, other, rng)
+        layout = SourceLayout.INDEPENDENT if number % 2 else SourceLayout.ONE_SOURCE
         limits = replace(SceneRange(), cutoff_hz=(cutoff_hz, cutoff_hz))
         if not self.rotor.linear:
             limits = replace(limits, stochastic_to_1x=_ALIKE)
-        return self._windows(layout, limits, which.changes, rng, 1)[0], cutoff_hz
+        return self._windows(layout, limits, changes, rng, 1)[0], cutoff_hz
 
     def _windows(
         self, layout: SourceLayout, limits: SceneRange, changes: dict[str, float], rng: np.random.Generator, count: int
@@ -179,7 +160,7 @@ class Shipped:
     def healthy(self, seed: int, commissioning: int, count: int) -> tuple[WindowStatistics, ...]:
         """Windows of 60 s of one commissioning, which do not overlap."""
         cutoff_hz = _commissioned_cutoff(self.machine.name, seed, commissioning)
-        rng = _generator(self.machine.name, seed, commissioning, _Use.COMMISSIONING)
+        rng = _generator(self.machine.name, seed, commissioning, 1)
         limits = ConditionRange(
             cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=(1.5, 1.5), noise_relative=(0.02, 0.02)
         )
@@ -187,16 +168,17 @@ class Shipped:
         draw = Draw(machine, own, Purpose.TRAINING, layout=Layout.ONE_SOURCE, fixed_condition=True)
         return tuple(simulate_window(draw, number) for number in range(1, count + 1))
 
-    def later(self, which: Later) -> tuple[WindowStatistics, float]:
+    def later(
+        self, seed: int, commissioning: int, cell: int, number: int, changes: dict[str, float]
+    ) -> tuple[WindowStatistics, float]:
         """One window of 60 s, and the cutoff of its excitation, Hz."""
-        name = self.machine.name
-        rng = _generator(name, which.seed, which.commissioning, _Use.LATER, which.cell, which.number)
-        own = self.machine.condition
-        cutoff_hz = _other_cutoff(own.cutoff_hz, _commissioned_cutoff(name, which.seed, which.commissioning), rng)
+        rng = _generator(self.machine.name, seed, commissioning, 2, cell, number)
+        own, other = self.machine.condition, _commissioned_cutoff(self.machine.name, seed, commissioning)
+        cutoff_hz = _other_cutoff(own.cutoff_hz, other, rng)
         machine = _within(self.machine, own.model_copy(update={"cutoff_hz": (cutoff_hz, cutoff_hz)}))
-        seed = int(rng.integers(2**62))
-        draw = Draw(machine, seed, Purpose.EVALUATION, faults=which.changes, layout=which.layout)
-        return simulate_window(draw, which.number), cutoff_hz
+        own_seed, layout = int(rng.integers(2**62)), Layout(number % 2)
+        draw = Draw(machine, own_seed, Purpose.EVALUATION, faults=changes, layout=layout)
+        return simulate_window(draw, number), cutoff_hz
 
 
 def _within(machine: Machine, limits: ConditionRange) -> Machine:

@@ -12,7 +12,7 @@ from benchmarks.studies import results as r
 from benchmarks.studies.opinions import LAYOUTS, changed_in, judged, opinion, readings, truth
 from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
-from benchmarks.studies.subjects import SUBJECTS, Later, commissioned, subject_named
+from benchmarks.studies.subjects import SUBJECTS, commissioned, subject_named
 from models.commissioning.knowledge import KnowledgeLevel
 from models.errors import MachineFileError
 from simulator.training.draws import Layout
@@ -32,9 +32,8 @@ _COMMISSIONINGS = 5
 def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
     level, name, commissioning, at = cell.given
     diagnostician, _ = commissioned(name, level, options.seed, commissioning, 3 if options.small else 6)
-    layout = Layout(number % 2)
-    window, cutoff_hz = subject_named(name).later(Later(options.seed, commissioning, at, number, layout, _CHANGES[at]))
-    known: dict[str, Value] = {"layout": LAYOUTS[layout], "cutoff_hz": cutoff_hz, **truth(_CHANGES[at])}
+    window, cutoff_hz = subject_named(name).later(options.seed, commissioning, at, number, _CHANGES[at])
+    known: dict[str, Value] = {"layout": LAYOUTS[Layout(number % 2)], "cutoff_hz": cutoff_hz, **truth(_CHANGES[at])}
     if isinstance(diagnostician, str):
         return [known | {"refused": diagnostician}]
     return [known | opinion(diagnostician, window, (0.01,))]

@@ -1,6 +1,6 @@
 """Variants of the relation networks' equations, as data: what each row of the ablation switches on or off."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -12,19 +12,6 @@ from models.diagnosis.networks.relation import Network, window_view
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
-
-__all__ = [
-    "VARIANTS",
-    "LinearRelation",
-    "Measure",
-    "Reader",
-    "Variant",
-    "VariantEquation",
-    "as_seen",
-    "equation_numbered",
-    "linear_fit",
-    "variant_equation",
-]
 
 
 class Measure(StrEnum):
@@ -46,29 +33,20 @@ class Reader(StrEnum):
     LIKELIHOOD = "likelihood"
 
 
+_ALL, _BEARING = ("28", "29", "31"), ("28", "31")
+
+
 @dataclass(frozen=True, slots=True)
 class Variant:
-    """One row of the table, and what of it is switched on."""
+    """One row of the table: the equations it exists for, and which ingredients it has."""
 
     group: str
     label: str
-    equations: tuple[str, ...] = ("28", "31")
-    """Equations it exists for."""
-    reader: Reader = Reader.NETWORK
-    synchronous_out: bool = True
-    long_lags: bool = True
-    """Lags from ``lag_from_s`` on, not from zero."""
-    normalised: bool = True
-    """Every window divided by the rms of its target."""
-    every_reference: bool = True
-    """All measured displacements as references, not y1 alone."""
-    tilt_out: bool = True
-    """The disc's acceleration among the inputs."""
-    speed_powers: bool = True
-    """Powers of Ω among the inputs of equation 29."""
-    varied: bool = True
-    """Trained on windows in which everything else varies, not on one condition."""
+    equations: tuple[str, ...]
+    has: frozenset[str]
+    """Of `_INGREDIENTS`."""
     measure: Measure = Measure.OWN_ERROR
+    reader: Reader = Reader.NETWORK
 
     @property
     def network_key(self) -> "Variant":
@@ -76,61 +54,55 @@ class Variant:
         return replace(self, group="", label="", equations=(), measure=Measure.MSD)
 
 
-_PRINTED = Variant(
-    "one after the other", "as printed", ("28", "29", "31"), Reader.PAPER,
-    synchronous_out=False, long_lags=False, normalised=False, every_reference=False, tilt_out=False, varied=False,
-    measure=Measure.MSD,
-)  # fmt: skip
-_OUT = replace(_PRINTED, label="+ synchronous part removed", equations=("28", "31"), reader=Reader.NETWORK)
-_OUT = replace(_OUT, synchronous_out=True)
-_LAGS = replace(_OUT, label="+ lags beyond the excitation's memory", long_lags=True)
-_NORMALISED = replace(_LAGS, label="+ every window normalised", normalised=True)
-_REFERENCES = replace(_NORMALISED, label="+ all measured references", every_reference=True)
-_TILT = replace(_REFERENCES, label="+ tilt eliminated", tilt_out=True)
-_VARIED = replace(_TILT, label="+ trained while everything else varies", varied=True)
-_PROJECTED = replace(_VARIED, label="+ projection on the signatures", measure=Measure.PROJECTION)
-_PRESENT = replace(_PROJECTED, label="+ block standard error (the present one)", measure=Measure.OWN_ERROR)
-
-_ALL = ("28", "29", "31")
-_29 = replace(_VARIED, equations=("29",))
+_INGREDIENTS = {
+    "synchronous": "synchronous part removed",
+    "lags": "lags beyond the excitation's memory",  # from ``lag_from_s`` on, not from zero
+    "normalised": "every window normalised",  # divided by the rms of its target
+    "references": "all measured references",  # displacements, not y1 alone
+    "tilt": "tilt eliminated",  # the disc's acceleration among the inputs
+    "powers": "powers of Ω among the inputs",  # of equation 29
+    "varied": "trained while everything else varies",  # not on one condition
+}
+_EVERYTHING = frozenset(_INGREDIENTS)
 
 
-def _without(label: str, equations: tuple[str, ...] = ("28", "31"), **off: object) -> Variant:
-    return replace(_PRESENT, group="the present one without", label=label, equations=equations, **off)  # type: ignore[arg-type]
+def _one_after_the_other() -> Iterator[Variant]:
+    group, has = "one after the other", frozenset({"powers"})
+    yield Variant(group, "as printed", _ALL, has, Measure.MSD, Reader.PAPER)
+    for name in ("synchronous", "lags", "normalised", "references", "tilt"):
+        has |= {name}
+        yield Variant(group, f"+ {_INGREDIENTS[name]}", _BEARING, has, Measure.MSD)
+    yield Variant(group, "+ phase reference as the reference", ("29",), has - {"powers"}, Measure.MSD)
+    yield Variant(group, f"+ {_INGREDIENTS['powers']}", ("29",), has, Measure.MSD)
+    yield Variant(group, f"+ {_INGREDIENTS['varied']}", _ALL, _EVERYTHING, Measure.MSD)
+    yield Variant(group, "+ projection on the signatures", _ALL, _EVERYTHING, Measure.PROJECTION)
+    yield Variant(group, "+ block standard error (the present one)", _ALL, _EVERYTHING)
 
 
-def _beside(label: str, reader: Reader, *, varied: bool = True) -> Variant:
-    return replace(_PRESENT, group="in its place", label=label, equations=_ALL, reader=reader, varied=varied)
+def _without() -> Iterator[Variant]:
+    group = "the present one without"
+    other = {"normalised": "normalisation", "references": "all references (y1 alone)"}
+    other["varied"] = "varied training (one condition)"
+    only = {"powers": ("29",), "varied": _ALL}
+    for name, label in _INGREDIENTS.items():
+        yield Variant(group, other.get(name, label), only.get(name, _BEARING), _EVERYTHING - {name})
+    yield Variant(group, "projection (MSD)", _ALL, _EVERYTHING, Measure.MSD)
+    yield Variant(group, "block standard error", _ALL, _EVERYTHING, Measure.PROJECTION)
 
 
-VARIANTS: tuple[Variant, ...] = (
-    _PRINTED,
-    _OUT,
-    _LAGS,
-    _NORMALISED,
-    _REFERENCES,
-    _TILT,
-    replace(_29, label="+ phase reference as the reference", varied=False, speed_powers=False),
-    replace(_29, label="+ powers of Ω among the inputs", varied=False),
-    replace(_VARIED, equations=_ALL),
-    replace(_PROJECTED, equations=_ALL),
-    replace(_PRESENT, equations=_ALL),
-    _without("synchronous part removed", synchronous_out=False),
-    _without("lags beyond the excitation's memory", long_lags=False),
-    _without("normalisation", normalised=False),
-    _without("all references (y1 alone)", every_reference=False),
-    _without("tilt eliminated", tilt_out=False),
-    _without("powers of Ω among the inputs", ("29",), speed_powers=False),
-    _without("varied training (one condition)", _ALL, varied=False),
-    _without("projection (MSD)", _ALL, measure=Measure.MSD),
-    _without("block standard error", _ALL, measure=Measure.PROJECTION),
-    _beside("as printed, trained while everything else varies", Reader.PAPER),
-    _beside("linear fit", Reader.LINEAR),
-    _beside("linear fit, one condition", Reader.LINEAR, varied=False),
-    _beside("shipped relation network", Reader.SHIPPED),
-    _beside("amortised network", Reader.AMORTISED),
-    _beside("likelihood", Reader.LIKELIHOOD),
-)
+def _in_its_place() -> Iterator[Variant]:
+    for label, reader, has in (
+        ("as printed, trained while everything else varies", Reader.PAPER, _EVERYTHING),
+        ("linear fit", Reader.LINEAR, _EVERYTHING),
+        ("linear fit, one condition", Reader.LINEAR, _EVERYTHING - {"varied"}),
+        ("shipped relation network", Reader.SHIPPED, _EVERYTHING),
+        ("amortised network", Reader.AMORTISED, _EVERYTHING),
+        ("likelihood", Reader.LIKELIHOOD, _EVERYTHING),
+    ):
+        yield Variant("in its place", label, _ALL, has, Measure.OWN_ERROR, reader)
+
+
+VARIANTS: tuple[Variant, ...] = (*_one_after_the_other(), *_without(), *_in_its_place())
 """The rows of the table."""
 
 
@@ -213,22 +185,22 @@ def variant_equation(variant: Variant, number: str) -> Equation | SynchronousEqu
     """The variant's equation, still without a unit."""
     equation = equation_numbered(number)
     if isinstance(equation, SynchronousEquation):
-        kind = SynchronousEquation if variant.speed_powers else _FixedSpeedEquation
+        kind = SynchronousEquation if "powers" in variant.has else _FixedSpeedEquation
         return kind(equation.number, equation.title)
-    count = len(equation.inputs) if variant.tilt_out else len(equation.inputs) - 1
+    count = len(equation.inputs) if "tilt" in variant.has else len(equation.inputs) - 1
     return VariantEquation(
         number=equation.number,
         title=equation.title,
         target=equation.target,
         inputs=equation.inputs[:count],
         signatures={name: partial(_first, function, count) for name, function in equation.signatures.items()},
-        references=4 if variant.every_reference else 1,
+        references=4 if "references" in variant.has else 1,
     )
 
 
 def as_seen(variant: Variant, window: WindowStatistics) -> WindowStatistics:
     """The window with the rotation-synchronous part put back where the variant does not remove it (Eqs. 17-18)."""
-    if variant.synchronous_out or window.synchronous is None:
+    if "synchronous" in variant.has or window.synchronous is None:
         return window
     q = window.synchronous
     turn = np.exp(1j * window.speed_rad_s * window.lags_s)

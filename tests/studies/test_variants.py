@@ -33,7 +33,7 @@ def test_the_variant_with_everything_on_is_the_equation_of_the_table(window: Win
 
 
 def test_y1_alone_without_tilt_is_the_printed_equation_28(window: WindowStatistics) -> None:
-    variant = replace(PRESENT, every_reference=False, tilt_out=False)
+    variant = replace(PRESENT, has=PRESENT.has - {"references", "tilt"})
     view = window_view(window, SHORT)
     rows = variant_equation(variant, "28").rows(view, SHORT)
     R, at = view.correlation, view.states.index
@@ -54,7 +54,7 @@ def test_a_unit_takes_the_place_of_the_norm(window: WindowStatistics) -> None:
 
 
 def test_the_synchronous_part_is_put_back_as_the_paper_has_it(window: WindowStatistics) -> None:
-    seen = as_seen(replace(PRESENT, synchronous_out=False), window)
+    seen = as_seen(replace(PRESENT, has=PRESENT.has - {"synchronous"}), window)
     i, j = window.states.index("y1"), window.states.index("z2")
     np.testing.assert_allclose(seen.correlation[:, i, j], full_correlation(window, "y1", "z2"))
     assert as_seen(PRESENT, window) is window
