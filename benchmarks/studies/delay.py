@@ -180,7 +180,7 @@ def _judged(records: Sequence[Record]) -> Iterator[Record]:
         valid["named"] = np.inf if row["named_s"] is None else row["named_s"]
         for name, bound in (("ratio", "bound_s"), ("fixed ratio", "bound_fixed_s")):
             valid[name] = float(valid["found"]) / float(row[bound] or 1.0)
-        yield valid | {"within": valid["ratio"] <= 2}
+        yield valid | {"within": None if row["early"] else valid["ratio"] <= 2}
 
 
 def _quantile(column: str, level: float) -> Callable[[Sequence[Record]], str]:
