@@ -131,6 +131,7 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
                 )
                 break
         powers = np.array([np.diag(w.correlation[0]) for w in windows[recording.name]])
+        powers = np.maximum(powers, 0.0)  # of a channel that does not move rounding may leave less than nothing
         half = len(powers) // 2
         if half:
             ratio = np.sqrt(powers[half:].mean(axis=0) / np.maximum(powers[:half].mean(axis=0), np.finfo(float).tiny))

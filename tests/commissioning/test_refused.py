@@ -22,7 +22,7 @@ from tests.commissioning.rotor_kit import (
     with_samples,
 )
 
-HEALTHY_S = 130.0
+HEALTHY_S = 100.0
 
 
 def verdict_of(made: Commissioning, check: str) -> tuple[str, str, str]:
@@ -84,6 +84,7 @@ def test_a_stuck_channel() -> None:
     made = made_of(with_samples(blocks, samples))
     assert refused(made)
     assert verdict_of(made, "sensors")[0] == "refused"
+    assert "of y2 in the second half is 0 times that of the first" in verdict_of(made, "stationary")[1]
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Sliding correlations: online equals batch for any splitting; offsets, gaps and the synchronous part."""
 
 from dataclasses import fields, replace
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -124,7 +125,7 @@ def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[i
 
 
 @pytest.mark.slow
-def test_ten_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
+def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
     """After every block of 100 000 samples the sliding estimate is the batch estimate of the same window."""
     plan = Plan(
         rate_hz=1e4,
@@ -141,7 +142,7 @@ def test_ten_million_samples_with_an_offset_a_million_times_the_fluctuation() ->
         max_span_ns=10**13,
     )
     window, tail, checked = SlidingWindow(plan), np.empty((0, 2)), 0
-    for block in range(100):
+    for block in range(40):
         samples = signal(100_000, block, offset=2e6, angle=False)
         statistics = [*[None], *[window.statistics() for _ in window.feed(samples, round(block * 1e10))]][-1]
         tail = np.concatenate([tail, samples])[-160_000:]
@@ -151,7 +152,7 @@ def test_ten_million_samples_with_an_offset_a_million_times_the_fluctuation() ->
         expected = batch_correlation(plan, tail, end)
         np.testing.assert_allclose(statistics.correlation, expected, atol=1e-9 * expected[0, 0, 0])
         checked += 1
-    assert checked >= 98
+    assert checked >= 38
 
 
 def test_synchronous_part_and_speed_are_recovered_and_removed() -> None:
@@ -270,6 +271,7 @@ def test_pairs_of_a_motion_and_its_rate_keep_their_powers() -> None:
 LAB = load_machine("lab")
 
 
+@cache
 def run_of_lab(seed: int, change: float = 0.0, *, unbalanced: bool = True) -> FloatArray:
     """A window of four independent sources while the speed changes by a part of the nominal one, through its middle."""
     rpm = LAB.operation.speed_rpm

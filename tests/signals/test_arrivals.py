@@ -75,7 +75,7 @@ repetitions = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 80)), ma
 N = 40
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(lateness(N), repetitions)
 def test_reordering_and_repetition_change_nothing(late: list[int], again: list[tuple[int, int]]) -> None:
     stream = [block(number) for number in range(N)]
@@ -86,7 +86,7 @@ def test_reordering_and_repetition_change_nothing(late: list[int], again: list[t
     assert refused(gone_on) == [Reason.OVERLAP] * len(again)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(lateness(N), repetitions, st.sets(st.integers(1, N - 1), max_size=12))
 def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tuple[int, int]], lost: set[int]) -> None:
     whole = [block(number) for number in range(N)]
@@ -96,7 +96,7 @@ def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tup
 
 
 @pytest.mark.slow
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(
     lateness(3 * N),
     repetitions,
@@ -166,7 +166,7 @@ def test_restarts_of_the_monitor_change_nothing(
     assert found == accepted(stream)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(
     st.lists(
         st.tuples(st.integers(0, 12), st.integers(0, 2), st.integers(-30, 30), st.sampled_from([0, 1, 2**64 - 2])),

@@ -88,11 +88,11 @@ def test_the_crack_takes_stiffness_from_its_own_direction_only() -> None:
 
 
 def test_a_cracked_rotor_moves_as_the_equation_of_motion_says() -> None:
-    expected = _solved(LAB, _crack, 1000)
-    states = _begun(LAB, _condition(crack=0.3), 1000)
+    expected = _solved(LAB, _crack, 500)
+    states = _begun(LAB, _condition(crack=0.3), 500)
     scale = np.abs(expected).max(axis=0)
     np.testing.assert_allclose(states / scale, expected / scale, atol=2e-3)
-    synchronous = _begun(LAB, _condition(), 1000)
+    synchronous = _begun(LAB, _condition(), 500)
     assert np.abs(expected - synchronous).max(axis=0)[1] > 0.2 * scale[1]
 
 
@@ -136,4 +136,4 @@ def test_a_rub_that_friction_drives_off_is_refused() -> None:
     plant = NonlinearPlant(LAB, _condition(), np.random.default_rng(1))
     plant.change(_condition(rub=5.0, friction=1.0))
     with pytest.raises(EstimationError, match="the rub is unstable"):
-        plant.advance(200_000)
+        plant.advance(40_000)
