@@ -1,6 +1,6 @@
 # make demo    set everything up and run the demo (FAULT=c_by, or none; ONCE=1 SEED=7 PACE=20)
 # make test    set everything up and run all checks
-# make quick   tests of the models and the monitor alone, a minute and a half
+# make quick   tests of the models and the monitor alone, a minute
 # make long    the tests of `make test` on further machines, seeds and realisations
 # make format  let ruff put the code in order
 # make wheels  build both wheels into dist/, and run the demo out of the wheel under every Python there is here

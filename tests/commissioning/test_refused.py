@@ -141,6 +141,7 @@ def test_a_file_that_describes_another_machine() -> None:
     assert "leave out of [rotor]" in advice
 
 
+@pytest.mark.slow
 def test_sensors_that_allow_no_equation_are_limited_to_changed_or_not() -> None:
     bearing = tuple(channel for channel in NOTHING.sensors if channel.location != "disc")
     machine = NOTHING.model_copy(update={"sensors": bearing})

@@ -32,6 +32,7 @@ def test_nothing_to_compare() -> None:
     assert agreements(Diagnosis("likelihood"), Diagnosis("network")) == ()
 
 
+@pytest.mark.slow
 def test_two_who_are_right_disagree_once_in_a_thousand_windows() -> None:
     rng = np.random.default_rng(SEED)
     windows, apart = 20_000, 0

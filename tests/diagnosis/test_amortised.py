@@ -35,6 +35,7 @@ def shipped() -> AmortisedNetworks:
     return amortised
 
 
+@pytest.mark.slow
 def test_drawn_spectra_scatter_around_their_expectation_like_averaged_segments() -> None:
     draws = SpectralDraws(LAB)
     rng = np.random.default_rng(SEED)

@@ -36,6 +36,7 @@ def z_of(diagnosis: Diagnosis) -> dict[str, float]:
     return {reading.name: reading.z for reading in diagnosis.parameters if reading.z is not None}
 
 
+@pytest.mark.slow
 def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
     found = [z_of(monitor().diagnose(window)) for window in recorded(ROTOR, OTHER, 2, 3)]
     for name in parameters_of():

@@ -37,6 +37,7 @@ def baseline() -> Baseline:
     )
 
 
+@pytest.mark.slow
 def test_every_commissioned_speed_has_its_own_unbalance() -> None:
     assert [round(one.speed_rad_s / 2 / np.pi) for one in baseline().rotations] == [24, 33]
     monitor = BaselineDiagnostician(baseline())

@@ -140,6 +140,7 @@ def test_a_plane_without_a_probe_says_so_and_the_other_is_read() -> None:
     assert reasons["k_by"] == reasons["c_by"] == ""
 
 
+@pytest.mark.slow
 def test_without_a_phase_reference_the_unbalance_is_read_from_the_line_itself() -> None:
     sizes = plan(speed_rad_s=Rotor().speed_rad_s)
     base = windows(simulate(Rotor(), Excitation(), 123, 71), sizes)

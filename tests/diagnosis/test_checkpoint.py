@@ -128,6 +128,7 @@ def windows() -> tuple[WindowStatistics, ...]:
     return tuple(found)
 
 
+@pytest.mark.slow
 def test_a_maximum_followed_for_long_goes_on_to_the_last_bit() -> None:
     """Twelve windows are followed from one search, then one takes its own units: stored after every window."""
     fit = LikelihoodFit(LAB, follow=True)

@@ -72,6 +72,7 @@ def test_synchronous_vectors_agree_with_theory(condition: Scenario, windows: lis
     assert windows[0].speed_rad_s == pytest.approx(speed, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_errors_fall_with_the_square_root_of_time(windows: list[WindowStatistics]) -> None:
     """Spread of a 60 s estimate against that of its 5 s parts: √12, within what 16 · 12 values can tell (± 30 %)."""
     whole = np.stack([window.correlation for window in windows]).std(axis=0, ddof=1)

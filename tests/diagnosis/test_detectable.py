@@ -36,12 +36,14 @@ def power(cov: FloatArray, name: str, seed: int) -> list[float]:
     return shares
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["c_by", "e"])
 def test_the_change_is_found_in_95_of_100_windows(name: str) -> None:
     cov = np.diag(np.geomspace(0.001, 0.02, 6) ** 2)
     assert power(cov, name, SEED) == pytest.approx([0.95, 0.95], abs=0.025)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_correlated_parameters_are_found_more_often_never_less(seed: int) -> None:
     cov = covariance(np.random.default_rng(SEED + seed))

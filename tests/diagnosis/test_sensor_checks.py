@@ -246,6 +246,7 @@ def displacements_only() -> tuple[Plan, list[int]]:
     return replace(plan, states=tuple(plan.states[i] for i in keep), columns=columns, scales=scales), [*keep, -1]
 
 
+@pytest.mark.slow
 def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() -> None:
     """Found where the 1x part stands out enough, and never put down to another channel."""
     plan, columns = displacements_only()

@@ -55,6 +55,7 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(degrees
     assert reading.interval[0] >= -1
 
 
+@pytest.mark.slow
 def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
     """The difference of two windows' vectors is their noise alone: which side of nothing it is on is chance."""
     draw = Draw(MACHINE, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT, fixed_condition=True)

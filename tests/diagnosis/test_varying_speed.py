@@ -24,6 +24,7 @@ def read(seed: int, ramp: float, *events: Event) -> Diagnosis:
     return LikelihoodFit(LAB).diagnose(window)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ramp", [pytest.param(0.05, marks=pytest.mark.long), 0.15])
 def test_a_healthy_machine_reads_healthy(ramp: float) -> None:
     diagnosis = read(SEED, ramp)

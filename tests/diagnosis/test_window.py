@@ -320,6 +320,7 @@ def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank(measured: b
     assert np.all(np.array(misfit, dtype=float) < 4), misfit
 
 
+@pytest.mark.slow
 def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
     samples, plan = run_of_lab(40, 0.15), plan_for(LAB, lagged=False)
     monkeypatch.setattr("models.diagnosis.synchronous.STEADY", 1.0)
@@ -330,6 +331,7 @@ def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -
     assert misfit > 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [0.0, 0.1])
 def test_the_speed_is_found_without_a_phase_reference(change: float) -> None:
     samples, plan = run_of_lab(50, change), plan_for(LAB, lagged=False)

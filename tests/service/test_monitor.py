@@ -48,6 +48,7 @@ def stream(name: str, duration_s: float, block_s: float = 0.1) -> list[SampleBlo
     return [block for block, _ in blocks(scenario(name, duration_s), machine, block_s=block_s)]
 
 
+@pytest.mark.slow
 def test_reports_do_not_depend_on_the_blocks() -> None:
     """Tenths of a second, uneven lengths, 1.9 s blocks, and encoded bytes: the same reports to the last bit."""
     fine = stream("healthy", 73.0)
@@ -164,6 +165,7 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
     assert not events
 
 
+@pytest.mark.slow
 def test_an_unsteady_speed_is_not_evaluable() -> None:
     loaded, machine = load_scenario("healthy")
     ramp = {"at_s": 20, "ramp_s": 30, "speed_rpm": 1580}

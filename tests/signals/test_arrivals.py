@@ -86,6 +86,7 @@ def test_reordering_and_repetition_change_nothing(late: list[int], again: list[t
     assert refused(gone_on) == [Reason.OVERLAP] * len(again)
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(lateness(N), repetitions, st.sets(st.integers(1, N - 1), max_size=12))
 def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tuple[int, int]], lost: set[int]) -> None:
