@@ -28,7 +28,7 @@ STUDIES = {
 }
 
 
-app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 @app.command()
@@ -44,11 +44,9 @@ def main(
 ) -> None:
     """Run studies on simulated windows; records are kept, and an interrupted study carries on where it stopped.
 
-    Examples
-    --------
-    python -m benchmarks.studies evaluate --machine lab --windows 500 --out studies --docs docs
+    Example: python -m benchmarks.studies evaluate --machine lab --windows 500 --out studies --docs docs
 
-    python -m benchmarks.studies all --small --out /tmp/check --docs /tmp/check
+    Check of everything: python -m benchmarks.studies all --small --out check --docs check
     """
     chosen = list(STUDIES) if names == ["all"] else names
     for name in chosen:

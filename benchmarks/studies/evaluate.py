@@ -260,12 +260,12 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
         ("lab", "network", SEVERAL, ("k_by", "k_bz"), "in bounds", 2.0),
         ("lab", "network", SEVERAL, ("c_by", "c_bz"), "in bounds", 1.5),
         ("light", "likelihood", SEVERAL, _READ, "in bounds", 1.3),
-        ("lab", "likelihood", ONE, ("k_by", "k_bz"), "off", 0.0008),
-        ("lab", "likelihood", ONE, ("c_by", "c_bz"), "off", 0.003),
+        ("lab", "likelihood", ONE, ("k_by", "k_bz"), "off %", 0.08),
+        ("lab", "likelihood", ONE, ("c_by", "c_bz"), "off %", 0.3),
     ):
         own = r.where(rows, topic="healthy", machine=machine, method=by, layout=layout)
         spreads = r.each([row for row in own if row["parameter"] in names], ("parameter",), r.scatter(column))
-        over = " over the bound" if column == "in bounds" else ""
+        over = " over the bound" if column == "in bounds" else " in %"
         if own:
             yield r.within(f"{by}: spread{over}, {layout}, {machine}", spreads, 0.0, most)
     for by in asked:

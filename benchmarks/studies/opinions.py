@@ -109,7 +109,7 @@ def readings(records: Iterable[Record]) -> Iterator[Record]:
             row = {**record, "parameter": name, "is named": name in named_in(record), "true": true or 0.0}
             if isinstance(change, float) and isinstance(error, float):
                 off, bound = change - float(true or 0.0), record.get(f"{name} bound")
-                row |= {"read": change, "off": off, "error": error, "in errors": off / error}
+                row |= {"read": change, "off": off, "off %": 100 * off, "error": error, "in errors": off / error}
                 row["covered"] = abs(off) <= Z95 * error
                 row |= {"bound": bound, "in bounds": off / float(bound)} if bound else {}
             yield row

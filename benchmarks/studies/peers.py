@@ -134,7 +134,7 @@ def _measure(
     said += [opinion(one, window, (options.rate,)) for one in diagnosticians(machine, bundle)]
     for one in said:
         named, true = named_in(one), equations if one["method"] == "paper" else set(series[2])
-        row: dict[str, Value] = {"method": one["method"], "named": " ".join(sorted(named)), "detected": bool(named)}
+        row: dict[str, Value] = {"method": one["method"], "named": one.get("named") or "", "detected": bool(named)}
         rows.append(row | {"exact": not one["refused"] and named == true, "refused": bool(one["refused"])})
     return rows
 

@@ -6,7 +6,7 @@ Clopper-Pearson, those of everything else come from resampling the windows.
 
 import csv
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -46,11 +46,12 @@ class Estimate:
 def rate(flags: Iterable[object]) -> Estimate | None:
     """Share of independent windows in which something holds, with its Clopper-Pearson interval; None without any."""
     held = [bool(flag) for flag in flags]
-    count, n = sum(held), len(held)
-    if not held:
-        return None
-    low = 0.0 if count == 0 else float(scipy.stats.beta.ppf(0.025, count, n - count + 1))
-    high = 1.0 if count == n else float(scipy.stats.beta.ppf(0.975, count + 1, n - count))
+    return _share(sum(held), len(held), 0.025) if held else None
+
+
+def _share(count: int, n: int, tail: float) -> Estimate:
+    low = 0.0 if count == 0 else float(scipy.stats.beta.ppf(tail, count, n - count + 1))
+    high = 1.0 if count == n else float(scipy.stats.beta.ppf(1 - tail, count + 1, n - count))
     return Estimate(count / n, low, high, n, count)
 
 
@@ -199,11 +200,14 @@ def at_most(what: str, measured: Estimate | None, most: float, declared: str = "
 
 
 def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: float) -> Goal:
-    """Goal of one or several figures that should all lie between two limits; the farthest off is shown."""
+    """Goal of one or several figures that should all lie between two limits; the farthest off is shown.
+
+    Their intervals are judged together: of many, some lie outside by chance.
+    """
     found = {name: one for name, one in figures.items() if one is not None}
     if not found:
         return Goal(what, "", "–", "–")
-    judged = {name: _judged(what, one, low, high, "") for name, one in found.items()}
+    judged = {name: _judged(what, _together(one, len(found)), low, high, "") for name, one in found.items()}
     name = max(found, key=lambda name: abs(found[name].value - (low + high) / 2))
     verdicts = [one.verdict for one in judged.values()]
     verdict = next((one for one in ("missed", "within chance") if one in verdicts), "met")
@@ -214,10 +218,19 @@ def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: 
     return Goal(what, declared, f"{several}{found[name]}", verdict)
 
 
+def _together(one: Estimate, figures: int) -> Estimate:
+    """With an interval that holds, together with those of so many other figures, at 95 % (Bonferroni)."""
+    if one.count is not None:
+        return _share(one.count, one.n, 0.025 / figures)
+    wider = float(scipy.stats.norm.isf(0.025 / figures) / scipy.stats.norm.isf(0.025))
+    return replace(one, low=one.value + wider * (one.low - one.value), high=one.value + wider * (one.high - one.value))
+
+
 def holding(what: str, rates: Mapping[str, Estimate | None], declared: float) -> Goal:
     """Goal of rates whose intervals should hold the declared one."""
     found = {name: one for name, one in rates.items() if one is not None}
-    met = all(one.low <= declared <= one.high for one in found.values())
+    wide = [_together(one, len(found)) for one in found.values()]
+    met = all(one.low <= declared <= one.high for one in wide)
     text = "; ".join(f"{name} {one}" for name, one in found.items())
     return Goal(what, f"{100 * declared:g} % inside", text or "–", ("met" if met else "missed") if found else "–")
 

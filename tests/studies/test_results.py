@@ -11,6 +11,7 @@ from benchmarks.studies.results import (
     Table,
     at_least,
     at_most,
+    holding,
     limit_of,
     rate,
     resampled,
@@ -62,6 +63,13 @@ def test_a_goal_is_missed_only_where_the_whole_interval_misses_it() -> None:
     assert judged.verdict == "missed"
     assert "1 of 2 inside; farthest k_by: 99.9 %" in judged.measured
     assert judged.declared == "93 % to 97 %"
+
+
+def test_of_many_figures_one_lies_outside_by_chance() -> None:
+    off, good = shares(85, 100), shares(95, 100)
+    assert within("covered", {"one": off}, 0.93, 0.97).verdict == "missed"
+    assert within("covered", {"one": off} | {str(n): good for n in range(20)}, 0.93, 0.97).verdict == "within chance"
+    assert holding("false alarms", {"lab": shares(5, 50)}, 0.01).verdict == "missed"
 
 
 def test_limits_keep_the_declared_rate() -> None:
