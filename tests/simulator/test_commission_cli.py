@@ -4,7 +4,6 @@ import json
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ from models.commissioning.commissioned import load_commissioned
 from models.machine import load_machine_file
 from simulator.recorder import record
 from tests.commissioning.rotor_kit import LAB, stream
+from tests.service.preloaded import ran
 
 ROOT = Path(__file__).parents[2]
 SHIPPED = (ROOT / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
@@ -20,16 +20,15 @@ NOTHING_KNOWN = re.sub(r"\[(rotor|operation|condition)\].*?(?=\n\[)", "", SHIPPE
 
 
 def run(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "simulator.rotortrain", "commission", *map(str, arguments)]
-    variables = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "200"}
-    return subprocess.run(command, cwd=folder, env=variables, capture_output=True, text=True, timeout=600, check=False)
+    variables = {**os.environ, "COLUMNS": "200"}
+    return ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("commission")
     (place / "machine.toml").write_text(NOTHING_KNOWN, encoding="utf-8")
-    for name, duration_s, seed in (("monday", 190.0, 81), ("friday", 130.0, 82), ("short", 20.0, 83)):
+    for name, duration_s, seed in (("monday", 100.0, 81), ("friday", 80.0, 82), ("short", 20.0, 83)):
         record(LAB, ((block, ()) for block in stream(duration_s, seed)), place / f"{name}.mcap")
     return place
 
@@ -43,7 +42,7 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
     first = load_commissioned(folder / "kit", machine)
     assert (first.version, first.replaces, first.level) == (1, None, "none")
     assert [one.name for one in first.recordings] == ["monday.mcap", "friday.mcap"]
-    assert [one.used_s for one in first.recordings] == [185.0, 125.0]
+    assert [one.used_s for one in first.recordings] == [95.0, 75.0]
     assert len({one.sha256 for one in first.recordings}) == 2
     report = json.loads((folder / "kit" / "report.json").read_text(encoding="utf-8"))
     assert report["identity"] == first.identity
