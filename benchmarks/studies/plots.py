@@ -53,7 +53,7 @@ def draw(chart: Chart, folder: Path) -> Path:
             panels[0].plot([], [], color=_COLOURS[n % 6], marker="" if chart.steps else _MARKERS[n % 6], label=name)[0]
             for n, name in enumerate(names)
         ]
-        figure.legend(handles=handles, loc="outside upper center", ncols=min(5, len(handles)))
+        figure.legend(handles=handles, loc="outside upper center", ncols=min(6, len(handles)))
         path = folder / f"{chart.name}.png"
         figure.savefig(path, dpi=130, bbox_inches="tight", metadata={"Software": None})
     with Image.open(path) as image:  # few colours, few bytes
