@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -15,15 +16,35 @@ import pytest
 from service.demo import FAULTS, Outcome
 from simulator.scenario import load_scenario
 from tests.service.live import endpoint, until
+from tests.service.preloaded import ran
 
 ROOT = Path(__file__).parents[2]
 HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "200"))
 
 
-def start(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, "-m", *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=cwd
+_started: list[subprocess.Popen[str]] = []
+
+
+@pytest.fixture(autouse=True)
+def _none_is_left() -> Iterator[None]:
+    yield
+    while _started:
+        process = _started.pop()
+        process.kill()
+        process.communicate()
+
+
+def start(*arguments: str, environment: dict[str, str] | None = None) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-m", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        cwd=ROOT,
+        env=environment,
     )
+    _started.append(process)
+    return process
 
 
 def children_of(pid: int) -> list[int]:
@@ -42,11 +63,9 @@ def children_of(pid: int) -> list[int]:
 def demo(folder: Path, *arguments: str) -> subprocess.Popen[str]:
     """A demo whose temporary files would all be in a folder."""
     folder.mkdir()
-    command = [sys.executable, "-m", "service.rotorwatch", "demo", "--http-port", "0", "--pace", "20", *arguments]
     environment = os.environ | {"TMPDIR": str(folder), "COLUMNS": "100"}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT, env=environment
-    )
+    paced = ("--http-port", "0", "--pace", "20")
+    return start("service.rotorwatch", "demo", *paced, *arguments, environment=environment)
 
 
 def read_until(process: subprocess.Popen[str], *texts: str) -> list[str]:
@@ -110,11 +129,11 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
     printed = [line.split()[1:] for line in lines if re.match(r"  \S*rotorwatch.* (watch|status) --", line)]
     assert [command[0] for command in printed] == ["watch", "status"]
     watch = start("service.rotorwatch", *printed[0])
+    lines += read_until(process, "c_bz raised", "demo failed")
+    status = ran("service.rotorwatch", *printed[1], "--json")  # at once: the demo goes on meanwhile
+    assert status.returncode == 1, status.stdout
+    assert "c_bz" in [one["name"] for one in json.loads(status.stdout)["machines"][0]["alarms"]]
     lines += read_until(process, "demo passed", "demo failed")
-    status = start("service.rotorwatch", *printed[1], "--json")
-    shown, _ = status.communicate(timeout=60)
-    assert status.returncode == 1, shown
-    assert "c_bz" in [one["name"] for one in json.loads(shown)["machines"][0]["alarms"]]
     lines += read_until(process, "(e) changed by", "failed")
     watch.send_signal(signal.SIGINT)
     watched, _ = watch.communicate(timeout=120)
@@ -196,35 +215,26 @@ def test_a_healthy_machine_at_full_speed_raises_nothing_and_loses_nothing(tmp_pa
     )
     where = endpoint()
     monitor = start("service.rotorwatch", "run", "--config", str(settings), "--listen", where)
-    simulator = None
-    try:
-        assert monitor.stdout is not None
-        url = next(line for line in monitor.stdout if line.startswith("HTTP API")).split()[-1]
-        simulator = start(
-            "simulator.rotorsim", "publish", "healthy", "--seed", "106", "--duration", str(HEALTHY_S), "--pace", "max",
-            "--connect", where, "--wait-for-subscriber", "60",
-        )  # fmt: skip
-        output, _ = simulator.communicate(timeout=840)
-        assert simulator.returncode == 0, output
-        base = f"{url}/api/v1/machines/demo/lab"
-        deadline = time.monotonic() + 180
-        while (health := httpx.get(f"{base}/health", timeout=180.0).json())["quality"][
-            "accepted_blocks"
-        ] < 10 * HEALTHY_S:
-            assert time.monotonic() < deadline, health["quality"]
-            time.sleep(0.2)
-        quality = health["quality"]
-        assert (quality["refused_blocks"], quality["gaps"], quality["queue_dropped_blocks"]) == ({}, 0, 0)
-        reports = httpx.get(f"{base}/reports", params={"limit": 1000}, timeout=180.0).json()["reports"]
-        assert [report["state"] for report in reports].count("healthy") == (HEALTHY_S - 60) // 5
-        events = httpx.get(f"{base}/alarms/events", timeout=180.0).json()["events"]
-        assert [one["data"]["name"] for one in events] in ([], ["stream-lost"])  # the silence after the end
-        assert json.loads(httpx.get(f"{base}/alarms", params={"all": True}, timeout=180.0).text)["alarms"]
-    finally:
-        for process in (monitor, simulator):
-            if process is not None and process.poll() is None:
-                process.terminate()
-                process.communicate(timeout=180)
+    assert monitor.stdout is not None
+    url = next(line for line in monitor.stdout if line.startswith("HTTP API")).split()[-1]
+    simulator = start(
+        "simulator.rotorsim", "publish", "healthy", "--seed", "106", "--duration", str(HEALTHY_S), "--pace", "max",
+        "--connect", where, "--wait-for-subscriber", "60",
+    )  # fmt: skip
+    output, _ = simulator.communicate(timeout=840)
+    assert simulator.returncode == 0, output
+    base = f"{url}/api/v1/machines/demo/lab"
+    deadline = time.monotonic() + 180
+    while (health := httpx.get(f"{base}/health", timeout=180.0).json())["quality"]["accepted_blocks"] < 10 * HEALTHY_S:
+        assert time.monotonic() < deadline, health["quality"]
+        time.sleep(0.2)
+    quality = health["quality"]
+    assert (quality["refused_blocks"], quality["gaps"], quality["queue_dropped_blocks"]) == ({}, 0, 0)
+    reports = httpx.get(f"{base}/reports", params={"limit": 1000}, timeout=180.0).json()["reports"]
+    assert [report["state"] for report in reports].count("healthy") == (HEALTHY_S - 60) // 5
+    events = httpx.get(f"{base}/alarms/events", timeout=180.0).json()["events"]
+    assert [one["data"]["name"] for one in events] in ([], ["stream-lost"])  # the silence after the end
+    assert json.loads(httpx.get(f"{base}/alarms", params={"all": True}, timeout=180.0).text)["alarms"]
 
 
 @pytest.mark.parametrize(
