@@ -9,7 +9,7 @@ from models.errors import MachineFileError
 from service.commands.running import HistoryOption, exit_codes
 
 if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
-    from service.store.database import Database
+    from service.store.file import HistoryFile
 
 __all__ = ["register"]
 
@@ -33,7 +33,7 @@ def check(config: HistoryOption = None) -> None:
     with exit_codes():
         from service.store.backup import faults  # noqa: PLC0415  # keeps --help quick
 
-        _, file = _chosen(config)
+        file = _chosen(config).path
         found = faults(file)
         for fault in found:
             typer.echo(f"{file}: {fault}", err=True)
@@ -54,7 +54,7 @@ def backup(
     with exit_codes():
         from service.store.backup import back_up  # noqa: PLC0415  # keeps --help quick
 
-        _, file = _chosen(config)
+        file = _chosen(config).path
         back_up(file, copy)
         typer.echo(
             f"{file} is copied to {copy}; it holds hashes of the access tokens: keep it where others cannot read it"
@@ -74,12 +74,12 @@ def restore(
     with exit_codes():
         from service.store.backup import restore as put_back  # noqa: PLC0415  # keeps --help quick
 
-        database, file = _chosen(config)
-        kept = put_back(database, backup_file)
-        typer.echo(f"{file} is that of {backup_file} now" + (f"; the former one is kept as {kept}" if kept else ""))
+        file = _chosen(config)
+        kept = put_back(file, backup_file)
+        typer.echo(f"{file.path} is that of {backup_file} now" + (f"; the former is kept as {kept}" if kept else ""))
 
 
-def _chosen(config: Path | None) -> "tuple[Database, Path]":
+def _chosen(config: Path | None) -> "HistoryFile":
     from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
     from service.store.database import Database  # noqa: PLC0415
 
@@ -87,4 +87,4 @@ def _chosen(config: Path | None) -> "tuple[Database, Path]":
     if database.file is None:
         way = "expected a file" if database.is_sqlite else "use pg_dump and pg_restore"
         raise MachineFileError(f"{config or 'settings'}: history.url is {database.shown}: {way}")
-    return database, database.file
+    return database.file

@@ -37,13 +37,8 @@ class AlarmLog:
         log = alarm_events.c
         query = select(*EVENT).join(machines, machines.c.machine_id == log.machine_id)
         query = query.where(machines.c.site == site, machines.c.name == name, log.recorded_ns >= recorded_ns)
-        query = query.order_by(log.sequence.desc()).limit(_MOST)
-
-        async def fetch() -> tuple[StoredEvent, ...]:
-            async with self._database.reading() as connection:
-                return tuple(StoredEvent(*row) for row in await connection.execute(query))
-
-        return self._database.call(fetch)[::-1]
+        newest_first = self._database.rows(query.order_by(log.sequence.desc()).limit(_MOST))
+        return tuple(StoredEvent(*row) for row in reversed(newest_first))
 
 
 def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:

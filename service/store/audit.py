@@ -13,34 +13,21 @@ _COLUMNS = [audit_log.c[name] for name in AuditEntry.__dataclass_fields__]
 
 
 class AuditLog:
-    """The log of requests that change something, or were refused; for any thread."""
+    """The log of requests that change something, or were refused; for any thread.
+
+    Both methods raise `StoreError` if the database fails.
+    """
 
     def __init__(self, database: Database) -> None:
         self._database = database
 
     def append(self, entry: AuditEntry) -> int:
-        """Write an entry and return its number; the number in the entry is not looked at.
-
-        Raises
-        ------
-        StoreError
-            If the database fails.
-        """
-        # What comes in is anything a stranger can put into a request.
-        values = {
-            name: _storable(value) if isinstance(value, str) else value
-            for name in AuditEntry.__dataclass_fields__
-            if name != "number"
-            for value in (getattr(entry, name),)
-        }
-
-        async def write() -> int:
-            async with self._database.writing() as connection:
-                made = await connection.execute(insert(audit_log).values(values).returning(audit_log.c.number))
-                number: int = made.scalar_one()
-            return number
-
-        return self._database.call(write)
+        """Write an entry and return its number; the number in the entry is not looked at."""
+        values = {name: _storable(getattr(entry, name)) for name in AuditEntry.__dataclass_fields__ if name != "number"}
+        with self._database.writing() as connection:
+            made = connection.execute(insert(audit_log).values(values).returning(audit_log.c.number))
+            number: int = made.scalar_one()
+        return number
 
     def entries(
         self, before: int | None = None, limit: int = 100, *, machine: str | None = None, actor: str | None = None
@@ -52,14 +39,9 @@ class AuditLog:
         before : int, optional
             Only entries with a smaller number: the last number of the page before.
         limit : int
-            At most this many.
+            At most this many, 1 or more.
         machine, actor : str, optional
             Only entries about this ``site/name``, by this actor.
-
-        Raises
-        ------
-        StoreError
-            If the database fails, or `limit` is less than 1.
         """
         if limit < 1:
             raise StoreError(f"audit log: {limit} entries were asked for, expected 1 or more")
@@ -70,13 +52,9 @@ class AuditLog:
             query = query.where(audit_log.c.machine == machine)
         if actor is not None:
             query = query.where(audit_log.c.actor == actor)
-
-        async def fetch() -> tuple[AuditEntry, ...]:
-            async with self._database.reading() as connection:
-                return tuple(AuditEntry(*row) for row in await connection.execute(query))
-
-        return self._database.call(fetch)
+        return tuple(AuditEntry(*row) for row in self._database.rows(query))
 
 
-def _storable(value: str) -> str:
-    return value.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
+def _storable(value: str | int) -> str | int:
+    """A value without what a stranger can put into a request and no database takes."""
+    return value if isinstance(value, int) else value.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()

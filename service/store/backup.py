@@ -7,9 +7,8 @@ from contextlib import ExitStack, closing
 from pathlib import Path
 from urllib.parse import quote
 
-from service.store.database import Database
 from service.store.errors import StoreError
-from service.store.writer import lock_file
+from service.store.file import HistoryFile, lock_file
 
 __all__ = ["back_up", "faults", "restore"]
 
@@ -60,7 +59,7 @@ def back_up(file: Path, copy: Path) -> None:
         raise
 
 
-def restore(database: Database, backup: Path) -> Path | None:
+def restore(into: HistoryFile, backup: Path) -> Path | None:
     """Put a backup in the place of a history that no monitor writes; return where the former one is kept, if any was.
 
     Raises
@@ -68,9 +67,7 @@ def restore(database: Database, backup: Path) -> Path | None:
     StoreError
         If a monitor runs, the backup is no whole history, or it cannot be copied.
     """
-    file = database.file
-    if file is None:
-        raise StoreError(f"{database.shown}: expected an SQLite file")
+    file = into.path
     if found := faults(backup):
         raise StoreError(f"{backup}: {found[0]}")
     with ExitStack() as undo:
@@ -83,7 +80,7 @@ def restore(database: Database, backup: Path) -> Path | None:
         copy.unlink(missing_ok=True)
         back_up(backup, copy)
         was_there = file.exists()
-        kept = database.set_aside("replaced")
+        kept = into.set_aside("replaced")
         copy.rename(file)
     return kept if was_there else None
 

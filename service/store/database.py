@@ -1,62 +1,79 @@
-"""The database behind the history: address, connections, transactions, and the one event loop that uses them."""
+"""The database behind the history: its address, its connections, and what is done when one does not answer.
 
-import asyncio
+Whoever asks uses a connection from the pool in a thread of its own, in `Database.reading` and `Database.writing`. One
+thread looks after them all: it breaks off what takes too long.
+"""
+
+import importlib
 import os
-import sqlite3
+import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
-from concurrent.futures import CancelledError
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, event, make_url, text
-from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy import URL, Connection, Engine, Row, Select, create_engine, event, inspect, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
-from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, create_async_engine
-from sqlalchemy.sql.schema import Table
+from sqlalchemy.pool import QueuePool, StaticPool
 
 from service.store.errors import DamagedError, StoreError
-from service.store.schema import migrate
+from service.store.file import HistoryFile, is_damage
+from service.store.tables import REVISION
+
+if TYPE_CHECKING:
+    from sqlalchemy.dialects import postgresql, sqlite
+    from sqlalchemy.sql.schema import Table
 
 __all__ = ["Database"]
 
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
-
 _ANSWER_S = 60.0  # at least; a query over a long time may take a while
-_JOIN_S = 10.0
 _FINISH_S = 2.0  # for what others have asked for when the history is closed
+_JOIN_S = 10.0
+_WATCH_S = 0.5
 _IMMEDIATE = "rotorwatch_immediate"
-_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_hops", "series", "tokens", "webhook_cursors")
 """Tables without which a monitor cannot go on; to look through the others would take minutes."""
-_COMPANIONS = ("", "-wal", "-shm")
+_POSTGRESQL = {"application_name": "rotorwatch", "tcp_user_timeout": 25_000} | {
+    "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3
+}  # fmt: skip
 _FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://user:password@host/database"
 
 
+@dataclass(slots=True, eq=False)
+class _Use:
+    """Somebody who uses a connection: until when, and why it was broken off."""
+
+    until_s: float
+    driver: Any = None
+    broken_off: str = ""
+
+
 class Database:
-    """Connections to one database, used in one thread of its own.
+    """Connections to one database; for any thread.
 
     Parameters
     ----------
     url : str
         ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
     timeout_s : float
-        How long to wait for a connection, for a lock that another program holds, or for one transaction, in seconds.
+        How long to wait for a connection, or for a lock that another program holds, in seconds.
 
     Attributes
     ----------
+    file : HistoryFile or None
+        None if it is no file.
+    shown : str
+        The address without the password.
     generation : int
         Goes up each time the history is gone on with in another file than before.
     news : str
         What happened to the file then.
     lost : str
         The same, where something of the history is not in the present file; empty if all of it is.
-    damage : str
-        What SQLite found wrong with the file while it was in use; whoever finds it sets it.
 
     Raises
     ------
@@ -69,21 +86,19 @@ class Database:
         self._url = _checked(url)
         self.is_sqlite = self._url.get_backend_name() == "sqlite"
         self.in_memory = self.is_sqlite and self._url.database in {None, "", ":memory:"}
-        self.file = None if not self.is_sqlite or self.in_memory else Path(self._url.database or "")
+        self.file = HistoryFile(Path(self._url.database or "")) if self.is_sqlite and not self.in_memory else None
         self.shown = self._url.render_as_string(hide_password=True)
-        self._asking = threading.Lock()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._thread: threading.Thread | None = None
-        self._engine: AsyncEngine | None = None
-        self._identity: tuple[int, int] | None = None
-        self._companions: dict[str, tuple[int, int] | None] = {}
+        self.answer_s = max(_ANSWER_S, 10.0 * timeout_s)
         self.generation = 0
-        self.news = self.lost = self.damage = ""
+        self.news = self.lost = ""
+        self._engine: Engine | None = None
+        self._uses: set[_Use] = set()
+        self._changed = threading.Condition()
         # SQLite has one writer at a time. In memory there is one connection in all, which readers share.
-        self._one_writer = asyncio.Lock()
+        self._one_writer = threading.Lock()
 
     def start(self, set_aside: bool = False, *, read_only: bool = False) -> None:
-        """Start the thread, connect, and bring the tables up to date.
+        """Connect, and bring the tables up to date.
 
         Parameters
         ----------
@@ -97,211 +112,187 @@ class Database:
         StoreError
             If that fails; nothing is left running then.
         """
-        if self._loop is not None:
+        if self._engine is not None:
             raise StoreError(f"{self.shown}: the history is open already")
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="history", daemon=True)
-        self._thread.start()
-        try:
-            if read_only:
-                self._engine = self._make_engine()
-                return
-            # Without a limit: bringing the tables of a large history up to date may take minutes.
-            asyncio.run_coroutine_threadsafe(self._guarded(None, self._connect, set_aside), self._loop).result()
-        except BaseException:
-            self.stop()
-            raise
+        with self.plainly():
+            self._engine = self._new_engine() if read_only else self._connect(set_aside)
+        threading.Thread(target=self._watch, name="history-watch", daemon=True).start()
 
     def stop(self) -> None:
-        """Answer everybody who has asked, close all connections and end the thread; a second time is nothing.
+        """Answer everybody who has asked, breaking off what takes too long, and disconnect; twice is once."""
+        with self._changed:
+            engine, self._engine = self._engine, None
+            if engine is None:
+                return
+            end_s = time.monotonic() + _FINISH_S
+            for use in self._uses:
+                use.until_s = min(use.until_s, end_s)
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._uses, _FINISH_S + _JOIN_S)
+        engine.dispose()
 
-        Raises
-        ------
-        StoreError
-            If the connections cannot be closed.
-        """
-        with self._asking:
-            loop, self._loop = self._loop, None
-        if loop is None or self._thread is None:
-            return
-        try:
-            limit_s = _FINISH_S + max(_ANSWER_S, 10.0 * self.timeout_s)
-            asyncio.run_coroutine_threadsafe(self._guarded(limit_s, self._finish), loop).result()
-        finally:
-            loop.call_soon_threadsafe(loop.stop)
-            self._thread.join(_JOIN_S)
-            if not self._thread.is_alive():
-                loop.close()
+    @property
+    def is_open(self) -> bool:
+        """Whether it can be asked."""
+        return self._engine is not None
 
-    def call(self, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs) -> _T:
-        """Run a coroutine function in the history's loop and wait for it; for any thread but the history's own.
+    @property
+    def engine(self) -> Engine:
+        """The engine, while the history is open."""
+        if self._engine is None:
+            raise StoreError(f"{self.shown}: the history is closed")
+        return self._engine
+
+    def rows(self, query: Select[*tuple[Any, ...]]) -> Sequence[Row[*tuple[Any, ...]]]:
+        """Everything that a query finds.
 
         Raises
         ------
         StoreError
             If the history is closed, or the database fails or does not answer.
         """
-        limit_s = max(_ANSWER_S, 10.0 * self.timeout_s)
-        with self._asking:  # after this nobody stops the loop without answering
-            if self._loop is None:
-                raise StoreError(f"{self.shown}: the history is closed")
-            asked = asyncio.run_coroutine_threadsafe(self._guarded(limit_s, function, *args, **kwargs), self._loop)
-        try:
-            return asked.result()
-        except CancelledError as error:
-            raise StoreError(f"{self.shown}: the history was closed") from error
+        with self.reading() as connection:
+            return connection.execute(query).all()
 
-    async def _finish(self) -> None:
-        """End what is going on, cancelling what takes too long, and disconnect."""
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        if others:
-            _, late = await asyncio.wait(others, timeout=_FINISH_S)
-            for task in late:
-                task.cancel()
-            await asyncio.gather(*late, return_exceptions=True)
-        await self._disconnect()
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection to read with, all of it at one point in time in SQLite; raises as `rows` does."""
+        with self.plainly(), self.alone() if self.in_memory else nullcontext(), self.using(self.answer_s) as connection:
+            yield connection
 
-    async def _guarded(
-        self, limit_s: float | None, function: Callable[_P, Awaitable[_T]], *args: _P.args, **kwargs: _P.kwargs
-    ) -> _T:
+    @contextmanager
+    def writing(self, limit_s: float | None = None, *, repeatable: bool = False) -> Iterator[Connection]:
+        """A connection within a transaction, committed at the end; raises as `rows` does.
+
+        Parameters
+        ----------
+        limit_s : float, optional
+            How long all of it may take, if not as long as a query.
+        repeatable : bool
+            Whether all statements must see the same, which they do in SQLite anyhow.
+        """
+        with self.plainly(), self.alone(), self.using(limit_s or self.answer_s) as connection:
+            self.to_write(connection)
+            if repeatable and not self.is_sqlite:
+                connection.execution_options(isolation_level="REPEATABLE READ")
+            with connection.begin():
+                yield connection
+
+    @contextmanager
+    def using(self, limit_s: float, connection: Connection | None = None) -> Iterator[Connection]:
+        """A connection that is watched: what takes longer than the limit is broken off, and so is it at the end.
+
+        Parameters
+        ----------
+        limit_s : float
+            In seconds.
+        connection : Connection, optional
+            Otherwise one from the pool.
+
+        Raises
+        ------
+        StoreError
+            If the history is closed.
+        SQLAlchemyError, OSError
+            If the database fails; TimeoutError if it was broken off.
+        """
+        use = _Use(time.monotonic() + limit_s)
+        with self._changed:
+            engine = self.engine
+            self._uses.add(use)
         try:
-            async with asyncio.timeout(limit_s):
-                return await function(*args, **kwargs)
-        except (SQLAlchemyError, OSError, TimeoutError) as error:
+            with engine.connect() if connection is None else nullcontext(connection) as used:
+                use.driver = used.connection.driver_connection
+                try:
+                    yield used
+                finally:
+                    with self._changed:
+                        use.driver = None  # not to be interrupted when somebody else has it
+        except (SQLAlchemyError, OSError) as error:
+            if use.broken_off:
+                raise TimeoutError(use.broken_off) from error
+            raise
+        finally:
+            with self._changed:
+                self._uses.discard(use)
+                if self._engine is None:
+                    self._changed.notify_all()
+
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Keep others of this process from writing to SQLite at the same time; nothing in PostgreSQL."""
+        if self.is_sqlite and not self._one_writer.acquire(timeout=2 * self.timeout_s):
+            raise TimeoutError
+        try:
+            yield
+        finally:
+            if self.is_sqlite:
+                self._one_writer.release()
+
+    @contextmanager
+    def plainly(self) -> Iterator[None]:
+        """Raise what goes wrong with the database as `StoreError`."""
+        try:
+            yield
+        except (SQLAlchemyError, OSError) as error:
             raise self.failure(error) from error
 
     def failure(self, error: BaseException) -> StoreError:
         """Put an error of the database into plain words."""
         if isinstance(error, StoreError):
             return error
+        cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+        reason = " ".join(str(cause).split()) or type(cause).__name__
         if isinstance(error, TimeoutError):
-            reason = "no answer in time"
-        else:
-            cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
-            reason = " ".join(str(cause).split()) or type(cause).__name__
+            reason = str(error) or "no answer in time"
         password = self._url.password
         if password:
             reason = reason.replace(str(password), "***")
         return StoreError(f"{self.shown}: {reason}")
 
-    @property
-    def is_open(self) -> bool:
-        """Whether the thread runs."""
-        return self._loop is not None
+    def to_write(self, connection: Connection) -> None:
+        """Let transactions of a connection wait for their turn at the beginning, in SQLite."""
+        connection.execution_options(**{_IMMEDIATE: True})
 
-    @property
-    def engine(self) -> AsyncEngine:
-        """The engine, while the history is open."""
-        if self._engine is None:
-            raise StoreError(f"{self.shown}: the history is closed")
-        return self._engine
-
-    @asynccontextmanager
-    async def reading(self) -> AsyncIterator[AsyncConnection]:
-        """A connection to read with, all of it at one point in time in SQLite."""
-        async with self._one_writer if self.in_memory else nullcontext(), self.engine.connect() as connection:
-            yield connection
-
-    @asynccontextmanager
-    async def writing(self, repeatable: bool = False) -> AsyncIterator[AsyncConnection]:
-        """A connection within a transaction, committed at the end.
-
-        Parameters
-        ----------
-        repeatable : bool
-            Whether all statements must see the same, which they do in SQLite anyhow.
-        """
-        async with self.alone(), self.writers.connect() as connection:
-            if repeatable and not self.is_sqlite:
-                await connection.execution_options(isolation_level="REPEATABLE READ")
-            async with connection.begin():
-                yield connection
-
-    @property
-    def writers(self) -> AsyncEngine:
-        """The engine for connections that write: in SQLite their transactions wait for their turn at the beginning."""
-        return self.engine.execution_options(**{_IMMEDIATE: True})
-
-    def alone(self) -> AbstractAsyncContextManager[None]:
-        """What keeps others of this process from writing to SQLite at the same time; nothing in PostgreSQL."""
-        return self._one_writer if self.is_sqlite else nullcontext()
-
-    def insert(self, table: Table) -> "sqlite.Insert | postgresql.Insert":
+    def insert(self, table: "Table") -> "sqlite.Insert | postgresql.Insert":
         """Begin an INSERT that knows ON CONFLICT."""
-        return sqlite.insert(table) if self.is_sqlite else postgresql.insert(table)
+        dialect = importlib.import_module(f"sqlalchemy.dialects.{'sqlite' if self.is_sqlite else 'postgresql'}")
+        made: sqlite.Insert | postgresql.Insert = dialect.insert(table)
+        return made
 
     def astray(self) -> str:
         """Why what is written would not be found at the address any more; empty if it would."""
-        if self.file is None or self._identity is None:
-            return ""
-        found = _identity(self.file)
-        if found is None:
-            return f"{self.shown}: the file was deleted"
-        if found != self._identity:
-            return f"{self.shown}: another file was put in its place"
-        return f"{self.shown}: the file is damaged: {self.damage}" if self.damage else ""
+        why = "" if self.file is None else self.file.astray()
+        return f"{self.shown}: {why}" if why else ""
 
     def found_damaged(self, error: Exception) -> bool:
         """Whether an error means that the file is damaged, and take note of it if so."""
-        if self.file is None or not _is_damage(error):
+        if self.file is None or not is_damage(error):
             return False
-        self.damage = str(error.orig if isinstance(error, DBAPIError) else error)
+        self.file.damage = str(error.orig if isinstance(error, DBAPIError) else error)
         return True
 
-    async def rescue(self, source: AsyncConnection | None) -> bool:
-        """Write what a deleted file holds, which is still open, into a new one at its path; say whether that is done.
-
-        Parameters
-        ----------
-        source : AsyncConnection or None
-            Opened before the file was deleted.
-        """
-        if self.file is None or source is None or _identity(self.file) is not None:
-            return False
-        copy = self.file.with_name(f"{self.file.name}.rescued")
-        try:
-            driver = (await source.get_raw_connection()).driver_connection
-            copy.unlink(missing_ok=True)
-            _make_file(copy)
-            target = sqlite3.connect(copy, check_same_thread=False)
-            try:
-                await driver.backup(target)  # type: ignore[union-attr]  # aiosqlite's, as it is SQLite
-            finally:
-                target.close()
-            self.set_aside("deleted")
-            copy.rename(self.file)
-        except (SQLAlchemyError, sqlite3.Error, OSError):
-            copy.unlink(missing_ok=True)
-            return False
-        return True
-
-    async def reconnect(self, why: str, rescued: bool) -> None:
-        """Go on in the file that is at the path now, or in a new one.
+    def begin_anew(self, why: str, source: Connection | None) -> None:
+        """Go on in the file that is at the path now, or in a new one; `lost` says what is not in it.
 
         Parameters
         ----------
         why : str
             From `astray`.
-        rescued : bool
-            Whether all that was in the former file is in it.
+        source : Connection or None
+            To the former file, of which all is saved if it was deleted.
 
         Raises
         ------
         StoreError, SQLAlchemyError, OSError
             If that fails; readers have the former file still.
         """
-        if not rescued and not self.damage:
-            self.set_aside("deleted", only_own=True)
-        former, generation = self._engine, self.generation
-        try:
-            await self._connect(set_aside=True)
-        except BaseException:
-            failed, self._engine = self._engine, former
-            if failed is not None and failed is not former:
-                await failed.dispose()
-            raise
-        if former is not None:
-            await former.dispose()
+        former, generation = self.engine, self.generation
+        rescued = self.file is not None and self.file.rescue(source)
+        if self.file is not None and not rescued and not self.file.damage:
+            self.file.set_aside("deleted", only_opened=True)
+        self._engine = self._connect(set_aside=True)
+        former.dispose()
         if self.generation == generation:  # not set aside
             self.generation += 1
             self.news = f"{why} while it was in use; " + (
@@ -309,101 +300,103 @@ class Database:
             )
             self.lost = "" if rescued else self.news
 
-    async def _connect(self, set_aside: bool) -> None:
+    def _connect(self, set_aside: bool) -> Engine:
         try:
-            if self.damage and set_aside:
-                raise DamagedError(f"{self.shown}: the file is damaged: {self.damage}")
-            await self._open()
+            if self.file is not None and self.file.damage and set_aside:
+                raise DamagedError(f"{self.shown}: the file is damaged: {self.file.damage}")
+            return self._opened()
         except (DamagedError, DBAPIError) as error:
-            if not set_aside or self.file is None or not _is_damage(error):
+            if not set_aside or self.file is None or not is_damage(error):
                 raise
-            await self._disconnect()
-            kept = self.set_aside("damaged")
+            kept = self.file.set_aside("damaged")
             self.news = self.lost = f"{self.failure(error)}: it is kept as {kept}, and the history begins anew"
             self.generation += 1
-            await self._open()
-        self.damage = ""
+            return self._opened()
 
-    async def _open(self) -> None:
+    def _opened(self) -> Engine:
         if self.file is not None:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            _make_file(self.file)
-        self._engine = self._make_engine()
-        async with self.writers.connect() as connection, connection.begin():
+            self.file.make()
+        engine = self._new_engine()
+        try:
+            # Without a limit: bringing the tables of a large history up to date may take minutes.
+            with engine.connect() as connection:
+                self.to_write(connection)
+                with connection.begin():
+                    self._bring_up_to_date(connection)
+            if self.file is not None:
+                self.file.opened()
+        except BaseException:
+            engine.dispose()
+            raise
+        return engine
+
+    def _bring_up_to_date(self, connection: Connection) -> None:
+        there = inspect(connection).has_table("alembic_version")
+        if not there or connection.scalars(text("SELECT version_num FROM alembic_version")).all() != [REVISION]:
+            from service.store.schema import migrate  # noqa: PLC0415  # Alembic takes long to import
+
             try:
-                await connection.run_sync(migrate)
+                migrate(connection)
             except StoreError as error:
                 raise StoreError(f"{self.shown}: {error}") from error
-            for table in _NEEDED if self.file is not None else ():
-                found = (await connection.execute(text(f"PRAGMA quick_check({table})"))).scalars().all()
-                if found != ["ok"]:
-                    raise DamagedError(f"{self.shown}: the file is damaged: table {table}: {found[0]}")
+        for table in _NEEDED if self.file is not None else ():
+            found = connection.scalars(text(f"PRAGMA quick_check({table})")).all()
+            if found != ["ok"]:
+                raise DamagedError(f"{self.shown}: the file is damaged: table {table}: {found[0]}")
+
+    def _new_engine(self) -> Engine:
+        if not self.is_sqlite:
+            return self._new_postgresql()
+        url = self._url
         if self.file is not None:
-            self._identity = _identity(self.file)
-            self._companions = {end: _identity(self._beside(end)) for end in _COMPANIONS}
+            # A file that was deleted must not come back empty with the next reader.
+            url = url.set(database=f"file:{quote(str(self.file.path))}", query={"mode": "rw", "uri": "true"})
+        engine = create_engine(
+            url,
+            poolclass=StaticPool if self.in_memory else QueuePool,
+            connect_args={"timeout": self.timeout_s, "check_same_thread": False},
+        )
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
 
-    def _beside(self, end: str) -> Path:
-        return Path(f"{self.file}{end}")
-
-    def set_aside(self, why: str, *, only_own: bool = False) -> Path:
-        """Rename the file and what SQLite keeps beside it; return the new name."""
-        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        kept = self._beside(f".{why}-{stamp}")
-        for end in _COMPANIONS:
-            there = self._beside(end)
-            if (found := _identity(there)) is not None and (not only_own or found == self._companions.get(end)):
-                there.rename(kept.with_name(kept.name + end))
-        return kept
-
-    async def _disconnect(self) -> None:
-        engine, self._engine = self._engine, None
-        if engine is not None:
-            await engine.dispose()
-
-    def _make_engine(self) -> AsyncEngine:
-        if self.is_sqlite:
-            url = self._url.set(drivername="sqlite+aiosqlite")
-            if self.file is not None:
-                # A file that was deleted must not come back empty with the next reader.
-                url = url.set(database=f"file:{quote(str(self.file))}", query={"mode": "rw", "uri": "true"})
-            engine = create_async_engine(url, connect_args={"timeout": self.timeout_s})
-            event.listen(engine.sync_engine, "connect", _prepare_sqlite)
-            event.listen(engine.sync_engine, "begin", _begin_sqlite)
-            return engine
+    def _new_postgresql(self) -> Engine:
         try:
-            return create_async_engine(
+            engine = create_engine(
                 self._url.set(drivername="postgresql+psycopg"),
                 pool_pre_ping=True,
                 pool_timeout=self.timeout_s,
-                connect_args={
-                    "connect_timeout": max(2, round(self.timeout_s)),
-                    "application_name": "rotorwatch",
-                    "keepalives_idle": 10,
-                    "keepalives_interval": 5,
-                    "keepalives_count": 3,
-                },
+                connect_args=_POSTGRESQL | {"connect_timeout": max(2, round(self.timeout_s))},
             )
         except ImportError as error:
             raise StoreError(f"{self.shown}: PostgreSQL needs psycopg: pip install 'rotorwatch[postgres]'") from error
 
+        @event.listens_for(engine, "connect")
+        def limit(connection: Any, record: object) -> None:
+            _ = record
+            # The server ends by itself what `_break_off` has turned away from.
+            connection.execute(f"SET statement_timeout = {round(1000 * self.answer_s)}")
+            connection.commit()
 
-def _identity(file: Path) -> tuple[int, int] | None:
-    """What a file is known by, whatever its name; None if there is none."""
-    try:
-        found = file.stat()
-    except FileNotFoundError:
-        return None
-    return found.st_dev, found.st_ino
+        return engine
 
+    def _watch(self) -> None:
+        with self._changed:
+            while self._engine is not None or self._uses:
+                for use in self._uses:
+                    if use.driver is not None and use.until_s < time.monotonic():
+                        use.broken_off = "the history was closed" if self._engine is None else "no answer in time"
+                        with suppress(Exception):  # it has come to an end by itself
+                            self._break_off(use.driver)
+                self._changed.wait(_WATCH_S)
 
-def _make_file(file: Path) -> None:
-    """Make a file, if there is none, for its owner alone: it holds hashes of secrets."""
-    os.close(os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600))
-
-
-def _is_damage(error: Exception) -> bool:
-    code = getattr(error.orig if isinstance(error, DBAPIError) else error, "sqlite_errorcode", None)
-    return isinstance(error, DamagedError) or (isinstance(code, int) and code & 0xFF in _DAMAGE)
+    def _break_off(self, driver: Any) -> None:
+        if self.is_sqlite:
+            driver.interrupt()
+            return
+        # Not an order to cancel, to which a server that hangs does not listen.
+        with socket.socket(fileno=os.dup(driver.fileno())) as line:
+            line.shutdown(socket.SHUT_RDWR)
 
 
 def _checked(url: str) -> URL:
@@ -422,11 +415,9 @@ def _checked(url: str) -> URL:
 def _prepare_sqlite(connection: Any, record: object) -> None:
     _ = record
     connection.isolation_level = None  # the transactions below, not those that the driver would begin
-    cursor = connection.cursor()
     # A compressed report is somewhat longer than half of SQLite's usual page, of which the rest would stay empty.
     for setting in ("page_size = 8192", "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
-        cursor.execute(f"PRAGMA {setting}")
-    cursor.close()
+        connection.execute(f"PRAGMA {setting}")
 
 
 def _begin_sqlite(connection: Connection) -> None:

@@ -1,20 +1,20 @@
 """Writes what several machines brought in one transaction."""
 
-from collections import ChainMap
-from collections.abc import MutableMapping, Sequence
-from dataclasses import asdict, dataclass, field
+import math
+from collections import ChainMap, defaultdict
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
-from sqlalchemy import delete, insert, or_, select, update
-from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy import Connection, Table, case, delete, insert, or_, select, update
 
-from service.store.backlog import Backlog, Bundle
+from service.store.claim import Bundle, Claim
 from service.store.database import Database
 from service.store.errors import StoreError
-from service.store.filling import fill
 from service.store.records import StoredEvent
 from service.store.tables import (
     alarm_events,
+    buckets,
     checkpoint_hops,
     checkpoints,
     evaluations,
@@ -24,70 +24,22 @@ from service.store.tables import (
     series,
 )
 
-__all__ = ["Claim", "SeriesNumbers", "write_group"]
+__all__ = ["SeriesNumbers", "write_group"]
 
 SeriesNumbers = dict[tuple[int, str, str], int]
-_Row = dict[str, Any]
+_ADDED = ("count", "total", "errors", "errors_total")
+_GREATEST = ("recorded_ns", "maximum")
+_Rows = defaultdict[Table, list[dict[str, Any]]]
 
 
-@dataclass(slots=True, eq=False)
-class Claim:
-    """The right to write one machine, and what is to be written.
-
-    Attributes
-    ----------
-    machine_id, title : int, str
-        Number in the database, and ``site/name``.
-    owner : str
-        Mark of this monitor in the database.
-    backlog : Backlog
-        What is to be written.
-    steps : int
-        Number of the latest attempt that is known to be in the database.
-    locked : bool
-        Whether the lock in PostgreSQL is held, as far as is known.
-    lost : StoreError or None
-        Why this monitor must not write the machine any more.
-    trouble : str
-        Why the database, which works, does not take what waits; empty if it does.
-    retry_s : float
-        When that is tried again, by the clock of the history's loop.
-    generation : int
-        Goes up when the history goes on in another file, which may lack what was written before.
-    """
-
-    machine_id: int
-    title: str
-    owner: str
-    backlog: Backlog
-    steps: int
-    locked: bool = True
-    lost: StoreError | None = None
-    trouble: str = ""
-    retry_s: float = 0.0
-    generation: int = 0
-
-
-@dataclass(slots=True)
-class _Rows:
-    """Rows of all machines, table by table."""
-
-    events: list[_Row] = field(default_factory=list)
-    reports: list[_Row] = field(default_factory=list)
-    evaluations: list[_Row] = field(default_factory=list)
-    readings: list[_Row] = field(default_factory=list)
-    in_buckets: list[tuple[int, int, int, float, float | None]] = field(default_factory=list)
-
-
-async def write_group(
-    database: Database, connection: AsyncConnection, claims: Sequence[Claim], known: SeriesNumbers, bucket_ns: int
+def write_group(
+    database: Database, connection: Connection, claims: Sequence[Claim], known: SeriesNumbers, bucket_ns: int
 ) -> tuple[dict[Claim, StoreError], SeriesNumbers]:
     """Write the attempts of several machines within the connection's transaction.
 
     Parameters
     ----------
-    database : Database
-    connection : AsyncConnection
+    database, connection : Database, Connection
         Within a transaction.
     claims : sequence of Claim
         Each with an attempt.
@@ -103,150 +55,152 @@ async def write_group(
         committed.
     """
     query = select(machines).where(machines.c.machine_id.in_([claim.machine_id for claim in claims])).with_for_update()
-    found = {row.machine_id: row for row in await connection.execute(query)}
+    found = {row.machine_id: row for row in connection.execute(query)}
     refused: dict[Claim, StoreError] = {}
     new_series: SeriesNumbers = {}
-    rows = _Rows()
+    rows = _Rows(list)
     for claim in claims:
-        bundle, machine = claim.backlog.attempt, found.get(claim.machine_id)
+        bundle, machine = claim.attempt, found.get(claim.machine_id)
         if bundle is None:
             continue
         if machine is None or machine.owner != claim.owner:
             refused[claim] = claim.lost = StoreError(f"another monitor has taken over the history of {claim.title}")
             continue
-        if machine.steps > claim.steps:
+        if machine.steps > claim.written:
             continue  # the former attempt did reach the database, only its answer was lost
-        events, error = await _new_events(connection, claim, bundle.events)
-        if error is not None:
+        try:
+            events = _new_events(connection, claim, bundle.events)
+        except StoreError as error:
             refused[claim] = error
             continue
+        of = {"machine_id": claim.machine_id}
+        rows[alarm_events] += [of | asdict(event) for event in events]
+        rows[reports] += [
+            of | asdict(report) | {"number": number, "recorded_ns": recorded_ns, "text": packed}
+            for number, (recorded_ns, report, packed) in enumerate(bundle.reports, machine.reports + 1)
+        ]
         numbers = ChainMap(new_series, known)
-        await _add_series(connection, claim.machine_id, bundle, numbers)
-        counted = _collect(rows, claim.machine_id, bundle, machine.reports, machine.evaluations, numbers)
-        rows.events.extend({"machine_id": claim.machine_id, **asdict(event)} for event in events)
-        await connection.execute(
-            update(machines).where(machines.c.machine_id == claim.machine_id).values(steps=claim.steps + 1, **counted)
-        )
-        await _write_checkpoint(connection, claim.machine_id, bundle)
-    for table, values in (
-        (alarm_events, rows.events),
-        (reports, rows.reports),
-        (evaluations, rows.evaluations),
-        (readings, rows.readings),
-    ):
+        _add_series(connection, claim.machine_id, bundle, numbers)
+        counted = {
+            "steps": claim.written + 1,
+            "reports": machine.reports + len(bundle.reports),
+            "evaluations": _add_readings(rows, of, bundle, machine.evaluations, numbers, bucket_ns),
+        }
+        connection.execute(update(machines).where(machines.c.machine_id == claim.machine_id).values(counted))
+        _write_checkpoint(connection, claim.machine_id, bundle)
+    in_buckets = rows.pop(buckets, [])
+    for table, values in rows.items():
         if values:
-            await connection.execute(insert(table), values)
-    await fill(database, connection, rows.in_buckets, bucket_ns)
+            connection.execute(insert(table), values)
+    if in_buckets:
+        _fill_buckets(database, connection, in_buckets)
     return refused, new_series
 
 
-async def _new_events(
-    connection: AsyncConnection, claim: Claim, events: Sequence[StoredEvent]
-) -> tuple[list[StoredEvent], StoreError | None]:
-    """Events that are not in the log yet, or why these cannot go in."""
+def _new_events(connection: Connection, claim: Claim, events: Sequence[StoredEvent]) -> list[StoredEvent]:
+    """Events that are not in the log yet; StoreError if these contradict it."""
     if not events:
-        return [], None
+        return []
     log = alarm_events.c
     new = {event.sequence: event for event in events}
     query = select(log.sequence, log.id).where(
         log.machine_id == claim.machine_id,
         or_(log.sequence >= min(new), log.id.in_([event.id for event in events])),
     )
-    for sequence, identifier in await connection.execute(query):
+    for sequence, identifier in connection.execute(query):
         event = new.pop(sequence, None)
         if event is not None and event.id != identifier:
-            return [], StoreError(
+            raise StoreError(
                 f"{claim.title}: alarm event {sequence} has the id {event.id}, but the history has it with the id "
                 f"{identifier}"
             )
         twin = next((each.sequence for each in new.values() if each.id == identifier), None)
         if twin is not None:
-            return [], StoreError(
+            raise StoreError(
                 f"{claim.title}: alarm event {twin} has the id {identifier}, which alarm event {sequence} has already"
             )
-    return list(new.values()), None
+    return list(new.values())
 
 
-async def _add_series(
-    connection: AsyncConnection, machine_id: int, bundle: Bundle, numbers: MutableMapping[tuple[int, str, str], int]
+def _add_series(
+    connection: Connection, machine_id: int, bundle: Bundle, numbers: MutableMapping[tuple[int, str, str], int]
 ) -> None:
+    """Look up the numbers of the bundle's series, and give numbers to new ones."""
     wanted = {(machine_id, reading.quantity, reading.name) for _, reading in bundle.readings}
     if wanted <= numbers.keys():
         return
     of_machine = select(series.c.quantity, series.c.name, series.c.series_id).where(series.c.machine_id == machine_id)
-    for quantity, name, series_id in await connection.execute(of_machine):
-        numbers[machine_id, quantity, name] = series_id
-    missing = sorted(wanted - numbers.keys())
-    if missing:
+    numbers.update({(machine_id, row.quantity, row.name): row.series_id for row in connection.execute(of_machine)})
+    if missing := sorted(wanted - numbers.keys()):
         rows = [{"machine_id": machine_id, "quantity": quantity, "name": name} for _, quantity, name in missing]
-        await connection.execute(insert(series), rows)
-        for quantity, name, series_id in await connection.execute(of_machine):
-            numbers[machine_id, quantity, name] = series_id
+        connection.execute(insert(series), rows)
+        numbers.update({(machine_id, row.quantity, row.name): row.series_id for row in connection.execute(of_machine)})
 
 
-def _collect(
+def _add_readings(
     rows: _Rows,
-    machine_id: int,
+    of: dict[str, int],
     bundle: Bundle,
-    n_reports: int,
-    n_evaluations: int,
-    numbers: MutableMapping[tuple[int, str, str], int],
-) -> dict[str, int]:
-    """Number reports and windows on from what the machine has, and return the new numbers."""
-    for packed in bundle.reports:
-        n_reports += 1
-        rows.reports.append(
-            {
-                "machine_id": machine_id,
-                "number": n_reports,
-                "start_ns": packed.report.start_ns,
-                "end_ns": packed.report.end_ns,
-                "recorded_ns": packed.recorded_ns,
-                "state": packed.report.state,
-                "filled": packed.report.filled,
-                "text": packed.text,
-            }
-        )
+    number: int,
+    numbers: Mapping[tuple[int, str, str], int],
+    bucket_ns: int,
+) -> int:
+    """Number windows on from what the machine has; return the last number."""
     window, seen = None, set[int]()
     for recorded_ns, reading in bundle.readings:
-        series_id = numbers[machine_id, reading.quantity, reading.name]
+        series_id = numbers[of["machine_id"], reading.quantity, reading.name]
+        value, error = reading.value, reading.standard_error
         if window != (recorded_ns, reading.end_ns) or series_id in seen:
             window, seen = (recorded_ns, reading.end_ns), set()
-            n_evaluations += 1
-            rows.evaluations.append(
-                {
-                    "machine_id": machine_id,
-                    "number": n_evaluations,
-                    "end_ns": reading.end_ns,
-                    "recorded_ns": recorded_ns,
-                }
-            )
+            number += 1
+            rows[evaluations].append(of | {"number": number, "end_ns": reading.end_ns, "recorded_ns": recorded_ns})
         seen.add(series_id)
-        rows.in_buckets.append((series_id, reading.end_ns, recorded_ns, reading.value, reading.standard_error))
-        rows.readings.append(
-            {
-                "machine_id": machine_id,
-                "number": n_evaluations,
-                "series_id": series_id,
-                "value": reading.value,
-                "standard_error": reading.standard_error,
-            }
-        )
-    return {"reports": n_reports, "evaluations": n_evaluations}
+        rows[readings].append(of | {"number": number, "series_id": series_id, "value": value, "standard_error": error})
+        if math.isfinite(value) and (error is None or math.isfinite(error)):  # what is infinite has no mean
+            start_ns = reading.end_ns // bucket_ns * bucket_ns
+            rows[buckets].append(
+                {
+                    "series_id": series_id, "start_ns": start_ns, "length_ns": bucket_ns, "recorded_ns": recorded_ns,
+                    "count": 1, "minimum": value, "maximum": value, "total": value,
+                    "errors": int(error is not None), "errors_total": error or 0.0,
+                }
+            )  # fmt: skip
+    return number
 
 
-async def _write_checkpoint(connection: AsyncConnection, machine_id: int, bundle: Bundle) -> None:
+def _fill_buckets(database: Database, connection: Connection, rows: list[dict[str, Any]]) -> None:
+    """Add readings to the buckets they lie in."""
+    merged: dict[tuple[int, int], dict[str, Any]] = {}
+    for row in rows:
+        there = merged.setdefault((row["series_id"], row["start_ns"]), row)
+        if there is not row:
+            there |= {name: there[name] + row[name] for name in _ADDED}
+            there |= {name: max(there[name], row[name]) for name in _GREATEST}
+            there["minimum"] = min(there["minimum"], row["minimum"])
+    made, stored = database.insert(buckets), buckets.c
+    new = made.excluded
+    added = made.on_conflict_do_update(
+        index_elements=[stored.series_id, stored.start_ns, stored.length_ns],
+        set_={name: stored[name] + new[name] for name in _ADDED}
+        | {name: case((new[name] > stored[name], new[name]), else_=stored[name]) for name in _GREATEST}
+        | {"minimum": case((new.minimum < stored.minimum, new.minimum), else_=stored.minimum)},
+    )
+    # In one order, whoever writes: two monitors on one server must not wait for each other.
+    connection.execute(added, [merged[place] for place in sorted(merged)])
+
+
+def _write_checkpoint(connection: Connection, machine_id: int, bundle: Bundle) -> None:
     if bundle.head is None:
         return
     values = asdict(bundle.head)
-    changed = await connection.execute(update(checkpoints).where(checkpoints.c.machine_id == machine_id).values(values))
+    changed = connection.execute(update(checkpoints).where(checkpoints.c.machine_id == machine_id).values(values))
     if changed.rowcount == 0:
-        await connection.execute(insert(checkpoints).values(machine_id=machine_id, **values))
+        connection.execute(insert(checkpoints).values(machine_id=machine_id, **values))
     hops = checkpoint_hops.c
-    there = await connection.scalars(select(hops.end_ns).where(hops.machine_id == machine_id))
+    there = connection.scalars(select(hops.end_ns).where(hops.machine_id == machine_id))
     gone = [end_ns for end_ns in there if end_ns not in bundle.keep or end_ns in bundle.new_hops]
     if gone:
-        await connection.execute(delete(checkpoint_hops).where(hops.machine_id == machine_id, hops.end_ns.in_(gone)))
+        connection.execute(delete(checkpoint_hops).where(hops.machine_id == machine_id, hops.end_ns.in_(gone)))
     new = [{"machine_id": machine_id, "end_ns": end, "moments": hop} for end, hop in bundle.new_hops.items()]
     if new:
-        await connection.execute(insert(checkpoint_hops), new)
+        connection.execute(insert(checkpoint_hops), new)

@@ -3,14 +3,14 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from sqlalchemy import Row, func, select
+from sqlalchemy import Connection, func, select
+from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import ColumnElement
 
 from service.store.alarm_log import EVENT
-from service.store.backlog import pack, unpack
+from service.store.claim import Claim, pack, unpack
 from service.store.database import Database
 from service.store.errors import StoreError
-from service.store.group import Claim
 from service.store.records import (
     Bucket,
     Checkpoint,
@@ -32,8 +32,8 @@ _HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
 class MachineStore:
     """The history of one machine, with the sole right to write it; from `Store.machine`.
 
-    `commit` is for the machine's own thread, everything else for any thread but the history's own. All that read raise
-    `StoreError` if the database fails; they see what is committed.
+    `commit` is for the machine's own thread, everything else for any. All that read raise `StoreError` if the database
+    fails; they see what is committed.
     """
 
     def __init__(self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int]) -> None:
@@ -41,7 +41,9 @@ class MachineStore:
         self._writer = writer
         self._claim = claim
         self._now_ns = now_ns
-        self._last_sequence = database.call(self._latest)
+        log = alarm_events.c
+        latest = select(func.max(log.sequence)).where(log.machine_id == claim.machine_id)
+        self._last_sequence: int = next((last for (last,) in database.rows(latest) if last is not None), -1)
 
     @property
     def title(self) -> str:
@@ -51,7 +53,7 @@ class MachineStore:
     @property
     def waiting(self) -> int:
         """Steps that are not in the database yet."""
-        return self._claim.backlog.steps
+        return self._claim.steps
 
     @property
     def trouble(self) -> str:
@@ -105,14 +107,21 @@ class MachineStore:
         packed = pack(self.title, step, recorded_ns)
         self._last_sequence = last
         try:
-            return self._database.call(self._writer.submit, self._claim, step, packed, recorded_ns)
+            return self._writer.submit(self._claim, step, packed, recorded_ns)
         except StoreError:
             self._last_sequence = before
             raise
 
     def restore(self) -> Checkpoint | None:
         """State of the monitor after the last committed step, or None if there is none."""
-        return self._database.call(self._restore)
+        hops, machine_id = checkpoint_hops.c, self._claim.machine_id
+        with self._database.reading() as connection:
+            head = connection.execute(select(*_HEAD).where(checkpoints.c.machine_id == machine_id)).one_or_none()
+            if head is None:
+                return None
+            query = select(hops.end_ns, hops.moments).where(hops.machine_id == machine_id).order_by(hops.end_ns)
+            rows = connection.execute(query).all()
+        return Checkpoint(CheckpointHead(*head), tuple((row.end_ns, row.moments) for row in rows))
 
     def events(
         self,
@@ -136,11 +145,9 @@ class MachineStore:
         since_ns, until_ns : int, optional
             Only those with since_ns ≤ time_ns < until_ns.
         alarm, kind, severity : str, optional
-            Only those of this alarm, kind, severity.
-        limit : int
-            At most this many.
-        newest_first : bool
-            Order, and thus which are returned if there are more.
+            Only those.
+        limit, newest_first : int, bool
+            At most so many, of the newest or the oldest.
         """
         log = alarm_events.c
         query = select(*EVENT).where(
@@ -154,12 +161,7 @@ class MachineStore:
             *_past(log.sequence, after, before),
         )
         query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
-
-        async def fetch() -> tuple[StoredEvent, ...]:
-            async with self._database.reading() as connection:
-                return tuple(StoredEvent(*row) for row in await connection.execute(query))
-
-        return self._database.call(fetch)
+        return tuple(StoredEvent(*row) for row in self._database.rows(query))
 
     def reports(
         self,
@@ -175,32 +177,16 @@ class MachineStore:
         ----------
         since_ns, until_ns : int, optional
             Only windows with since_ns ≤ end_ns < until_ns.
-        before : int, optional
-            Only reports with a smaller number: the last number of the page before.
-        limit : int
-            At most this many.
+        before, limit : int
+            At most so many reports with a smaller number: the last number of the page before.
         """
-        column = reports.c
-
-        async def fetch() -> Sequence[Row[*tuple[Any, ...]]]:
-            async with self._database.reading() as connection:
-                where = [column.machine_id == self._claim.machine_id, *_past(column.number, None, before)]
-                if since_ns is not None or until_ns is not None:
-                    within = _between(column.end_ns, since_ns, until_ns)
-                    bounds = select(func.min(column.number), func.max(column.number)).where(where[0], *within)
-                    first, last = (await connection.execute(bounds)).one()
-                    if first is None:
-                        return ()
-                    where += [*within, column.number >= first, column.number <= last]
-                query = select(column.number, column.start_ns, column.end_ns, column.state, column.filled, column.text)
-                query = query.where(*where).order_by(column.number.desc()).limit(_checked(limit))
-                return (await connection.execute(query)).all()
-
-        rows = self._database.call(fetch)
-        return tuple(
-            (row.number, StoredReport(row.start_ns, row.end_ns, row.state, row.filled, unpack(row.text)))
-            for row in rows
-        )
+        report = reports.c
+        query = select(report.number, report.start_ns, report.end_ns, report.state, report.filled, report.text)
+        with self._database.reading() as connection:
+            chosen = self._windows(connection, report, since_ns, until_ns)
+            query = query.where(*chosen, *_past(report.number, None, before)).order_by(report.number.desc())
+            rows = connection.execute(query.limit(_checked(limit))).all()
+        return tuple((row.number, StoredReport(*row[1:-1], unpack(row.text))) for row in rows)
 
     def readings(
         self,
@@ -216,48 +202,23 @@ class MachineStore:
 
         Parameters
         ----------
-        quantity, name : str
-            Of what.
         since_ns, until_ns : int, optional
             Only windows with since_ns ≤ end_ns < until_ns.
-        after : int, optional
-            Only windows with a greater number: the last number of the page before.
-        limit : int
-            At most this many.
+        after, limit : int
+            At most so many windows with a greater number: the last number of the page before.
         """
-        window = evaluations.c
-
-        async def fetch() -> tuple[tuple[int, StoredReading], ...]:
-            async with self._database.reading() as connection:
-                where = [window.machine_id == self._claim.machine_id, *_past(window.number, after, None)]
-                if since_ns is not None or until_ns is not None:
-                    within = _between(window.end_ns, since_ns, until_ns)
-                    bounds = select(func.min(window.number), func.max(window.number)).where(where[0], *within)
-                    first, last = (await connection.execute(bounds)).one()
-                    if first is None:
-                        return ()
-                    where += [*within, window.number >= first, window.number <= last]
-                series_id = await connection.scalar(
-                    select(series.c.series_id).where(
-                        series.c.machine_id == self._claim.machine_id,
-                        series.c.quantity == quantity,
-                        series.c.name == name,
-                    )
-                )
-                joined = evaluations.join(
-                    readings,
-                    (readings.c.machine_id == window.machine_id)
-                    & (readings.c.number == window.number)
-                    & (readings.c.series_id == series_id),
-                )
-                query = select(window.number, window.end_ns, readings.c.value, readings.c.standard_error)
-                query = query.select_from(joined).where(*where).order_by(window.number).limit(_checked(limit))
-                rows = (await connection.execute(query)).all()
-            return tuple(
-                (row.number, StoredReading(row.end_ns, quantity, name, row.value, row.standard_error)) for row in rows
-            )
-
-        return self._database.call(fetch)
+        window, reading, of = evaluations.c, readings.c, series.c
+        same = (reading.machine_id == window.machine_id) & (reading.number == window.number)
+        series_id = select(of.series_id).where(
+            of.machine_id == self._claim.machine_id, of.quantity == quantity, of.name == name
+        )
+        query = select(window.number, window.end_ns, reading.value, reading.standard_error)
+        query = query.join_from(evaluations, readings, same & (reading.series_id == series_id.scalar_subquery()))
+        with self._database.reading() as connection:
+            chosen = self._windows(connection, window, since_ns, until_ns)
+            query = query.where(*chosen, *_past(window.number, after, None)).order_by(window.number)
+            rows = connection.execute(query.limit(_checked(limit))).all()
+        return tuple((row[0], StoredReading(row[1], quantity, name, *row[2:])) for row in rows)
 
     def downsampled(
         self,
@@ -272,8 +233,6 @@ class MachineStore:
 
         Parameters
         ----------
-        quantity : str
-            Of what.
         names : sequence of str, optional
             Which; all if left out.
         since_ns, until_ns : int, optional
@@ -284,9 +243,8 @@ class MachineStore:
         points : int
             At most this many buckets for each name; those without a reading are left out.
         """
-        return self._database.call(
-            trend, self._database, self._claim.machine_id, quantity, names, since_ns, until_ns, _checked(points)
-        )
+        with self._database.reading() as connection:
+            return trend(connection, self._claim.machine_id, quantity, names, since_ns, until_ns, _checked(points))
 
     def _follow(self, events: Sequence[StoredEvent]) -> int:
         """The last sequence after these events."""
@@ -300,22 +258,19 @@ class MachineStore:
             raise StoreError(f"{self.title}: two alarm events of one step have the same id: {identifiers}")
         return last
 
-    async def _latest(self) -> int:
-        query = select(func.max(alarm_events.c.sequence)).where(alarm_events.c.machine_id == self._claim.machine_id)
-        async with self._database.reading() as connection:
-            latest: int | None = await connection.scalar(query)
-        return -1 if latest is None else latest
-
-    async def _restore(self) -> Checkpoint | None:
-        hops = checkpoint_hops.c
-        async with self._database.reading() as connection:
-            of_machine = checkpoints.c.machine_id == self._claim.machine_id
-            head = (await connection.execute(select(*_HEAD).where(of_machine))).one_or_none()
-            if head is None:
-                return None
-            query = select(hops.end_ns, hops.moments).where(hops.machine_id == self._claim.machine_id)
-            rows = (await connection.execute(query.order_by(hops.end_ns))).all()
-        return Checkpoint(CheckpointHead(*head), tuple((row.end_ns, row.moments) for row in rows))
+    def _windows(
+        self,
+        connection: Connection,
+        column: ReadOnlyColumnCollection[str, Any],
+        since_ns: int | None,
+        until_ns: int | None,
+    ) -> list[ColumnElement[bool]]:
+        """Conditions on windows; if time is asked for, on their numbers too, along which pages are read."""
+        chosen = [column.machine_id == self._claim.machine_id, *_between(column.end_ns, since_ns, until_ns)]
+        if since_ns is None and until_ns is None:
+            return chosen
+        bounds = connection.execute(select(func.min(column.number), func.max(column.number)).where(*chosen)).one()
+        return [*chosen, column.number.between(*bounds)]
 
 
 def _between(column: ColumnElement[int], since_ns: int | None, until_ns: int | None) -> list[ColumnElement[bool]]:

@@ -23,24 +23,10 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class StoredEvent:
-    """One entry in the log of alarms of a machine.
+    """One entry in the log of alarms of a machine: what happened to which alarm, and the alarm's state after it.
 
-    Attributes
-    ----------
-    sequence : int
-        0, 1, 2, … per machine, without a gap, across restarts.
-    id : str
-        Unique within the machine.
-    time_ns, recorded_ns : int
-        When it happened, in data time, and when it was recorded.
-    kind, alarm, severity, state : str
-        What happened to which alarm, and the alarm's state after it.
-    occurrence : int
-        Number of the alarm's occurrence.
-    actor : str
-        Who did it; empty if the monitor itself.
-    text : str
-        The CloudEvent, JSON, to the byte.
+    `sequence` is 0, 1, 2, … per machine, without a gap, across restarts; `id` is unique within the machine; `actor` is
+    empty if it was the monitor itself; `text` is the CloudEvent, JSON, to the byte.
     """
 
     sequence: int
@@ -69,20 +55,9 @@ class StoredReport:
 
 @dataclass(frozen=True, slots=True)
 class StoredReading:
-    """One number of one window.
+    """One number of the window that ended at `end_ns`; neither value nor standard error is ever NaN.
 
-    Attributes
-    ----------
-    end_ns : int
-        End of the window.
-    quantity : str
-        ``parameter``, ``equation`` or ``misfit``.
-    name : str
-        Which parameter or equation.
-    value : float
-        Never NaN.
-    standard_error : float or None
-        None if there is none; never NaN.
+    `quantity` is ``parameter``, ``equation``, ``misfit`` or ``speed``, `name` says which one.
     """
 
     end_ns: int
@@ -96,20 +71,8 @@ class StoredReading:
 class CheckpointHead:
     """State of a monitor after a step, all but the ring of hops.
 
-    Attributes
-    ----------
-    format : int
-        Number of the format of `state`.
-    bundle : str or None
-        Bundle the monitor ran with.
-    machine_hash, code_version : str
-        What the state belongs to.
-    end_ns, recorded_ns : int
-        End of the newest data in it, and when it was recorded.
-    alarms : str
-        State of the alarms, JSON.
-    state : bytes
-        Everything else.
+    `format` is that of `state`; `bundle`, `machine_hash` and `code_version` are what it belongs to; `end_ns` is the end
+    of the newest data in it; `alarms` is the state of the alarms, JSON.
     """
 
     format: int
@@ -132,16 +95,9 @@ class Checkpoint:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointStep:
-    """How the checkpoint changes in a step.
+    """How the checkpoint changes in a step: a new head, new hops, and the ends of those that remain.
 
-    Attributes
-    ----------
-    head : CheckpointHead
-        Replaces the former one.
-    new_hops : tuple of (int, bytes)
-        Hops that the step completed, with the ends of their data.
-    keep : tuple of int
-        Ends of the hops that remain; all others are deleted. New hops remain whether they are named or not.
+    All other hops are deleted. New ones remain whether they are named or not.
     """
 
     head: CheckpointHead
@@ -161,20 +117,9 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Bucket:
-    """Readings of one quantity over a stretch of time.
+    """Readings of one quantity, of windows with start_ns ≤ end_ns < start_ns + length_ns.
 
-    Attributes
-    ----------
-    quantity, name : str
-        Of what.
-    start_ns, length_ns : int
-        Windows that end in start_ns ≤ end_ns < start_ns + length_ns.
-    count : int
-        How many readings.
-    minimum, mean, maximum : float
-        Of their values.
-    mean_standard_error : float or None
-        Of those that have one; None if none has.
+    `mean_standard_error` is that of the readings that have one; None if none has.
     """
 
     quantity: str
@@ -192,18 +137,8 @@ class Bucket:
 class AuditEntry:
     """Who asked for what over the API, and what came of it.
 
-    Attributes
-    ----------
-    number : int
-        Given by the database in the order of arrival; what is passed when an entry is appended is not looked at.
-    at_ns : int
-        When.
-    actor, address : str
-        Name of the token, and where the request came from.
-    method, path, status : str, str, int
-        The request and its answer.
-    action, machine, alarm, reason : str
-        What was meant by it; empty where it does not apply. `machine` is ``site/name``.
+    `number` is given by the database in the order of arrival; `actor` is the name of the token; `machine` is
+    ``site/name``, and empty, as `action`, `alarm` and `reason` are, where it does not apply.
     """
 
     number: int

@@ -28,6 +28,7 @@ def migrate(connection: Connection, revision: str = "head") -> None:
         connection.execute(
             text("SELECT pg_advisory_xact_lock(:high, :low)"), {"high": MIGRATING[0], "low": MIGRATING[1]}
         )
+        connection.execute(text("SET LOCAL statement_timeout = 0"))  # a large history may take minutes
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations").replace("%", "%%"))
     config.attributes["connection"] = connection

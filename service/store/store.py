@@ -1,13 +1,17 @@
-"""The history of all machines of one monitor: one database, one event loop in a thread of its own.
+"""The history of all machines of one monitor, in one database.
 
 ::
 
-    machines' threads --commit--> Writer --one transaction for all that wait--> SQLite or PostgreSQL
-    HTTP threads ------queries------------------------------------------------> (or, while it fails, memory)
-                                  Reduction: drops what is old
+    machines' threads --steps--> what waits, for each machine
+                                    |  the Writer's thread: all that waits in one transaction
+                                    v
+    whoever asks, in its own thread --> SQLite or PostgreSQL <-- the Reduction's thread drops what is old
+
+The way of a step: `MachineStore.commit` checks and packs it, `Writer.submit` adds it to what waits in the machine's
+`Claim`, the Writer's thread takes what there is of all machines, `write_group` makes rows of it, and
+whoever waits is told.
 """
 
-import asyncio
 import time
 from collections.abc import Callable
 
@@ -37,8 +41,6 @@ class Store:
     ----------
     url : str
         ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
-    retention : Retention
-        How long what is kept.
     timeout_s : float
         How long to wait for a connection, or for a lock of another program, in seconds; a transaction may take twice
         as long. Then steps wait in memory.
@@ -48,13 +50,6 @@ class Store:
         Reports of one machine that wait in memory meanwhile; of readings, twenty times as many.
     now_ns : callable
         The computer's time, nanoseconds since 1970 UTC.
-
-    Attributes
-    ----------
-    alarms : AlarmLog
-    tokens : TokenStore
-    audit : AuditLog
-    webhooks : WebhookCursors
 
     Raises
     ------
@@ -107,15 +102,11 @@ class Store:
 
     def unreachable(self) -> str:
         """Why the database takes no transaction now; empty if it does, also while nothing has to be written."""
-
-        async def ask() -> None:
-            async with asyncio.timeout(_PROBE_S), self._database.writing() as connection:
-                await connection.execute(text("SELECT 1"))
-
         if astray := self._database.astray():
             return astray
         try:
-            self._database.call(ask)
+            with self._database.writing(_PROBE_S) as connection:
+                connection.execute(text("SELECT 1"))
         except StoreError as error:
             return str(error)
         return ""
@@ -134,11 +125,11 @@ class Store:
             If the database cannot be reached or used.
         """
         self._database.start(set_aside)
-        self._database.call(self._writer.start)
-        self._database.call(self._reduction.start)
+        self._writer.start()
+        self._reduction.start()
 
     def close(self) -> None:
-        """Write what waits, if the database takes it, let go of all machines and end the thread.
+        """Write what waits, if the database takes it, let go of all machines and disconnect.
 
         Raises
         ------
@@ -148,8 +139,8 @@ class Store:
         if not self._database.is_open:
             return
         try:
-            self._database.call(self._reduction.stop)
-            self._database.call(self._writer.stop)
+            self._reduction.stop()
+            self._writer.stop()
         finally:
             self._database.stop()
 
@@ -161,8 +152,7 @@ class Store:
         StoreError
             If another monitor writes it, or the database fails.
         """
-        claim = self._database.call(self._writer.claim, site, name)
-        return MachineStore(self._database, self._writer, claim, self._now_ns)
+        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns)
 
     def retain(self, now_ns: int) -> Dropped:
         """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.
@@ -172,4 +162,4 @@ class Store:
         StoreError
             If the database fails.
         """
-        return self._database.call(self._reduction.run, now_ns)
+        return self._reduction.run(now_ns)

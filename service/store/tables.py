@@ -10,39 +10,21 @@
     tokens    audit_log    webhook_cursors
 """
 
-from sqlalchemy import (
-    BigInteger,
-    Column,
-    Double,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    PrimaryKeyConstraint,
-    Table,
-    Text,
-    UniqueConstraint,
-    text,
-)
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy import BigInteger, Double, Integer, LargeBinary, Text
+from sqlalchemy.types import TypeEngine
 
 __all__ = [
-    "alarm_events",
-    "audit_log",
-    "buckets",
-    "checkpoint_hops",
-    "checkpoints",
-    "evaluations",
-    "machines",
-    "metadata",
-    "readings",
-    "reports",
-    "series",
-    "tokens",
-    "webhook_cursors",
-]
+    "REVISION", "alarm_events", "audit_log", "buckets", "checkpoint_hops", "checkpoints", "evaluations", "machines",
+    "metadata", "readings", "reports", "series", "tokens", "webhook_cursors",
+]  # fmt: skip
 
-metadata = MetaData(
+REVISION = "0002"
+"""The migration that ends with these tables."""
+
+metadata = sa.MetaData(
     naming_convention={
         "pk": "%(table_name)s_pk",
         "fk": "%(table_name)s_%(column_0_name)s_fk",
@@ -52,173 +34,148 @@ metadata = MetaData(
 )
 
 
-def _machine_id() -> Column[int]:
-    return Column("machine_id", Integer, ForeignKey("machines.machine_id"), nullable=False)
+def _filled(kind: type[TypeEngine[Any]], *names: str) -> tuple[sa.Column[Any], ...]:
+    """Columns that are never empty."""
+    return tuple(sa.Column(name, kind, nullable=False) for name in names)
 
 
-machines = Table(
+def _machine_id() -> sa.Column[int]:
+    return sa.Column("machine_id", Integer, sa.ForeignKey("machines.machine_id"), nullable=False)
+
+
+machines = sa.Table(
     "machines",
     metadata,
-    Column("machine_id", Integer, primary_key=True),
-    Column("site", Text, nullable=False),
-    Column("name", Text, nullable=False),
-    # Who may write: a monitor that finds another's mark here has been replaced.
-    Column("owner", Text, nullable=False),
+    sa.Column("machine_id", Integer, primary_key=True),
+    # Who may write: a monitor that finds another's mark in `owner` has been replaced.
+    *_filled(Text, "site", "name", "owner"),
     # How many there have been; a step that is sent twice is known by its number.
-    Column("steps", BigInteger, nullable=False),
-    Column("reports", BigInteger, nullable=False),
-    Column("evaluations", BigInteger, nullable=False),
-    UniqueConstraint("site", "name"),
+    *_filled(BigInteger, "steps", "reports", "evaluations"),
+    sa.UniqueConstraint("site", "name"),
 )
 
-alarm_events = Table(
+alarm_events = sa.Table(
     "alarm_events",
     metadata,
     _machine_id(),
-    Column("sequence", BigInteger, nullable=False),
-    Column("id", Text, nullable=False),
-    Column("time_ns", BigInteger, nullable=False),
-    Column("recorded_ns", BigInteger, nullable=False),
-    Column("kind", Text, nullable=False),
-    Column("alarm", Text, nullable=False),
-    Column("severity", Text, nullable=False),
-    Column("state", Text, nullable=False),
-    Column("occurrence", BigInteger, nullable=False),
-    Column("actor", Text, nullable=False),
-    Column("text", Text, nullable=False),
-    PrimaryKeyConstraint("machine_id", "sequence"),
-    UniqueConstraint("machine_id", "id"),
-    Index(None, "machine_id", "time_ns"),
+    *_filled(BigInteger, "sequence"),
+    *_filled(Text, "id"),
+    *_filled(BigInteger, "time_ns", "recorded_ns"),
+    *_filled(Text, "kind", "alarm", "severity", "state"),
+    *_filled(BigInteger, "occurrence"),
+    *_filled(Text, "actor", "text"),
+    sa.PrimaryKeyConstraint("machine_id", "sequence"),
+    sa.UniqueConstraint("machine_id", "id"),
+    sa.Index(None, "machine_id", "time_ns"),
 )
 
-reports = Table(
+reports = sa.Table(
     "reports",
     metadata,
     _machine_id(),
-    Column("number", BigInteger, nullable=False),
-    Column("start_ns", BigInteger, nullable=False),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("recorded_ns", BigInteger, nullable=False),
-    Column("state", Text, nullable=False),
-    Column("filled", Double, nullable=False),
-    Column("text", LargeBinary, nullable=False),
-    PrimaryKeyConstraint("machine_id", "number"),
-    Index(None, "machine_id", "end_ns"),
-    Index(None, "recorded_ns"),
+    *_filled(BigInteger, "number", "start_ns", "end_ns", "recorded_ns"),
+    *_filled(Text, "state"),
+    *_filled(Double, "filled"),
+    *_filled(LargeBinary, "text"),
+    sa.PrimaryKeyConstraint("machine_id", "number"),
+    sa.Index(None, "machine_id", "end_ns"),
+    sa.Index(None, "recorded_ns"),
 )
 
-evaluations = Table(
+evaluations = sa.Table(
     "evaluations",
     metadata,
     _machine_id(),
-    Column("number", BigInteger, nullable=False),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("recorded_ns", BigInteger, nullable=False),
-    PrimaryKeyConstraint("machine_id", "number"),
-    Index(None, "machine_id", "end_ns"),
-    Index(None, "recorded_ns"),
+    *_filled(BigInteger, "number", "end_ns", "recorded_ns"),
+    sa.PrimaryKeyConstraint("machine_id", "number"),
+    sa.Index(None, "machine_id", "end_ns"),
+    sa.Index(None, "recorded_ns"),
     sqlite_with_rowid=False,
 )
 
-series = Table(
+series = sa.Table(
     "series",
     metadata,
-    Column("series_id", Integer, primary_key=True),
+    sa.Column("series_id", Integer, primary_key=True),
     _machine_id(),
-    Column("quantity", Text, nullable=False),
-    Column("name", Text, nullable=False),
+    *_filled(Text, "quantity", "name"),
     # End of the latest window whose reading has been dropped, so that only buckets know of it; -1 if there is none.
-    Column("dropped_ns", BigInteger, nullable=False, server_default=text("-1")),
-    UniqueConstraint("machine_id", "quantity", "name"),
+    sa.Column("dropped_ns", BigInteger, nullable=False, server_default=sa.text("-1")),
+    sa.UniqueConstraint("machine_id", "quantity", "name"),
 )
 
 # The greatest number of rows by far: nothing but the numbers, in the order in which they come.
-readings = Table(
+readings = sa.Table(
     "readings",
     metadata,
-    Column("machine_id", Integer, nullable=False),
-    Column("number", BigInteger, nullable=False),
-    Column("series_id", Integer, nullable=False),
-    Column("value", Double, nullable=False),
-    Column("standard_error", Double, nullable=True),
-    PrimaryKeyConstraint("machine_id", "number", "series_id"),
+    *_filled(Integer, "machine_id"),
+    *_filled(BigInteger, "number"),
+    *_filled(Integer, "series_id"),
+    *_filled(Double, "value"),
+    sa.Column("standard_error", Double, nullable=True),
+    sa.PrimaryKeyConstraint("machine_id", "number", "series_id"),
     sqlite_with_rowid=False,
 )
 
-buckets = Table(
+buckets = sa.Table(
     "buckets",
     metadata,
-    Column("series_id", Integer, ForeignKey("series.series_id"), nullable=False),
-    Column("start_ns", BigInteger, nullable=False),
-    Column("length_ns", BigInteger, nullable=False),
-    Column("recorded_ns", BigInteger, nullable=False),
-    Column("count", BigInteger, nullable=False),
-    Column("minimum", Double, nullable=False),
-    Column("maximum", Double, nullable=False),
-    Column("total", Double, nullable=False),
-    Column("errors", BigInteger, nullable=False),
-    Column("errors_total", Double, nullable=False),
-    PrimaryKeyConstraint("series_id", "start_ns", "length_ns"),
-    Index(None, "recorded_ns"),
+    sa.Column("series_id", Integer, sa.ForeignKey("series.series_id"), nullable=False),
+    *_filled(BigInteger, "start_ns", "length_ns", "recorded_ns", "count"),
+    *_filled(Double, "minimum", "maximum", "total"),
+    *_filled(BigInteger, "errors"),
+    *_filled(Double, "errors_total"),
+    sa.PrimaryKeyConstraint("series_id", "start_ns", "length_ns"),
+    sa.Index(None, "recorded_ns"),
     sqlite_with_rowid=False,
 )
 
-checkpoints = Table(
+checkpoints = sa.Table(
     "checkpoints",
     metadata,
-    Column("machine_id", Integer, ForeignKey("machines.machine_id"), primary_key=True, autoincrement=False),
-    Column("format", Integer, nullable=False),
-    Column("bundle", Text, nullable=True),
-    Column("machine_hash", Text, nullable=False),
-    Column("code_version", Text, nullable=False),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("recorded_ns", BigInteger, nullable=False),
-    Column("alarms", Text, nullable=False),
-    Column("state", LargeBinary, nullable=False),
+    sa.Column("machine_id", Integer, sa.ForeignKey("machines.machine_id"), primary_key=True, autoincrement=False),
+    *_filled(Integer, "format"),
+    sa.Column("bundle", Text, nullable=True),
+    *_filled(Text, "machine_hash", "code_version"),
+    *_filled(BigInteger, "end_ns", "recorded_ns"),
+    *_filled(Text, "alarms"),
+    *_filled(LargeBinary, "state"),
 )
 
-checkpoint_hops = Table(
+checkpoint_hops = sa.Table(
     "checkpoint_hops",
     metadata,
     _machine_id(),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("moments", LargeBinary, nullable=False),
-    PrimaryKeyConstraint("machine_id", "end_ns"),
+    *_filled(BigInteger, "end_ns"),
+    *_filled(LargeBinary, "moments"),
+    sa.PrimaryKeyConstraint("machine_id", "end_ns"),
 )
 
-tokens = Table(
+tokens = sa.Table(
     "tokens",
     metadata,
-    Column("token_id", Text, primary_key=True),
-    Column("name", Text, nullable=False),
-    Column("scopes", Text, nullable=False),
-    Column("secret_hash", LargeBinary, nullable=False),
-    Column("created_ns", BigInteger, nullable=False),
-    Column("expires_ns", BigInteger, nullable=True),
-    Column("revoked_ns", BigInteger, nullable=True),
+    sa.Column("token_id", Text, primary_key=True),
+    *_filled(Text, "name", "scopes"),
+    *_filled(LargeBinary, "secret_hash"),
+    *_filled(BigInteger, "created_ns"),
+    sa.Column("expires_ns", BigInteger, nullable=True),
+    sa.Column("revoked_ns", BigInteger, nullable=True),
 )
 
-audit_log = Table(
+audit_log = sa.Table(
     "audit_log",
     metadata,
-    Column("number", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
-    Column("at_ns", BigInteger, nullable=False),
-    Column("actor", Text, nullable=False),
-    Column("address", Text, nullable=False),
-    Column("method", Text, nullable=False),
-    Column("path", Text, nullable=False),
-    Column("status", Integer, nullable=False),
-    Column("action", Text, nullable=False),
-    Column("machine", Text, nullable=False),
-    Column("alarm", Text, nullable=False),
-    Column("reason", Text, nullable=False),
+    sa.Column("number", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    *_filled(BigInteger, "at_ns"),
+    *_filled(Text, "actor", "address", "method", "path"),
+    *_filled(Integer, "status"),
+    *_filled(Text, "action", "machine", "alarm", "reason"),
 )
 
-webhook_cursors = Table(
+webhook_cursors = sa.Table(
     "webhook_cursors",
     metadata,
-    Column("name", Text, nullable=False),
-    Column("machine_key", Text, nullable=False),
-    Column("sequence", BigInteger, nullable=False),
-    PrimaryKeyConstraint("name", "machine_key"),
+    *_filled(Text, "name", "machine_key"),
+    *_filled(BigInteger, "sequence"),
+    sa.PrimaryKeyConstraint("name", "machine_key"),
 )

@@ -1,5 +1,7 @@
 """Tokens of access: their hashes, never their secrets."""
 
+from typing import Any
+
 from sqlalchemy import insert, select, update
 
 from service.store.database import Database
@@ -30,55 +32,28 @@ class TokenStore:
             raise StoreError(f"token {record.token_id}: scopes are {record.scopes}, expected words without blanks")
         values = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
         values["scopes"] = " ".join(record.scopes)
-
-        async def write() -> None:
-            async with self._database.writing() as connection:
-                there = select(tokens.c.token_id).where(tokens.c.token_id == record.token_id)
-                if await connection.scalar(there) is not None:
-                    raise StoreError(f"token {record.token_id}: there is one with this identifier already")
-                await connection.execute(insert(tokens).values(values))
-
-        self._database.call(write)
+        with self._database.writing() as connection:
+            there = select(tokens.c.token_id).where(tokens.c.token_id == record.token_id)
+            if connection.scalar(there) is not None:
+                raise StoreError(f"token {record.token_id}: there is one with this identifier already")
+            connection.execute(insert(tokens).values(values))
 
     def find(self, token_id: str) -> TokenRecord | None:
         """One token, revoked and expired ones included."""
-        found = self._select(token_id)
-        return found[0] if found else None
+        rows = self._database.rows(select(*_COLUMNS).where(tokens.c.token_id == token_id))
+        return _record(*rows[0]) if rows else None
 
     def all(self) -> tuple[TokenRecord, ...]:
         """Every token, oldest first."""
-        return self._select(None)
+        query = select(*_COLUMNS).order_by(tokens.c.created_ns, tokens.c.token_id)
+        return tuple(_record(*row) for row in self._database.rows(query))
 
     def revoke(self, token_id: str, at_ns: int) -> bool:
         """Revoke a token; False if there is none, or it is revoked already."""
+        chosen = (tokens.c.token_id == token_id, tokens.c.revoked_ns.is_(None))
+        with self._database.writing() as connection:
+            return connection.execute(update(tokens).where(*chosen).values(revoked_ns=at_ns)).rowcount > 0
 
-        async def write() -> bool:
-            async with self._database.writing() as connection:
-                chosen = (tokens.c.token_id == token_id, tokens.c.revoked_ns.is_(None))
-                done = await connection.execute(update(tokens).where(*chosen).values(revoked_ns=at_ns))
-                return done.rowcount > 0
 
-        return self._database.call(write)
-
-    def _select(self, token_id: str | None) -> tuple[TokenRecord, ...]:
-        query = select(*_COLUMNS).order_by(tokens.c.created_ns, tokens.c.token_id)
-        if token_id is not None:
-            query = query.where(tokens.c.token_id == token_id)
-
-        async def fetch() -> tuple[TokenRecord, ...]:
-            async with self._database.reading() as connection:
-                rows = (await connection.execute(query)).all()
-            return tuple(
-                TokenRecord(
-                    token_id=row.token_id,
-                    name=row.name,
-                    scopes=tuple(row.scopes.split()),
-                    secret_hash=row.secret_hash,
-                    created_ns=row.created_ns,
-                    expires_ns=row.expires_ns,
-                    revoked_ns=row.revoked_ns,
-                )
-                for row in rows
-            )
-
-        return self._database.call(fetch)
+def _record(token_id: str, name: str, scopes: str, *rest: Any) -> TokenRecord:
+    return TokenRecord(token_id, name, tuple(scopes.split()), *rest)

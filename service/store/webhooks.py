@@ -21,21 +21,11 @@ class WebhookCursors:
         """Sequence of the event that is to be delivered next; -1 if none was ever set."""
         column = webhook_cursors.c
         query = select(column.sequence).where(column.name == name, column.machine_key == machine_key)
-
-        async def fetch() -> int:
-            async with self._database.reading() as connection:
-                found: int | None = await connection.scalar(query)
-            return -1 if found is None else found
-
-        return self._database.call(fetch)
+        return next((sequence for (sequence,) in self._database.rows(query)), -1)
 
     def set(self, name: str, machine_key: str, sequence: int) -> None:
         """Note the sequence of the event that is to be delivered next."""
         made = self._database.insert(webhook_cursors).values(name=name, machine_key=machine_key, sequence=sequence)
         made = made.on_conflict_do_update(index_elements=["name", "machine_key"], set_={"sequence": sequence})
-
-        async def write() -> None:
-            async with self._database.writing() as connection:
-                await connection.execute(made)
-
-        self._database.call(write)
+        with self._database.writing() as connection:
+            connection.execute(made)

@@ -1,26 +1,27 @@
 """Commits what the machines bring, as many at a time as wait, and tries again while the database fails."""
 
-import asyncio
-import fcntl
 import os
 import secrets
-from contextlib import ExitStack, suppress
-from pathlib import Path
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
+from contextlib import ExitStack, contextmanager, suppress
 
 import structlog
-from sqlalchemy import select, text, update
+from sqlalchemy import Connection, select, text, update
 from sqlalchemy.exc import DBAPIError, InterfaceError, InternalError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
-from sqlalchemy.ext.asyncio import AsyncConnection
 
-from service.store.backlog import Backlog, PackedReport
+from service.store.claim import Claim, PackedReport
 from service.store.database import Database
 from service.store.errors import StoreError
-from service.store.group import Claim, SeriesNumbers, write_group
+from service.store.file import lock_file
+from service.store.group import SeriesNumbers, write_group
 from service.store.records import Step
 from service.store.tables import machines
 
-__all__ = ["Writer", "lock_file"]
+__all__ = ["Writer"]
 
 _LOCK = 0x726F746F  # first number of PostgreSQL's advisory locks; the second is the machine's
 _LOOK_S = 2.0  # between looks whether the database is still where it should be
@@ -29,15 +30,13 @@ _log = structlog.get_logger("rotorwatch", part="history")
 
 
 class Writer:
-    """One connection, over which all machines of this monitor are written.
+    """One thread and one connection, over which all machines of this monitor are written.
 
     In PostgreSQL the same connection holds the locks on the machines, so that they are let go when it breaks; then
     the mark of the owner in the table says whether another monitor has come in between.
 
     Parameters
     ----------
-    database : Database
-        Where to.
     retry_s : float
         Time between attempts while the database fails, in seconds.
     most_reports : int
@@ -51,21 +50,22 @@ class Writer:
         self._retry_s = retry_s
         self._most_reports = most_reports
         self._bucket_ns = bucket_ns
-        self._claims: dict[int, Claim] = {}
+        self._claims: list[Claim] = []
         self._files = ExitStack()
         self._series: SeriesNumbers = {}
-        self._connection: AsyncConnection | None = None
-        self._turn = asyncio.Lock()
-        self._wake = asyncio.Event()
-        self._stopping = asyncio.Event()
-        self._task: asyncio.Task[None] | None = None
+        self._connection: Connection | None = None
+        self._turn = threading.Lock()  # on the connection; taken first where both are
+        self._lock = threading.Lock()  # on what waits and on what is said of it; never held while the database works
+        self._wake = threading.Event()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="history-writer", daemon=True)
         self.trouble = ""
 
-    async def start(self) -> None:
+    def start(self) -> None:
         """Begin to write what is submitted."""
-        self._task = asyncio.create_task(self._run())
+        self._thread.start()
 
-    async def stop(self) -> None:
+    def stop(self) -> None:
         """Write what waits, if the database takes it, and let go of all machines.
 
         Raises
@@ -73,23 +73,22 @@ class Writer:
         StoreError
             Saying what is lost, if the database does not take it.
         """
-        self._stopping.set()
+        with self._lock:
+            self._stopping.set()  # whoever has submitted a step before has submitted it in time
         self._wake.set()
-        if self._task is not None:
-            await self._task
-        await self._disconnect()
+        self._thread.join(self._database.answer_s)
+        if not self._thread.is_alive():
+            self._disconnect()
         self._files.close()
-        claims = list(self._claims.values())
-        self._claims.clear()
         lost = [
-            f"{claim.title}: {claim.backlog.contents()} ({self.trouble or claim.trouble})"
-            for claim in claims
-            if claim.backlog.steps
+            f"{claim.title}: {claim.contents()} ({self.trouble or claim.trouble})"
+            for claim in self._claims
+            if claim.steps
         ]
         if lost:
             raise StoreError(f"could not be written before the end, and is lost: {'; '.join(lost)}")
 
-    async def claim(self, site: str, name: str) -> Claim:
+    def claim(self, site: str, name: str) -> Claim:
         """Register a machine and take the right to write it.
 
         Raises
@@ -97,55 +96,15 @@ class Writer:
         StoreError
             If another monitor, or this one already, writes it.
         """
-        async with self._turn, self._database.alone():
-            try:
-                return await self._claim(await self._connected(), site, name)
-            except (SQLAlchemyError, OSError):
-                await self._disconnect(broken=True)
-                raise
-
-    async def _claim(self, connection: AsyncConnection, site: str, name: str) -> Claim:
-        machine_id, owner, steps = await self._take(connection, site, name)
-        backlog = Backlog(self._most_reports)
-        claim = Claim(machine_id, f"{site}/{name}", owner, backlog, steps, generation=self._database.generation)
-        self._claims[machine_id] = claim
+        claim = Claim(site, name, self._most_reports)
+        with self._database.plainly(), self._connected() as connection:
+            if any(other.title == claim.title for other in self._claims):
+                raise _taken(claim)
+            self._take(connection, claim)
+            self._claims.append(claim)
         return claim
 
-    async def _take(self, connection: AsyncConnection, site: str, name: str) -> tuple[int, str, int]:
-        """Take the right to write a machine: its number, the mark left in the database, steps written so far."""
-        machine_id = await self._register(connection, site, name)
-        taken = StoreError(f"another monitor writes the history of {site}/{name}")
-        if machine_id in self._claims:
-            raise taken
-        owner = secrets.token_hex(16)
-        chosen = machines.c.machine_id == machine_id
-        with ExitStack() as undo:
-            if self._database.file is not None:
-                descriptor = lock_file(self._database.file.with_name(f"{self._database.file.name}.{site}.{name}.lock"))
-                if descriptor is None:
-                    raise taken
-                undo.callback(os.close, descriptor)
-            elif not self._database.is_sqlite and not await _lock_row(connection, machine_id):
-                raise taken
-            async with connection.begin():
-                await connection.execute(update(machines).where(chosen).values(owner=owner))
-                steps: int | None = await connection.scalar(select(machines.c.steps).where(chosen))
-            self._files.push(undo.pop_all())
-        return machine_id, owner, steps or 0
-
-    async def _register(self, connection: AsyncConnection, site: str, name: str) -> int:
-        number = select(machines.c.machine_id).where(machines.c.site == site, machines.c.name == name)
-        new = {"site": site, "name": name, "owner": "", "steps": 0, "reports": 0, "evaluations": 0}
-        async with connection.begin():
-            found: int | None = await connection.scalar(number)
-            if found is not None:
-                return found
-            await connection.execute(self._database.insert(machines).values(new).on_conflict_do_nothing())
-        async with connection.begin():
-            made: int = (await connection.execute(number)).scalar_one()
-        return made
-
-    async def submit(self, claim: Claim, step: Step, packed: tuple[PackedReport, ...], recorded_ns: int) -> bool:
+    def submit(self, claim: Claim, step: Step, packed: Iterable[PackedReport], recorded_ns: int) -> bool:
         """Put a step behind those that wait and say whether it has become durable.
 
         Raises
@@ -153,178 +112,210 @@ class Writer:
         StoreError
             If it is refused for good.
         """
-        if claim.lost is not None:
-            raise claim.lost
-        if self._stopping.is_set():
-            raise StoreError("the history is closed")
-        claim.backlog.add(step, recorded_ns, packed)
-        if self.trouble or claim.trouble:
-            return False  # the machine's thread must not wait for a database that does not answer
-        heard: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
-        claim.backlog.waiting.heard.append(heard)
+        with self._lock:
+            if claim.lost is not None:
+                raise claim.lost
+            if self._stopping.is_set():
+                raise StoreError("the history is closed")
+            claim.add(step, recorded_ns, packed)
+            if self.trouble or claim.trouble:
+                return False  # the machine's thread must not wait for a database that does not answer
+            heard: Future[bool] = Future()
+            claim.waiting.heard.append(heard)
         self._wake.set()
         try:
-            return await asyncio.wait_for(heard, _PATIENCE * self._database.timeout_s)
-        except TimeoutError:
+            return heard.result(_PATIENCE * self._database.timeout_s)
+        except TimeoutError as error:
+            self._fail([claim], str(self._database.failure(error)))
             return False
 
-    async def _run(self) -> None:
-        while True:
-            troubled = any(claim.trouble for claim in self._claims.values())
-            with suppress(TimeoutError):
-                await asyncio.wait_for(self._wake.wait(), self._retry_s if troubled else _LOOK_S)
+    def _run(self) -> None:
+        stopping = False
+        while not stopping:
+            troubled = self.trouble or any(claim.trouble for claim in self._claims)
+            self._wake.wait(self._retry_s if troubled else _LOOK_S)
             self._wake.clear()
-            while await self._in_place() and (ready := [claim for claim in self._claims.values() if self._due(claim)]):
-                if await self._write(ready):
-                    continue
-                if self._stopping.is_set():
-                    return
-                if self.trouble:
-                    with suppress(TimeoutError):
-                        await asyncio.wait_for(self._stopping.wait(), self._retry_s)
-            if self._stopping.is_set():
-                return
+            stopping = self._stopping.is_set()
+            while self._in_place() and (ready := self._ready(stopping)) and self._write(ready):
+                pass  # until nothing waits any more, or something goes wrong
 
-    async def _in_place(self) -> bool:
-        """Whether the database is at its address; one that was deleted, replaced or damaged is begun anew."""
-        if not self._claims or not (why := self._database.astray()):
-            return True
-        claims = list(self._claims.values())
-        self._fail(claims, why)
+    def _ready(self, at_once: bool) -> list[Claim]:
+        """Machines of which something is to be written now; what the database did not take has to wait."""
+        now_s = time.monotonic()
+        with self._lock:
+            due = [claim for claim in self._claims if at_once or not claim.trouble or claim.retry_s <= now_s]
+            return [claim for claim in due if claim.take() is not None]
+
+    def _write(self, ready: list[Claim]) -> bool:
+        """Write one transaction; say whether the database has taken all of it."""
         try:
-            async with self._turn, self._database.alone():
-                await self._begin_anew(why, claims)
+            with self._connected() as connection, connection.begin():
+                refused, series = write_group(self._database, connection, ready, self._series, self._bucket_ns)
         except Exception as error:
-            # As in `_write`: this task must go on, and try again.
-            self._claims = {claim.machine_id: claim for claim in claims}
-            self._fail(claims, f"{why}; it could not be begun anew: {self._database.failure(error)}")
+            # Nothing narrower: whatever a driver raises, this thread must go on, or no machine would be written again.
+            why = str(self._database.failure(error))
+            if self._database.found_damaged(error) or _is_operational(error):
+                self._fail(ready, why)
+            elif len(ready) > 1:
+                # The database is well, one machine's step is not: the others shall not wait for it.
+                taken = [self._write([claim]) for claim in ready]
+                return all(taken)
+            else:
+                self._refuse(ready[0], why)
+            return False
+        self._series.update(series)
+        self._recover()
+        with self._lock:
+            for claim in ready:
+                self._settle(claim, refused.get(claim))
+        return True
+
+    def _settle(self, claim: Claim, refused: StoreError | None) -> None:
+        bundle, claim.attempt, claim.trouble = claim.attempt, None, ""
+        if bundle is None:
+            return
+        if refused is None:
+            claim.written += 1
+        elif not bundle.heard:
+            _log.error("a step was refused", why=str(refused))
+        bundle.settle(refused, written=True)
+
+    def _in_place(self) -> bool:
+        """Whether the database is at its address; one that was deleted, replaced or damaged is begun anew."""
+        why, generation = self._database.astray(), self._database.generation
+        if not self._claims or not (why or any(claim.generation != generation for claim in self._claims)):
+            return True
+        self._fail(self._claims, why or self.trouble)
+        try:
+            if why:
+                with self._turn, self._database.alone():
+                    self._database.begin_anew(why, self._connection)
+                    self._disconnect(broken=True)
+                self._series.clear()
+                self._files.close()
+            with self._connected() as connection:
+                for claim in self._claims:
+                    self._take_again(connection, claim)
+        except Exception as error:
+            # As in `_write`: this thread must go on, and try again.
+            self._fail(
+                self._claims,
+                f"{why or self._database.news}; it could not be begun anew: {self._database.failure(error)}",
+            )
             return False
         _log.error("the history goes on in another file", why=self._database.news)
         self._recover()
         return True
 
-    async def _begin_anew(self, why: str, claims: list[Claim]) -> None:
-        """Go on in the file at the address, with the same machines."""
-        rescued = await self._database.rescue(self._connection)
-        await self._disconnect(broken=True)
-        await self._database.reconnect(why, rescued)
-        self._series.clear()
-        self._claims.clear()
-        self._files.close()
-        connection = await self._connected()
-        for claim in claims:
-            site, _, name = claim.title.partition("/")
-            try:
-                claim.machine_id, claim.owner, steps = await self._take(connection, site, name)
-            except StoreError as error:
-                claim.lost = error
-                continue
-            claim.steps = claim.steps if rescued else steps
-            claim.trouble = ""
-            claim.generation = self._database.generation
-            self._claims[claim.machine_id] = claim
-
-    def _due(self, claim: Claim) -> bool:
-        """Whether something of the machine is to be written now; what the database did not take has to wait."""
-        waits = claim.trouble and not self._stopping.is_set() and asyncio.get_running_loop().time() < claim.retry_s
-        return not waits and claim.backlog.take() is not None
-
-    async def _write(self, ready: list[Claim]) -> bool:
-        """Write one transaction; say whether the database has taken all of it."""
-        try:
-            refused = await self._commit(ready)
-        except Exception as error:
-            # Nothing narrower: whatever a driver raises, this task must go on, or no machine would be written again.
-            await self._disconnect(broken=True)
-            if self._database.found_damaged(error) or _is_operational(error):
-                self._fail(ready, str(self._database.failure(error)))
-            elif len(ready) > 1:
-                # The database is well, one machine's step is not: the others shall not wait for it.
-                return all([await self._write([claim]) for claim in ready])
-            else:
-                self._refuse(ready[0], str(self._database.failure(error)))
-            return False
-        self._recover()
-        for claim in ready:
-            bundle, error_text = claim.backlog.attempt, refused.get(claim)
-            claim.backlog.done()
-            claim.trouble = ""
-            if bundle is None:
-                continue
-            if error_text is None:
-                claim.steps += 1
-            elif not bundle.heard:
-                _log.error("a step was refused", why=str(error_text))
-            bundle.settle(error_text, written=True)
-        return True
-
-    def _fail(self, ready: list[Claim], trouble: str) -> None:
-        if trouble != self.trouble:
-            _log.error("the history cannot be written; it waits in memory", why=trouble)
-        self.trouble = trouble
-        for claim in ready:
-            _put_off(claim)
-
-    def _refuse(self, claim: Claim, trouble: str) -> None:
-        """The database does not take one machine's step: that machine's trouble, and tried again after a while."""
-        if trouble != claim.trouble:
-            _log.error("the history does not take what happens", machine=claim.title, why=trouble)
-        claim.trouble = trouble
-        claim.retry_s = asyncio.get_running_loop().time() + self._retry_s
-        _put_off(claim)
-
-    def _recover(self) -> None:
-        if not self.trouble:
+    def _take_again(self, connection: Connection, claim: Claim) -> None:
+        """Take the right to write a machine in the file that is at the address now."""
+        if claim.generation == self._database.generation:
             return
-        self.trouble = ""
-        for claim in self._claims.values():
-            backlog = claim.backlog
-            if backlog.dropped_reports or backlog.dropped_readings:
-                _log.error(
-                    "reports and readings were dropped while the history could not be written",
-                    machine=claim.title, reports=backlog.dropped_reports, readings=backlog.dropped_readings,
-                )  # fmt: skip
-                backlog.dropped_reports = backlog.dropped_readings = 0
-        _log.info("the history is written again")
+        steps = claim.written
+        try:
+            self._take(connection, claim)
+        except StoreError as error:
+            claim.lost, claim.generation = error, self._database.generation
+            return
+        claim.trouble = ""
+        if not self._database.lost:
+            claim.written = steps
 
-    async def _commit(self, ready: list[Claim]) -> dict[Claim, StoreError]:
-        async with asyncio.timeout(2 * self._database.timeout_s), self._turn, self._database.alone():
-            connection = await self._connected()
-            async with connection.begin():
-                refused, new_series = await write_group(
-                    self._database, connection, ready, self._series, self._bucket_ns
-                )
-        self._series.update(new_series)
-        return refused
+    def _take(self, connection: Connection, claim: Claim) -> None:
+        """Take the right to write a machine; StoreError if another monitor has it."""
+        number = select(machines.c.machine_id).where(machines.c.site == claim.site, machines.c.name == claim.name)
+        new = {"site": claim.site, "name": claim.name, "owner": "", "steps": 0, "reports": 0, "evaluations": 0}
+        owner, file = secrets.token_hex(16), self._database.file
+        with ExitStack() as undo:
+            with connection.begin():
+                if (found := connection.scalar(number)) is None:
+                    connection.execute(self._database.insert(machines).values(new).on_conflict_do_nothing())
+                    found = connection.execute(number).scalar_one()
+                if file is not None:
+                    descriptor = lock_file(file.path.with_name(f"{file.path.name}.{claim.site}.{claim.name}.lock"))
+                    if descriptor is None:
+                        raise _taken(claim)
+                    undo.callback(os.close, descriptor)
+                elif not self._database.is_sqlite and not _lock_row(connection, found):
+                    raise _taken(claim)
+                chosen = machines.c.machine_id == found
+                connection.execute(update(machines).where(chosen).values(owner=owner))
+                steps = connection.execute(select(machines.c.steps).where(chosen)).scalar_one()
+            self._files.push(undo.pop_all())
+        claim.machine_id, claim.owner, claim.written, claim.generation = found, owner, steps, self._database.generation
 
-    async def _connected(self) -> AsyncConnection:
-        if self._connection is None:
-            self._connection = await self._database.writers.connect()
-            for claim in self._claims.values():
-                claim.locked = False
-        if not self._database.is_sqlite:
-            for claim in self._claims.values():
-                # Our own former connection may still hold it for a while; the owner's mark protects us meanwhile.
-                if not claim.locked and claim.lost is None:
-                    claim.locked = await _lock_row(self._connection, claim.machine_id)
-        return self._connection
+    @contextmanager
+    def _connected(self) -> Iterator[Connection]:
+        """The connection, for one thread at a time; after an error the next one is another."""
+        with self._turn, self._database.alone():
+            try:
+                if self._connection is None:
+                    self._connection = self._database.engine.connect()
+                    self._database.to_write(self._connection)
+                    for claim in self._claims:
+                        claim.locked = False
+                with self._database.using(2 * self._database.timeout_s, self._connection) as connection:
+                    self._lock_again(connection)
+                    yield connection
+            except StoreError:
+                raise
+            except Exception:
+                self._disconnect(broken=True)
+                raise
 
-    async def _disconnect(self, broken: bool = False) -> None:
+    def _lock_again(self, connection: Connection) -> None:
+        """Take the locks in PostgreSQL that went with a former connection."""
+        unlocked = [claim for claim in self._claims if not claim.locked and claim.lost is None]
+        if unlocked and not self._database.is_sqlite:
+            with connection.begin():
+                for claim in unlocked:
+                    # That connection may still hold it for a while; the owner's mark protects us meanwhile.
+                    claim.locked = _lock_row(connection, claim.machine_id)
+
+    def _disconnect(self, broken: bool = False) -> None:
         connection, self._connection = self._connection, None
         if connection is None:
             return
         with suppress(SQLAlchemyError, OSError):
             if broken and not self._database.in_memory:
-                await connection.invalidate()  # whatever state it is in: it is not used again
+                connection.invalidate()  # whatever state it is in: it is not used again
         with suppress(SQLAlchemyError, OSError):
-            await connection.close()
+            connection.close()
+
+    def _fail(self, claims: Iterable[Claim], trouble: str) -> None:
+        with self._lock:
+            if trouble != self.trouble:
+                _log.error("the history cannot be written; it waits in memory", why=trouble)
+            self.trouble = trouble
+            for claim in claims:
+                claim.put_off()
+
+    def _refuse(self, claim: Claim, trouble: str) -> None:
+        """The database does not take one machine's step: that machine's trouble, and tried again after a while."""
+        with self._lock:
+            if trouble != claim.trouble:
+                _log.error("the history does not take what happens", machine=claim.title, why=trouble)
+            claim.trouble = trouble
+            claim.retry_s = time.monotonic() + self._retry_s
+            claim.put_off()
+
+    def _recover(self) -> None:
+        if not self.trouble:
+            return
+        with self._lock:
+            self.trouble = ""
+            for claim in self._claims:
+                if claim.dropped_reports or claim.dropped_readings:
+                    _log.error(
+                        "reports and readings were dropped while the history could not be written",
+                        machine=claim.title, reports=claim.dropped_reports, readings=claim.dropped_readings,
+                    )  # fmt: skip
+                    claim.dropped_reports = claim.dropped_readings = 0
+        _log.info("the history is written again")
 
 
-def _put_off(claim: Claim) -> None:
-    """Let nobody wait for what is not written yet."""
-    for bundle in (claim.backlog.attempt, claim.backlog.waiting):
-        if bundle is not None:
-            bundle.settle(None, written=False)
+def _taken(claim: Claim) -> StoreError:
+    return StoreError(f"another monitor writes the history of {claim.title}")
 
 
 def _is_operational(error: Exception) -> bool:
@@ -334,24 +325,6 @@ def _is_operational(error: Exception) -> bool:
     return isinstance(error, (OperationalError, InterfaceError, InternalError, PoolTimeoutError, OSError))
 
 
-async def _lock_row(connection: AsyncConnection, machine_id: int) -> bool:
-    async with connection.begin():
-        query = text("SELECT pg_try_advisory_lock(:high, :low)")
-        return bool(await connection.scalar(query, {"high": _LOCK, "low": machine_id}))
-
-
-def lock_file(path: Path) -> int | None:
-    """Lock the file beside the database that stands for one machine; None if another has it.
-
-    The system lets go of it when the process ends, however it ends.
-    """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        return None
-    except BaseException:
-        os.close(descriptor)
-        raise
-    return descriptor
+def _lock_row(connection: Connection, machine_id: int) -> bool:
+    query = text("SELECT pg_try_advisory_lock(:high, :low)")
+    return bool(connection.scalar(query, {"high": _LOCK, "low": machine_id}))

@@ -264,8 +264,7 @@ def test_infinity_and_the_smallest_numbers_come_back(lab: MachineStore) -> None:
 def test_steps_that_wait_together_are_committed_together(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     machines = [store.machine("demo", f"m{number}") for number in range(12)]
     commits: list[int] = []
-    engine = store._database.engine.sync_engine
-    event.listen(engine, "commit", lambda connection: commits.append(1))
+    event.listen(store._database.engine, "commit", lambda connection: commits.append(1))
     ready = threading.Barrier(len(machines))
 
     def feed(machine: MachineStore) -> None:
@@ -279,6 +278,15 @@ def test_steps_that_wait_together_are_committed_together(store: Store, monkeypat
         assert [each.sequence for each in machine.events()] == list(range(10))
         assert [report.text for _, report in machine.reports()] == [f'{{"number": {n}}}' for n in range(9, -1, -1)]
     assert 10 <= len(commits) < 120 // 2  # 120 steps
+
+
+def test_who_reads_does_not_hold_up_who_writes(store: Store, lab: MachineStore) -> None:
+    with store._database.reading() as connection:
+        assert connection.scalar(text("SELECT count(*) FROM alarm_events")) == 0
+        for number in range(3):
+            assert lab.commit(hop_step(number, events=(alarm_event(number),)))
+        store.audit.append(AUDIT)
+        assert len(lab.events()) == 3
 
 
 @pytest.mark.parametrize("table", ["alarm_events", "audit_log"])
@@ -459,13 +467,10 @@ def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
     store.open()
     try:
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
-
-        async def settings() -> list[object]:
-            async with store._database.reading() as connection:
-                names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size")
-                return [await connection.scalar(text(f"PRAGMA {name}")) for name in names]
-
-        assert store._database.call(settings) == ["wal", 2, 1, 5000, 8192]
+        names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size")
+        with store._database.reading() as reader:
+            found = [reader.scalar(text(f"PRAGMA {name}")) for name in names]
+        assert found == ["wal", 2, 1, 5000, 8192]
     finally:
         store.close()
     with sqlite3.connect(file) as connection:

@@ -1,19 +1,20 @@
 """The database fails and comes back: nothing is lost, nothing is there twice, the order is kept."""
 
-import asyncio
-import select
+import os
+import select as sockets
+import signal
 import socket
 import socketserver
 import sqlite3
 import tempfile
 import threading
 import uuid
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from sqlalchemy import text
+from sqlalchemy import Select, func, literal, select, text
 
 from service.store.database import Database
 from service.store.errors import StoreError
@@ -22,7 +23,7 @@ from service.store.records import Step
 from service.store.retention import Retention
 from service.store.store import Store
 from tests.service.live import until
-from tests.service.postgres import KINDS, USER, PostgresServer, postgres_server
+from tests.service.postgres import KINDS, USER, PostgresServer, database_url, postgres_server
 from tests.service.test_store import T0, alarm_event, head, hop_step
 
 QUICK_S = 1.0
@@ -182,7 +183,7 @@ class _Relay(socketserver.BaseRequestHandler):
         with socket.socket(socket.AF_UNIX) as target:
             target.connect(self.server.target)
             while True:
-                for source in select.select([client, target], [], [])[0]:
+                for source in sockets.select([client, target], [], [])[0]:
                     data = source.recv(65536)
                     if source is target and losing:
                         assert b"COMMIT" in data  # the server has done it
@@ -225,6 +226,25 @@ def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServ
         assert len(lab.readings(quantity="misfit", name="z")) == 20
 
 
+def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None:
+    with opened(server.new_database(f"history_{uuid.uuid4().hex}")) as store:
+        lab = store.machine("demo", "lab")
+        assert lab.commit(hop_step(0, events=(alarm_event(0),)))
+        holders = store._database.rows(
+            select(text("pid")).select_from(text("pg_locks")).where(text("locktype = 'advisory' AND objid = 1"))
+        )
+        for (pid,) in holders:  # the process that serves the writer's connection
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
+            until(lambda: lab.waiting == 0, "the step over another connection")
+            assert len(lab.events()) == 2
+        finally:
+            for (pid,) in holders:
+                os.kill(pid, signal.SIGCONT)
+        assert len(holders) == 1
+
+
 def test_that_the_database_is_away_shows_while_nothing_is_written(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url) as store:
@@ -248,35 +268,48 @@ def test_locks_are_taken_again_after_the_database_was_away(parts: Parts) -> None
             other.machine("demo", "lab")
 
 
-def test_whoever_asks_while_the_history_is_closed_is_answered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+ONES = select(literal(1).label("n")).cte("ones", recursive=True)
+ENDLESS = select(func.count()).select_from(ONES.union_all(select(ONES.c.n)))
+"""A query that comes to no end by itself."""
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_whoever_asks_while_the_history_is_closed_is_answered(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("service.store.database._FINISH_S", 0.05)
-    database = Database(f"sqlite:///{tmp_path / 'history.sqlite'}", QUICK_S)
+    database = Database(database_url(kind, tmp_path), QUICK_S)
     database.start()
     answers: list[str] = []
 
-    async def read() -> None:
-        async with database.reading() as connection:
-            await connection.execute(text("SELECT 1"))
-
-    async def last() -> None:
-        async with database.reading():
-            await asyncio.sleep(3600.0)
-
-    def ask(function: Callable[[], Coroutine[None, None, None]]) -> None:
+    def ask(query: Select[int]) -> None:
         try:
             while True:
-                database.call(function)
+                database.rows(query)
         except StoreError as error:
             answers.append(str(error))
 
-    before = threading.active_count()
-    threads = [threading.Thread(target=ask, args=(one,), daemon=True) for one in (last, *[read] * 4)]
+    threads = [threading.Thread(target=ask, args=(one,), daemon=True) for one in (ENDLESS, *[select(literal(1))] * 4)]
     for thread in threads:
         thread.start()
-    until(lambda: threading.active_count() > before + len(threads), "connections in use")  # each has a thread
+    until(lambda: len(database._uses) == len(threads), "all who ask")
     database.stop()
     for thread in threads:
         thread.join(60.0)
     assert len(answers) == 5
     assert all("closed" in answer for answer in answers)
-    until(lambda: threading.active_count() < before, "the end of all connections")
+    assert not database._uses
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "memory"])
+def test_a_query_that_takes_too_long_is_broken_off(kind: str, tmp_path: Path) -> None:
+    database = Database("sqlite:///:memory:" if kind == "memory" else database_url(kind, tmp_path), QUICK_S)
+    database.answer_s = 0.1
+    database.start()
+    try:
+        for _ in range(2):
+            with pytest.raises(StoreError, match=r"no answer in time|statement timeout"):
+                database.rows(ENDLESS)
+            assert [tuple(row) for row in database.rows(select(literal(1)))] == [(1,)]
+    finally:
+        database.stop()

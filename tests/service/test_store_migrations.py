@@ -13,7 +13,7 @@ from service.store.errors import StoreError
 from service.store.retention import Retention
 from service.store.schema import migrate
 from service.store.store import Store
-from service.store.tables import metadata
+from service.store.tables import REVISION, metadata
 from tests.service.postgres import KINDS, database_url
 
 
@@ -64,7 +64,7 @@ def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
         list(pool.map(opened_and_closed, [url] * 4))
     engine = engine_for(url)
     with engine.connect() as connection:
-        assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == ["0002"]
+        assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == [REVISION]
     engine.dispose()
 
 

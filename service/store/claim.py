@@ -1,4 +1,4 @@
-"""Steps of one machine on their way into the database.
+"""The right to write one machine, and its steps on their way into the database.
 
 ::
 
@@ -8,29 +8,29 @@ While the database fails, what waits is bounded: the oldest reports and readings
 the newest state is needed, and alarm events are never dropped.
 """
 
-import asyncio
 import math
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from concurrent.futures import Future
+from dataclasses import dataclass, field, fields
+from typing import NamedTuple
 
 import zstandard
 
 from service.store.errors import StoreError
 from service.store.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport
 
-__all__ = ["Backlog", "Bundle", "PackedReport", "pack", "unpack"]
+__all__ = ["Bundle", "Claim", "PackedReport", "pack", "unpack"]
 
 _LARGEST = 2**63
 _READINGS_PER_REPORT = 20
 
 
-@dataclass(frozen=True, slots=True)
-class PackedReport:
-    """A report with its text compressed, and when it was recorded."""
+class PackedReport(NamedTuple):
+    """A report, when it was recorded, and its text compressed."""
 
-    report: StoredReport
     recorded_ns: int
+    report: StoredReport
     text: bytes
 
 
@@ -45,34 +45,66 @@ class Bundle:
     new_hops: dict[int, bytes] = field(default_factory=dict)
     keep: frozenset[int] = frozenset()
     steps: int = 0
-    heard: list[asyncio.Future[bool]] = field(default_factory=list)
+    heard: list[Future[bool]] = field(default_factory=list)
 
     def settle(self, error: StoreError | None, written: bool) -> None:
         """Tell those who wait what became of it."""
         for future in self.heard:
-            if not future.done():
-                if error is None:
-                    future.set_result(written)
-                else:
-                    future.set_exception(error)
+            if error is None:
+                future.set_result(written)
+            else:
+                future.set_exception(error)
         self.heard.clear()
 
 
-class Backlog:
-    """What one machine has to write; used in the history's loop only.
+@dataclass(slots=True, eq=False)
+class Claim:
+    """The right to write one machine, and what it has to write.
 
-    Parameters
+    `attempt` belongs to the writer's thread, everything else that waits to whoever holds the writer's lock.
+
+    Attributes
     ----------
     most_reports : int
         Reports that wait while the database fails; of readings, twenty times as many.
+    machine_id : int
+        Number in the database.
+    owner : str
+        Mark of this monitor in the database.
+    written : int
+        Number of the latest attempt that is known to be in the database.
+    locked : bool
+        Whether the lock in PostgreSQL is held, as far as is known.
+    lost : StoreError or None
+        Why this monitor must not write the machine any more.
+    trouble : str
+        Why the database, which works, does not take what waits; empty if it does.
+    retry_s : float
+        When that is tried again, by the monotonic clock.
+    generation : int
+        Goes up when the history goes on in another file, which may lack what was written before.
     """
 
-    def __init__(self, most_reports: int) -> None:
-        self._most_reports = most_reports
-        self.waiting = Bundle()
-        self.attempt: Bundle | None = None
-        self.dropped_reports = 0
-        self.dropped_readings = 0
+    site: str
+    name: str
+    most_reports: int
+    machine_id: int = 0
+    owner: str = ""
+    written: int = 0
+    locked: bool = True
+    lost: StoreError | None = None
+    trouble: str = ""
+    retry_s: float = 0.0
+    generation: int = 0
+    waiting: Bundle = field(default_factory=Bundle)
+    attempt: Bundle | None = None
+    dropped_reports: int = 0
+    dropped_readings: int = 0
+
+    @property
+    def title(self) -> str:
+        """``site/name``."""
+        return f"{self.site}/{self.name}"
 
     @property
     def steps(self) -> int:
@@ -100,10 +132,10 @@ class Backlog:
             waiting.head = step.checkpoint.head
             waiting.keep = frozenset(step.checkpoint.keep) | new_hops.keys()
             waiting.new_hops = {end: hop for end, hop in waiting.new_hops.items() if end in waiting.keep} | new_hops
-        while len(waiting.reports) > self._most_reports:
+        while len(waiting.reports) > self.most_reports:
             waiting.reports.popleft()
             self.dropped_reports += 1
-        while len(waiting.readings) > self._most_reports * _READINGS_PER_REPORT:
+        while len(waiting.readings) > self.most_reports * _READINGS_PER_REPORT:
             waiting.readings.popleft()
             self.dropped_readings += 1
 
@@ -113,9 +145,11 @@ class Backlog:
             self.attempt, self.waiting = self.waiting, Bundle()
         return self.attempt
 
-    def done(self) -> None:
-        """Forget the attempt: it is written, or refused for good."""
-        self.attempt = None
+    def put_off(self) -> None:
+        """Let nobody wait for what is not written yet."""
+        for bundle in (self.attempt, self.waiting):
+            if bundle is not None:
+                bundle.settle(None, written=False)
 
 
 def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]:
@@ -127,30 +161,17 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
         Naming the machine, the field and the value, if they cannot.
     """
     for report in step.reports:
-        _times(machine, "report", start_ns=report.start_ns, end_ns=report.end_ns)
-        _number(machine, "report", "filled", report.filled)
-        _texts(machine, "report", report.state)
+        _check(machine, "report", report)
     for reading in step.readings:
-        of = f"reading of {reading.quantity} {reading.name}"
-        _times(machine, of, end_ns=reading.end_ns)
-        _number(machine, of, "value", reading.value)
-        _number(machine, of, "standard_error", 0.0 if reading.standard_error is None else reading.standard_error)
-        _texts(machine, of, reading.quantity, reading.name)
+        _check(machine, f"reading of {reading.quantity} {reading.name}", reading)
     for event in step.events:
-        of = f"alarm event {event.sequence}"
-        _times(
-            machine, of, time_ns=event.time_ns, recorded_ns=event.recorded_ns,
-            sequence=event.sequence, occurrence=event.occurrence,
-        )  # fmt: skip
-        _texts(machine, of, event.id, event.kind, event.alarm, event.severity, event.state, event.actor, event.text)
+        _check(machine, f"alarm event {event.sequence}", event)
     if step.checkpoint is not None:
-        head = step.checkpoint.head
-        _times(machine, "checkpoint", end_ns=head.end_ns, recorded_ns=head.recorded_ns)
+        _check(machine, "checkpoint", step.checkpoint.head)
         for end_ns, _ in step.checkpoint.new_hops:
-            _times(machine, "hop of the checkpoint", end_ns=end_ns)
-        _texts(machine, "checkpoint", head.bundle or "", head.machine_hash, head.code_version, head.alarms)
+            _check_number(machine, "hop of the checkpoint", "end_ns", end_ns)
     compressor = zstandard.ZstdCompressor()
-    return tuple(PackedReport(each, recorded_ns, compressor.compress(each.text.encode())) for each in step.reports)
+    return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
 
 
 def unpack(text: bytes) -> str:
@@ -167,22 +188,22 @@ def unpack(text: bytes) -> str:
         raise StoreError(f"history: the text of a report is damaged: {error}") from error
 
 
-def _times(machine: str, of: str, **values: int) -> None:
-    for name, value in values.items():
-        if not 0 <= value < _LARGEST:
-            raise StoreError(f"{machine}: {of}: {name} is {value}, expected 0 or more and less than 2^63")
+def _check(machine: str, of: str, record: StoredReport | StoredReading | StoredEvent | CheckpointHead) -> None:
+    for each in fields(record):
+        value = getattr(record, each.name)
+        if isinstance(value, int | float):
+            _check_number(machine, of, each.name, value)
+        elif isinstance(value, str):
+            try:
+                value.encode()
+            except UnicodeEncodeError as error:
+                raise StoreError(f"{machine}: {of}: {value!r} is no valid text: {error.reason}") from error
+            if "\0" in value:
+                raise StoreError(f"{machine}: {of}: {value!r} holds a NUL character, which no text may")
 
 
-def _number(machine: str, of: str, name: str, value: float) -> None:
+def _check_number(machine: str, of: str, name: str, value: float) -> None:
+    if isinstance(value, int) and not 0 <= value < _LARGEST:
+        raise StoreError(f"{machine}: {of}: {name} is {value}, expected 0 or more and less than 2^63")
     if math.isnan(value):
         raise StoreError(f"{machine}: {of}: {name} is nan, expected a number")
-
-
-def _texts(machine: str, of: str, *values: str) -> None:
-    for value in values:
-        try:
-            value.encode()
-        except UnicodeEncodeError as error:
-            raise StoreError(f"{machine}: {of}: {value!r} is no valid text: {error.reason}") from error
-        if "\0" in value:
-            raise StoreError(f"{machine}: {of}: {value!r} holds a NUL character, which no text may")
