@@ -147,7 +147,7 @@ class MachineStore:
         alarm, kind, severity : str, optional
             Only those.
         limit, newest_first : int, bool
-            At most so many, of the newest or the oldest.
+            At most so many, in this order.
         """
         log = alarm_events.c
         query = select(*EVENT).where(

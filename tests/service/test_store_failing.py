@@ -245,6 +245,20 @@ def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None
         assert len(holders) == 1
 
 
+def test_nobody_waits_twice_for_a_disk_that_hangs(tmp_path: Path) -> None:
+    with opened(f"sqlite:///{tmp_path}/history.sqlite") as store:
+        lab = store.machine("demo", "lab")
+        with store._writer._turn:  # the writer's thread comes no further than this
+            assert not lab.commit(hop_step(0, events=(alarm_event(0),)))
+            assert "no answer in time" in store.trouble
+            assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
+            assert lab.waiting == 2
+        until(lambda: lab.waiting == 0, "recovery")
+        assert store.trouble == ""
+        assert [event.sequence for event in lab.events()] == [0, 1]
+        assert lab.commit(hop_step(2))
+
+
 def test_that_the_database_is_away_shows_while_nothing_is_written(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url) as store:

@@ -1,5 +1,7 @@
 """The migrations make exactly the tables that the code uses, once, whoever comes first."""
 
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -66,6 +68,17 @@ def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
     with engine.connect() as connection:
         assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == [REVISION]
     engine.dispose()
+
+
+def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_need(url: str) -> None:
+    opened_and_closed(url)
+    code = (
+        "import sys; from service.store.store import Store; from service.store.retention import Retention; "
+        "store = Store(sys.argv[1], Retention()); store.open(); store.machine('demo', 'lab'); store.close(); "
+        "print({'alembic', 'sqlalchemy.orm', 'sqlalchemy.ext.asyncio'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, url], capture_output=True, text=True, check=True)
+    assert done.stdout == "set()\n"
 
 
 def test_buckets_of_an_older_version_get_the_readings_that_are_still_there(
