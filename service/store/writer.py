@@ -279,6 +279,9 @@ class Writer:
         with suppress(SQLAlchemyError, OSError):
             if broken and not self._database.in_memory:
                 connection.invalidate()  # whatever state it is in: it is not used again
+            elif not self._database.is_sqlite:
+                # The server notices the end of a connection in its own time; whoever comes next shall not wait for it.
+                connection.execute(text("SELECT pg_advisory_unlock_all()"))
         with suppress(SQLAlchemyError, OSError):
             connection.close()
 
