@@ -78,7 +78,7 @@ class Writer:
         self._wake.set()
         self._thread.join(self._database.answer_s)
         if not self._thread.is_alive():
-            self._disconnect()
+            self._let_go()
         self._files.close()
         lost = [
             f"{claim.title}: {claim.contents()} ({self.trouble or claim.trouble})"
@@ -259,7 +259,7 @@ class Writer:
                     yield connection
             except StoreError:
                 raise
-            except Exception:
+            except Exception:  # whatever broke off in the middle leaves the connection in a state that nobody knows
                 self._disconnect(broken=True)
                 raise
 
@@ -272,6 +272,13 @@ class Writer:
                     # That connection may still hold it for a while; the owner's mark protects us meanwhile.
                     claim.locked = _lock_row(connection, claim.machine_id)
 
+    def _let_go(self) -> None:
+        """Release the locks in PostgreSQL: the server notices the end of a connection in its own time."""
+        if self._connection is not None and not self._database.is_sqlite:
+            with suppress(StoreError, SQLAlchemyError, OSError), self._connected() as connection:
+                connection.execute(text("SELECT pg_advisory_unlock_all()"))
+        self._disconnect()
+
     def _disconnect(self, broken: bool = False) -> None:
         connection, self._connection = self._connection, None
         if connection is None:
@@ -279,9 +286,6 @@ class Writer:
         with suppress(SQLAlchemyError, OSError):
             if broken and not self._database.in_memory:
                 connection.invalidate()  # whatever state it is in: it is not used again
-            elif not self._database.is_sqlite:
-                # The server notices the end of a connection in its own time; whoever comes next shall not wait for it.
-                connection.execute(text("SELECT pg_advisory_unlock_all()"))
         with suppress(SQLAlchemyError, OSError):
             connection.close()
 

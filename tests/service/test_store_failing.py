@@ -226,23 +226,37 @@ def test_a_step_whose_commit_was_not_answered_is_there_once(server: PostgresServ
         assert len(lab.readings(quantity="misfit", name="z")) == 20
 
 
+@contextmanager
+def hanging(store: Store) -> Iterator[None]:
+    """The server's process for the writer's connection does nothing for a while."""
+    ((pid,),) = store._database.rows(
+        select(text("pid")).select_from(text("pg_locks")).where(text("locktype = 'advisory' AND objid = 1"))
+    )
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
 def test_a_server_that_hangs_is_turned_away_from(server: PostgresServer) -> None:
     with opened(server.new_database(f"history_{uuid.uuid4().hex}")) as store:
         lab = store.machine("demo", "lab")
         assert lab.commit(hop_step(0, events=(alarm_event(0),)))
-        holders = store._database.rows(
-            select(text("pid")).select_from(text("pg_locks")).where(text("locktype = 'advisory' AND objid = 1"))
-        )
-        for (pid,) in holders:  # the process that serves the writer's connection
-            os.kill(pid, signal.SIGSTOP)
-        try:
+        with hanging(store):
             assert not lab.commit(hop_step(1, events=(alarm_event(1),)))
             until(lambda: lab.waiting == 0, "the step over another connection")
             assert len(lab.events()) == 2
-        finally:
-            for (pid,) in holders:
-                os.kill(pid, signal.SIGCONT)
-        assert len(holders) == 1
+
+
+def test_the_end_does_not_wait_for_a_server_that_hangs(server: PostgresServer) -> None:
+    with opened(server.new_database(f"history_{uuid.uuid4().hex}")) as store:
+        assert store.machine("demo", "lab").commit(hop_step(0))
+        ending = threading.Thread(target=store.close, daemon=True)
+        with hanging(store):
+            ending.start()
+            ending.join(60.0)
+            assert not ending.is_alive()
 
 
 def test_nobody_waits_twice_for_a_disk_that_hangs(tmp_path: Path) -> None:
