@@ -36,7 +36,7 @@ def main(
     names: Annotated[list[str], typer.Argument(metavar="STUDY...", help=f"Among {', '.join(STUDIES)}; or all.")],
     out: Annotated[Path, typer.Option(help="Folder of the records, one file for each study.")],
     machine: Annotated[list[str] | None, typer.Option(help="Machine; repeatable. The study's own if left out.")] = None,
-    windows: Annotated[int, typer.Option(min=1, help="Windows per cell.")] = 100,
+    windows: Annotated[int | None, typer.Option(min=1, help="Windows per cell: 100, or 2 with --small.")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 20261122,
     processes: Annotated[int, typer.Option(min=1)] = os.cpu_count() or 1,
     small: Annotated[bool, typer.Option("--small", help="The smallest plan: a check, not a result.")] = False,
@@ -52,7 +52,7 @@ def main(
     for name in chosen:
         if name not in STUDIES:
             raise typer.BadParameter(f"{name!r}, expected among {', '.join(STUDIES)}, or all")
-    options = Options(tuple(machine or ()), windows, seed, small)
+    options = Options(tuple(machine or ()), windows or (2 if small else 100), seed, small)
     try:
         for name in chosen:
             study = STUDIES[name](options)

@@ -26,7 +26,7 @@ from models.diagnosis.networks.relation_training import train_network
 from models.diagnosis.readings import Diagnostician, ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from models.machine import Machine, load_machine
+from models.machine import Machine
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 _FAULTS: tuple[dict[str, float], ...] = (
@@ -265,7 +265,7 @@ def _tables(false_alarm_rate: float) -> tuple[Table, ...]:
 
 def ablation(options: Options) -> Study:
     """Variants of the relation networks on the same windows."""
-    machine = load_machine((options.machines or ("lab",))[0])
+    machine = options.machine()
     bundle = load_bundle(machine.name, machine)
     calibration = 9 if options.small else 199
     cells = []

@@ -266,8 +266,9 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
         own = r.where(rows, topic="healthy", machine=machine, method=by, layout=layout)
         spreads = r.each([row for row in own if row["parameter"] in names], ("parameter",), r.scatter(column))
         over = " over the bound" if column == "in bounds" else " in %"
+        of = "" if names == _READ else f" of {', '.join(names)}"
         if own:
-            yield r.within(f"{by}: spread{over}, {layout}, {machine}", spreads, 0.0, most)
+            yield r.within(f"{by}: spread{of}{over}, {layout}, {machine}", spreads, 0.0, most)
     for by in asked:
         for column, declared in zip(("any", "strict any"), RATES, strict=True):
             alarms = r.each(r.where(windows, topic="healthy", method=by), ("machine",), r.share(column))

@@ -33,6 +33,7 @@ def write_page(study: Study, options: Options, records: Sequence[Record], docs: 
     numbers = {
         "windows": options.windows,
         "seed": options.seed,
+        "machine": (options.machines or ("lab",))[0],
         "total": len({tuple(record[key] for key in keys) for record in records}),
     }
     words = _TEXTS[study.name]

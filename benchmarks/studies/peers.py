@@ -20,7 +20,7 @@ from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperDiagnostician, calibrate_paper
 from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.machine import Machine, load_machine
+from models.machine import Machine
 from models.signals.block import FloatArray
 from simulator.scenario import Event
 from simulator.stream import blocks
@@ -193,7 +193,7 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
 
 def peers(options: Options) -> Study:
     """Beside operational modal analysis, a feature vector and the networks as printed."""
-    machine = load_machine((options.machines or ("lab",))[0])
+    machine = options.machine()
     bundle = load_bundle(machine.name, machine)
     changes = (_CHANGES[0], _CHANGES[3], _CHANGES[6]) if options.small else _CHANGES
     cells = tuple(

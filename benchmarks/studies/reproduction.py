@@ -28,7 +28,7 @@ from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from models.machine import Machine, load_machine
+from models.machine import Machine
 from models.physics.lyapunov import stochastic_covariance, synchronous_response
 from models.physics.matrices import STATE_INDEX
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
@@ -249,7 +249,7 @@ def _charts(records: Sequence[Record]) -> Iterator[Chart]:
 
 def reproduction(options: Options) -> Study:
     """The paper's eight conditions before its own networks and all diagnosticians."""
-    machine = load_machine((options.machines or ("lab",))[0])
+    machine = options.machine()
     bundle = load_bundle(machine.name, machine)
     cutoffs = _CUTOFFS_HZ[1:3] if options.small else _CUTOFFS_HZ
     noises = _NOISE_LEVELS[::4] if options.small else _NOISE_LEVELS

@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import scipy.stats
 
+from models.diagnosis.readings import Z95
+
 Value = str | float | bool | None
 """Of a record: what JSON has, none of it nested."""
 Record = Mapping[str, Value]
@@ -200,7 +202,7 @@ def at_most(what: str, measured: Estimate | None, most: float, declared: str = "
 
 
 def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: float) -> Goal:
-    """Goal of one or several figures that should all lie between two limits; the farthest off is shown.
+    """Goal of one or several figures that should all lie between two limits; the worst is shown.
 
     Their intervals are judged together: of many, some lie outside by chance.
     """
@@ -208,10 +210,12 @@ def within(what: str, figures: Mapping[str, Estimate | None], low: float, high: 
     if not found:
         return Goal(what, "", "–", "–")
     judged = {name: _judged(what, _together(one, len(found)), low, high, "") for name, one in found.items()}
-    name = max(found, key=lambda name: abs(found[name].value - (low + high) / 2))
+    are_rates = all(one.count is not None for one in found.values())
+    best = low if low == 0 else high if high >= 1 and are_rates else (low + high) / 2
+    name = max(found, key=lambda name: abs(found[name].value - best))
     verdicts = [one.verdict for one in judged.values()]
     verdict = next((one for one in ("missed", "within chance") if one in verdicts), "met")
-    several = f"{verdicts.count('met')} of {len(found)} inside; farthest {name}: " if len(found) > 1 else ""
+    several = f"{verdicts.count('met')} of {len(found)} inside; worst {name}: " if len(found) > 1 else ""
     declared = f"{_limit(found[name], low)} to {_limit(found[name], high)}"
     if low == 0 or (high >= 1 and found[name].count is not None):
         declared = f"≤ {_limit(found[name], high)}" if low == 0 else f"≥ {_limit(found[name], low)}"
@@ -222,7 +226,7 @@ def _together(one: Estimate, figures: int) -> Estimate:
     """With an interval that holds, together with those of so many other figures, at 95 % (Bonferroni)."""
     if one.count is not None:
         return _share(one.count, one.n, 0.025 / figures)
-    wider = float(scipy.stats.norm.isf(0.025 / figures) / scipy.stats.norm.isf(0.025))
+    wider = float(scipy.stats.norm.isf(0.025 / figures)) / Z95
     return replace(one, low=one.value + wider * (one.low - one.value), high=one.value + wider * (one.high - one.value))
 
 

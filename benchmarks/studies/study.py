@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value
-from models.errors import RecordingError
+from models.errors import MachineFileError, RecordingError
+from models.machine import Machine, load_machine
 from simulator.training.progress import labelled_bars
 
 _Task = TypeVar("_Task")
@@ -37,6 +38,18 @@ class Options:
     seed: int = 20261122
     small: bool = False
     """The smallest plan that exercises everything, at a declared rate of 10 % false alarms: a check, not a result."""
+
+    def machine(self) -> Machine:
+        """The machine of a study that has one.
+
+        Raises
+        ------
+        MachineFileError
+            If several are asked for.
+        """
+        if len(self.machines) > 1:
+            raise MachineFileError(f"--machine {', '.join(self.machines)}: this study takes one machine")
+        return load_machine((self.machines or ("lab",))[0])
 
     @property
     def rate(self) -> float:
@@ -62,7 +75,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Over:
-    """Do a function over worker processes, in order, with a bar."""
+    """Apply a function to tasks in worker processes, in order, with a progress bar."""
 
     name: str
     pool: ProcessPoolExecutor | None

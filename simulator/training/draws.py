@@ -107,7 +107,7 @@ class Draw:
     ----------
     machine : Machine
     seed : int
-        Of the whole campaign.
+        Of the whole training or study.
     purpose : Purpose
     stream : int
         Tells apart series of windows of the same purpose (equations, cells of a table).

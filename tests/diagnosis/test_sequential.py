@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
-from models.diagnosis.verdict.delay import GaussianHops, detection_delays
 from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
+from tests.diagnosis.gaussian_hops import GaussianHops, detection_delays
 from tests.diagnosis.test_isolation import window
 
 SEED = 88_300

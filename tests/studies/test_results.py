@@ -61,8 +61,12 @@ def test_a_goal_is_missed_only_where_the_whole_interval_misses_it() -> None:
     covered = {"e": shares(94, 100), "k_by": shares(999, 1000)}
     judged = within("covered", covered, 0.93, 0.97)
     assert judged.verdict == "missed"
-    assert "1 of 2 inside; farthest k_by: 99.9 %" in judged.measured
+    assert "1 of 2 inside; worst k_by: 99.9 %" in judged.measured
     assert judged.declared == "93 % to 97 %"
+    assert (
+        "2 of 2 inside; worst c_by: 97.5 %"
+        in within("found", {"k_by": shares(40, 40), "c_by": shares(39, 40)}, 0.95, 1.0).measured
+    )
 
 
 def test_of_many_figures_one_lies_outside_by_chance() -> None:
