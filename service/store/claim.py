@@ -61,7 +61,7 @@ class Bundle:
 class Claim:
     """The right to write one machine, and what it has to write.
 
-    `attempt` belongs to the writer's thread, everything else that waits to whoever holds the writer's lock.
+    What waits, the attempt included, is changed only by whoever holds the writer's lock.
 
     Attributes
     ----------
@@ -109,7 +109,7 @@ class Claim:
     @property
     def steps(self) -> int:
         """Steps that are not in the database yet."""
-        return self.waiting.steps + (0 if self.attempt is None else self.attempt.steps)
+        return sum(bundle.steps for bundle in (self.attempt, self.waiting) if bundle is not None)
 
     def contents(self) -> str:
         """What is not in the database, in words; with what was dropped to make room."""

@@ -6,6 +6,7 @@ thread looks after them all: it breaks off what takes too long.
 
 import importlib
 import os
+import select
 import socket
 import threading
 import time
@@ -17,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from sqlalchemy import URL, Connection, Engine, Row, Select, create_engine, event, inspect, make_url, text
-from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
-from sqlalchemy.pool import QueuePool, StaticPool
+from sqlalchemy.exc import ArgumentError, DBAPIError, DisconnectionError, SQLAlchemyError
+from sqlalchemy.pool import StaticPool
 
 from service.store.errors import DamagedError, StoreError
 from service.store.file import HistoryFile, is_damage
@@ -167,11 +168,11 @@ class Database:
         Parameters
         ----------
         limit_s : float, optional
-            How long all of it may take, if not as long as a query.
+            How long the lock, and then the transaction, may take, if not as long as usual.
         repeatable : bool
             Whether all statements must see the same, which they do in SQLite anyhow.
         """
-        with self.plainly(), self.alone(), self.using(limit_s or self.answer_s) as connection:
+        with self.plainly(), self.alone(limit_s), self.using(limit_s or self.answer_s) as connection:
             self.to_write(connection)
             if repeatable and not self.is_sqlite:
                 connection.execution_options(isolation_level="REPEATABLE READ")
@@ -219,9 +220,9 @@ class Database:
                     self._changed.notify_all()
 
     @contextmanager
-    def alone(self) -> Iterator[None]:
+    def alone(self, limit_s: float | None = None) -> Iterator[None]:
         """Keep others of this process from writing to SQLite at the same time; nothing in PostgreSQL."""
-        if self.is_sqlite and not self._one_writer.acquire(timeout=2 * self.timeout_s):
+        if self.is_sqlite and not self._one_writer.acquire(timeout=limit_s or 2 * self.timeout_s):
             raise TimeoutError
         try:
             yield
@@ -351,11 +352,8 @@ class Database:
         if self.file is not None:
             # A file that was deleted must not come back empty with the next reader.
             url = url.set(database=f"file:{quote(str(self.file.path))}", query={"mode": "rw", "uri": "true"})
-        engine = create_engine(
-            url,
-            poolclass=StaticPool if self.in_memory else QueuePool,
-            connect_args={"timeout": self.timeout_s, "check_same_thread": False},
-        )
+        pool: dict[str, Any] = {"poolclass": StaticPool} if self.in_memory else {"pool_timeout": self.timeout_s}
+        engine = create_engine(url, connect_args={"timeout": self.timeout_s, "check_same_thread": False}, **pool)
         event.listen(engine, "connect", _prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
         return engine
@@ -364,7 +362,6 @@ class Database:
         try:
             engine = create_engine(
                 self._url.set(drivername="postgresql+psycopg"),
-                pool_pre_ping=True,
                 pool_timeout=self.timeout_s,
                 connect_args=_POSTGRESQL | {"connect_timeout": max(2, round(self.timeout_s))},
             )
@@ -377,6 +374,15 @@ class Database:
             # The server ends by itself what `_break_off` has turned away from.
             connection.execute(f"SET statement_timeout = {round(1000 * self.answer_s)}")
             connection.commit()
+
+        @event.listens_for(engine, "checkout")
+        def still_there(connection: Any, record: object, proxy: object) -> None:
+            _ = record, proxy
+            # Not a ping, which waits for a server that hangs: one that has closed the connection has sent its end.
+            line = select.poll()
+            line.register(connection.fileno(), select.POLLIN)
+            if line.poll(0):
+                raise DisconnectionError
 
         return engine
 

@@ -24,11 +24,11 @@ def migrate(connection: Connection, revision: str = "head") -> None:
         If the database belongs to a newer version, or to something else.
     """
     if connection.dialect.name == "postgresql":
+        connection.execute(text("SET LOCAL statement_timeout = 0"))  # a large history may take minutes, another's too
         # One at a time; SQLite's transaction keeps the others out by itself.
         connection.execute(
             text("SELECT pg_advisory_xact_lock(:high, :low)"), {"high": MIGRATING[0], "low": MIGRATING[1]}
         )
-        connection.execute(text("SET LOCAL statement_timeout = 0"))  # a large history may take minutes
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent / "migrations").replace("%", "%%"))
     config.attributes["connection"] = connection

@@ -55,7 +55,7 @@ class Writer:
         self._series: SeriesNumbers = {}
         self._connection: Connection | None = None
         self._turn = threading.Lock()  # on the connection; taken first where both are
-        self._lock = threading.Lock()  # on what waits and on what is said of it; never held while the database works
+        self._lock = threading.RLock()  # on what waits and on what is said of it; never held while the database works
         self._wake = threading.Event()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="history-writer", daemon=True)
@@ -126,7 +126,10 @@ class Writer:
         try:
             return heard.result(_PATIENCE * self._database.timeout_s)
         except TimeoutError as error:
-            self._fail([claim], str(self._database.failure(error)))
+            with self._lock:
+                if heard.done():
+                    return heard.result()  # written at the last moment
+                self._fail([claim], str(self._database.failure(error)))
             return False
 
     def _run(self) -> None:
@@ -164,10 +167,10 @@ class Writer:
                 self._refuse(ready[0], why)
             return False
         self._series.update(series)
-        self._recover()
         with self._lock:
             for claim in ready:
                 self._settle(claim, refused.get(claim))
+            self._recover()
         return True
 
     def _settle(self, claim: Claim, refused: StoreError | None) -> None:
@@ -191,8 +194,8 @@ class Writer:
                 with self._turn, self._database.alone():
                     self._database.begin_anew(why, self._connection)
                     self._disconnect(broken=True)
-                self._series.clear()
-                self._files.close()
+                    self._series.clear()
+                    self._files.close()
             with self._connected() as connection:
                 for claim in self._claims:
                     self._take_again(connection, claim)
