@@ -32,6 +32,7 @@ Cursor = dict[str, int]
 _PAGE = 100
 _KEEP_ALIVE_S = 15.0
 _AGAIN_S = 1.0
+_LAST_S = 2.0
 _RETRY_MS = 2000
 _ENTRY = r"([A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63})=(-1|[0-9]{1,18})"
 CURSOR_PATTERN = f"^({_ENTRY}(,{_ENTRY})*)?$"
@@ -110,7 +111,7 @@ class EventFeed:
     """Tells streams that there is news; `wake`, `health` and `close` are for any thread."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()
         self._listeners: set[_Listener] = set()
         self._health: dict[str, _Said] = {}
         self._closed = False
@@ -136,9 +137,11 @@ class EventFeed:
                 listener.wake()
 
     def close(self) -> None:
-        """End every stream."""
+        """End every stream once it has told what is committed; whoever reads slowly is waited for only so long."""
         self._closed = True
         self.wake()
+        with self._lock:
+            self._lock.wait_for(lambda: not self._listeners, _LAST_S)
 
     async def follow(
         self, logs: Mapping[str, AlarmLog], cursor: Cursor, admitted: Callable[[], Awaitable[bool]]
@@ -161,7 +164,8 @@ class EventFeed:
             yield f"retry: {_RETRY_MS}\nid: {cursor_text(cursor)}\nevent: start\ndata: {{}}\n\n"
             told: dict[str, int] = {}
             asked_s = time.monotonic()
-            while not self._closed:
+            while True:
+                closes = self._closed
                 listener.news.clear()
                 waits = False
                 for place, log in logs.items():
@@ -172,6 +176,8 @@ class EventFeed:
                     if said is not None and told.get(place) != said.number:
                         told[place] = said.number
                         yield f"event: health\ndata: {said.text}\n\n"
+                if closes:
+                    return
                 quiet = not await _woken(listener.news, _AGAIN_S if waits else _KEEP_ALIVE_S)
                 if quiet:
                     # No empty line: some readers take that for the end of an event without data.
@@ -183,10 +189,11 @@ class EventFeed:
         finally:
             with self._lock:
                 self._listeners.discard(listener)
+                self._lock.notify_all()
 
     async def _committed(self, place: str, log: AlarmLog, cursor: Cursor) -> AsyncIterator[str]:
         """What is in the log after the cursor, which moves along; nothing while the history cannot be read."""
-        while cursor[place] < log.last_sequence() and not self._closed:
+        while cursor[place] < log.last_sequence():
             try:
                 page = await run_in_threadpool(log.events, after=cursor[place], limit=_PAGE)
             except StoreError:

@@ -177,6 +177,8 @@ class Runtime:
                 self._workers.append(worker)
                 self._pulses.append(Pulse(worker.inbox.call))
                 self.metrics.watch(worker)
+            # After the workers, whose last events they tell, and before the history that these are read from.
+            undo.callback(self.feed.close)
             undo.callback(self.webhooks.close)
             logs = {f"{worker.machine.site}/{worker.machine.name}": worker.history for worker in self._workers}
             self.webhooks.start(logs, self.store.webhooks)
@@ -187,7 +189,6 @@ class Runtime:
             undo.callback(supervisor.stop)
             supervisor.start()
             undo.callback(self.replays.close)
-            undo.callback(self.feed.close)
             self._server = server
             app = create_app(self, guard)
             app.add_middleware(RequestMeter, counts=self._requests)  # around all others, so that refusals count

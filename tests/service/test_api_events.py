@@ -262,21 +262,30 @@ def test_streams_are_counted_and_given_back() -> None:
         until(admitted, "seat")
 
 
-def test_streams_end_when_the_service_stops() -> None:
+def test_streams_end_when_the_service_stops(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was committed before is told, however slow the history is."""
     with monitor() as runtime:
         lab, _ = runtime.machines()
+        read = lab.history.events
+
+        def late(**query: Any) -> Any:
+            until(lambda: runtime.feed.closed, "end of the service")
+            return read(**query)
+
         left: list[httpx_sse.ServerSentEvent] = []
         with reading(runtime) as reader, client(runtime) as http, http.stream("GET", EVENTS) as stuck:
             reader.next("start")
             assert stuck.status_code == 200
-            happen(lab)
+            monkeypatch.setattr(lab.history, "events", late)
+            happen(lab, 250)  # more than two pages
+            expected = [one.text for one in read(after=-1, limit=1000)]
             stopping = threading.Thread(target=runtime.stop)
             stopping.start()
             # An end, not a broken connection: the reader would raise.
             left += reader.events
             stopping.join(180)
             assert not stopping.is_alive()
-        assert [event.event for event in left if event.event == "alarm"] == ["alarm"]
+        assert [event.data for event in left if event.event == "alarm"] == expected
 
 
 def test_a_stream_ends_when_its_token_is_revoked(monkeypatch: pytest.MonkeyPatch) -> None:
