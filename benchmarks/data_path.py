@@ -21,7 +21,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
-from service.monitor import MachineMonitor
+from service.monitor.monitor import MachineMonitor
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
 

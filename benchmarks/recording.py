@@ -24,9 +24,9 @@ from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
 from models.signals.salvage import salvage_recording
 from models.signals.wire import encode_block
-from service.config import LogSettings, RecordingSettings
-from service.logs import configure_logging
-from service.recording.recorder import MachineRecorder
+from service.recordings.recorder import MachineRecorder
+from service.settings.service import LogSettings, RecordingSettings
+from service.terminal.logs import configure_logging
 
 REPETITIONS = 5
 RATE_HZ, CHANNELS, BLOCK = 4000.0, 12, 400

@@ -35,11 +35,11 @@ from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from rotorwatch.client.alarm_log import follow_alarms
 from rotorwatch.records.alarms import AlarmCloudEvent
-from service.monitor import MachineMonitor
-from service.store.machine import MachineStore
-from service.store.retention import Retention
-from service.store.store import Store
-from service.transport import Link, LinkError
+from service.history.machine import MachineStore
+from service.history.retention import Retention
+from service.history.store import Store
+from service.monitor.monitor import MachineMonitor
+from service.stream.transport import Link, LinkError
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks

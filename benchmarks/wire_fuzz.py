@@ -38,7 +38,7 @@ from wire_grammar import GOOD_RUN, Grammar, Message
 import models
 from models.machine import load_machine
 from models.signals.link import LinkSettings
-from service.transport import Link
+from service.stream.transport import Link
 
 _SECOND, _THIRD = "demo/second", "demo/third"
 _AT_ONCE = 500

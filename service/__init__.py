@@ -1,1 +1,1 @@
-"""The monitoring service; ``service.monitor`` holds the data path of one machine and is the first file to read."""
+"""The monitoring service; read `service.monitor.monitor` first, which holds the data path of one machine."""

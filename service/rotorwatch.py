@@ -31,7 +31,7 @@ from service.commands.running import (
 )
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
-    from service.config import ServiceSettings
+    from service.settings.service import ServiceSettings
 
 __all__ = ["app"]
 
@@ -99,10 +99,10 @@ def run(
         one_blas_thread()
         raise_file_limit()
         share_memory_arenas()
-        from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
-        from service.logs import configure_logging  # noqa: PLC0415
         from service.runtime import running  # noqa: PLC0415  # must see the variables set above
-        from service.stopping import stop_request  # noqa: PLC0415
+        from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+        from service.terminal.logs import configure_logging  # noqa: PLC0415
+        from service.terminal.stopping import stop_request  # noqa: PLC0415
 
         settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
         configure_logging(settings.log)
@@ -173,8 +173,8 @@ def router(
     with exit_codes():
         from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
         from models.signals.link import LinkSettings  # noqa: PLC0415
-        from service.stopping import stop_request  # noqa: PLC0415
-        from service.transport import route  # noqa: PLC0415
+        from service.stream.transport import route  # noqa: PLC0415
+        from service.terminal.stopping import stop_request  # noqa: PLC0415
 
         settings = LinkSettings(listen=(ENDPOINT,)) if link is None else load_link(link)
         changes: dict[str, Any] = {n: tuple(given) for n, given in (("listen", listen), ("connect", connect)) if given}
@@ -221,7 +221,7 @@ def demo(
         one_blas_thread()
         typer.echo("starting a simulated machine and a monitor (some seconds) ...")
         sys.stdout.flush()
-        from service.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
+        from service.commands.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
 
         code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
     raise typer.Exit(code)
@@ -238,7 +238,7 @@ def _overridden(
     namespace: str | None,
 ) -> "ServiceSettings":
     """Put the command line over the settings; endpoints and role replace those of the settings altogether."""
-    from service.config import MachineEntry, check_distinct  # noqa: PLC0415  # keeps --help quick
+    from service.settings.service import MachineEntry, check_distinct  # noqa: PLC0415  # keeps --help quick
 
     update: dict[str, Any] = {}
     if machines:
@@ -273,8 +273,8 @@ def _checked(file: Path) -> str:
     from models.commissioning.installed import install  # noqa: PLC0415  # keeps --help quick
     from models.machine import load_machine_file  # noqa: PLC0415
     from models.mistakes import read_toml  # noqa: PLC0415
-    from service.config import load_settings  # noqa: PLC0415
-    from service.store.store import Store  # noqa: PLC0415
+    from service.history.store import Store  # noqa: PLC0415
+    from service.settings.service import load_settings  # noqa: PLC0415
 
     if {"site", "rotor", "sensors"} & set(read_toml(file)):
         machine = load_machine_file(file)

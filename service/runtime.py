@@ -29,24 +29,24 @@ from models.signals.keys import MachineKeys
 from rotorwatch.records.health import Health
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
-from service.config import ServiceSettings
-from service.event_feed import EventFeed
-from service.http.app import create_app
-from service.http.replays import ReplayDesk
-from service.http.server import HttpError, HttpServer
-from service.logs import logger
-from service.metrics.collector import Metrics
-from service.metrics.requests import RequestCounts, RequestMeter
-from service.pulse import Pulse
-from service.readiness import readiness_of
-from service.recording.catalogue import Catalogue
-from service.recording.recorder import MachineRecorder, RecorderStatus
-from service.store.audit import AuditLog
-from service.store.errors import StoreError
-from service.store.store import Store
-from service.transport import Link, MachineCallbacks, MachineLink, MachineTap
-from service.webhooks.desk import WebhookDesk
-from service.worker import MachineWorker
+from service.api.app import create_app
+from service.api.readiness import readiness_of
+from service.api.routes.replays import ReplayDesk
+from service.api.server import HttpError, HttpServer
+from service.delivery.event_feed import EventFeed
+from service.delivery.metrics.collector import Metrics
+from service.delivery.metrics.requests import RequestCounts, RequestMeter
+from service.delivery.webhooks.desk import WebhookDesk
+from service.history.audit import AuditLog
+from service.history.errors import StoreError
+from service.history.store import Store
+from service.recordings.catalogue import Catalogue
+from service.recordings.recorder import MachineRecorder, RecorderStatus
+from service.settings.service import ServiceSettings
+from service.stream.liveness import Pulse
+from service.stream.transport import Link, MachineCallbacks, MachineLink, MachineTap
+from service.stream.worker import MachineWorker
+from service.terminal.logs import logger
 
 __all__ = ["HttpError", "Runtime", "running"]
 
@@ -63,7 +63,7 @@ class Runtime:
     Parameters
     ----------
     settings : ServiceSettings
-        From `service.config.load_settings`.
+        From `service.settings.service.load_settings`.
 
     Raises
     ------

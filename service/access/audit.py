@@ -18,8 +18,8 @@ from typing import Protocol
 from models.errors import RotorwatchError
 from service.access.rates import MovingWindow
 from service.access.tokens import masked
-from service.logs import logger
-from service.store.records import AuditEntry
+from service.history.records import AuditEntry
+from service.terminal.logs import logger
 
 __all__ = ["STARTED", "AuditLog", "AuditNote", "AuditTrail", "Visit"]
 

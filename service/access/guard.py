@@ -38,9 +38,9 @@ from service.access.requirement import Requirement, requires
 from service.access.routes import PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, TokenStore, parse_token, token_is_valid
-from service.access_settings import AccessSettings
-from service.logs import Limiter, logger
-from service.store.records import TokenRecord
+from service.history.records import TokenRecord
+from service.settings.access import AccessSettings
+from service.terminal.logs import Limiter, logger
 
 __all__ = ["ACCESS_PROBLEMS", "AccessError", "Guard"]
 

@@ -15,10 +15,10 @@ from starlette.types import Scope as AsgiScope
 from service.access.audit import AuditNote, AuditTrail, Visit
 from service.access.origin import SAFE_METHODS
 from service.access.presented import address_of, challenges, network_of
+from service.access.problems import problem_answer
 from service.access.requirement import CALLER
 from service.access.scopes import Caller
-from service.logs import Limiter, logger
-from service.problems import problem_answer
+from service.terminal.logs import Limiter, logger
 
 __all__ = ["VISIT", "AccessMiddleware"]
 

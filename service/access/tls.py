@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from models.errors import MachineFileError
-from service.access_settings import AccessSettings, TlsSettings
+from service.settings.access import AccessSettings, TlsSettings
 
 __all__ = ["server_arguments", "tls_context"]
 

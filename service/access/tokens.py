@@ -11,7 +11,7 @@ from typing import Protocol
 
 from models.errors import MachineFileError
 from service.access.scopes import ANONYMOUS, Scope
-from service.store.records import TokenRecord
+from service.history.records import TokenRecord
 
 __all__ = ["LONGEST_DAYS", "PresentedToken", "TokenStore", "masked", "new_token", "parse_token", "token_is_valid"]
 

@@ -19,9 +19,9 @@ from models.errors import MachineFileError
 from service.commands.running import HistoryOption, exit_codes
 
 if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
-    from service.config import HistorySettings
-    from service.store.records import AuditEntry, TokenRecord
-    from service.store.store import Store
+    from service.history.records import AuditEntry, TokenRecord
+    from service.history.store import Store
+    from service.settings.service import HistorySettings
 
 __all__ = ["creation_hint", "register"]
 
@@ -223,8 +223,8 @@ def _audit_line(entry: "AuditEntry", who: int, origin: int) -> str:
 
 @contextmanager
 def _opened(config: Path | None) -> "Iterator[Store]":
-    from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
-    from service.store.store import Store  # noqa: PLC0415
+    from service.history.store import Store  # noqa: PLC0415
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
     history = load_settings(config).history
     if history.in_memory:
@@ -242,7 +242,7 @@ def _opened(config: Path | None) -> "Iterator[Store]":
 
 def _write(store: "Store", action: str, reason: str) -> None:
     """Into the audit log, before it is done."""
-    from service.store.records import AuditEntry  # noqa: PLC0415  # keeps --help quick
+    from service.history.records import AuditEntry  # noqa: PLC0415  # keeps --help quick
 
     try:
         user = getpass.getuser()

@@ -9,7 +9,7 @@ from models.errors import MachineFileError
 from service.commands.running import HistoryOption, exit_codes
 
 if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
-    from service.store.file import HistoryFile
+    from service.history.file import HistoryFile
 
 __all__ = ["register"]
 
@@ -31,7 +31,7 @@ def check(config: HistoryOption = None) -> None:
     [cyan]rotorwatch history check --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.store.backup import faults  # noqa: PLC0415  # keeps --help quick
+        from service.history.backup import faults  # noqa: PLC0415  # keeps --help quick
 
         file = _chosen(config).path
         found = faults(file)
@@ -52,7 +52,7 @@ def backup(
     [cyan]rotorwatch history backup /backup/history-monday.sqlite --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.store.backup import back_up  # noqa: PLC0415  # keeps --help quick
+        from service.history.backup import back_up  # noqa: PLC0415  # keeps --help quick
 
         file = _chosen(config).path
         back_up(file, copy)
@@ -72,7 +72,7 @@ def restore(
     [cyan]rotorwatch history restore /backup/history-monday.sqlite --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.store.backup import restore as put_back  # noqa: PLC0415  # keeps --help quick
+        from service.history.backup import restore as put_back  # noqa: PLC0415  # keeps --help quick
 
         file = _chosen(config)
         kept = put_back(file, backup_file)
@@ -80,8 +80,8 @@ def restore(
 
 
 def _chosen(config: Path | None) -> "HistoryFile":
-    from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
-    from service.store.database import Database  # noqa: PLC0415
+    from service.history.database import Database  # noqa: PLC0415
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
     database = Database(load_settings(config).history.database, 5.0)
     if database.file is None:

@@ -132,8 +132,8 @@ def plot(
             if number is not None and not 0 < number < 1e9:
                 raise MachineFileError(f"{name} is {number:g}, expected a number above 0")
         _need_matplotlib()
-        from service.plots.request import PlotRequest, draw_plot  # noqa: PLC0415  # keeps --help quick
-        from service.plots.style import Look  # noqa: PLC0415
+        from service.analysis.plots.request import PlotRequest, draw_plot  # noqa: PLC0415  # keeps --help quick
+        from service.analysis.plots.style import Look  # noqa: PLC0415
 
         draw_plot(
             PlotRequest(

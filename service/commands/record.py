@@ -17,8 +17,8 @@ from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
     from models.signals.salvage import Salvage
-    from service.config import HistorySettings, RecordingSettings
-    from service.recording.recorder import MachineRecorder
+    from service.recordings.recorder import MachineRecorder
+    from service.settings.service import HistorySettings, RecordingSettings
 
 __all__ = ["register"]
 
@@ -80,12 +80,12 @@ def record(
             config, machine, out, {k: v for k, v in changes.items() if v is not None}
         )
         from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
-        from service.config import LogSettings  # noqa: PLC0415
-        from service.logs import configure_logging  # noqa: PLC0415
-        from service.recording.recorder import MachineRecorder  # noqa: PLC0415
-        from service.stopping import stop_request  # noqa: PLC0415
-        from service.store.alarm_log import committed_events  # noqa: PLC0415
-        from service.transport import Link, MachineTap  # noqa: PLC0415
+        from service.history.alarm_log import committed_events  # noqa: PLC0415
+        from service.recordings.recorder import MachineRecorder  # noqa: PLC0415
+        from service.settings.service import LogSettings  # noqa: PLC0415
+        from service.stream.transport import Link, MachineTap  # noqa: PLC0415
+        from service.terminal.logs import configure_logging  # noqa: PLC0415
+        from service.terminal.stopping import stop_request  # noqa: PLC0415
 
         configure_logging(LogSettings())
         ends = tuple(connect or (() if listen else (ENDPOINT,)))
@@ -175,7 +175,7 @@ def _settings(
     """Machines, what is kept, and the history of the monitor: the command line over the settings file."""
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
     from models.mistakes import checked  # noqa: PLC0415
-    from service.config import RecordingSettings, load_settings  # noqa: PLC0415
+    from service.settings.service import RecordingSettings, load_settings  # noqa: PLC0415
 
     settings = load_settings(config)
     if not machines and config is None:
@@ -211,8 +211,8 @@ def _summed_up(recorders: "list[MachineRecorder]") -> bool:
 
 def _recover(file: Path, out: Path | None) -> None:
     from models.signals.salvage import inspect_recording, salvage_recording  # noqa: PLC0415  # keeps --help quick
-    from service.recording.catalogue import PART  # noqa: PLC0415
-    from service.recording.leftovers import is_locked, loss_text  # noqa: PLC0415
+    from service.recordings.catalogue import PART  # noqa: PLC0415
+    from service.recordings.leftovers import is_locked, loss_text  # noqa: PLC0415
 
     partial = file.suffix == PART
     if partial and is_locked(file.parent):

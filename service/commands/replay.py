@@ -19,10 +19,10 @@ from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes,
 if TYPE_CHECKING:  # these import numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
     from rotorwatch.records.replays import OfflineSummary
-    from service.replay.control import Control
-    from service.replay.source import RecordingSource
-    from service.replay_link import NetworkPlan
-    from service.stopping import StopRequest
+    from service.recordings.replay.control import Control
+    from service.recordings.replay.source import RecordingSource
+    from service.stream.replay_link import NetworkPlan
+    from service.terminal.stopping import StopRequest
 
 __all__ = ["NamespaceOption", "in_namespace", "register", "summary_lines"]
 
@@ -135,9 +135,9 @@ def replay(
         if nice:
             os.nice(nice)
         one_blas_thread()
-        from service.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
-        from service.replay.control import Control  # noqa: PLC0415
-        from service.replay.source import RecordingSource  # noqa: PLC0415
+        from service.recordings.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
+        from service.recordings.replay.control import Control  # noqa: PLC0415
+        from service.recordings.replay.source import RecordingSource  # noqa: PLC0415
 
         try:
             source = RecordingSource(files)
@@ -153,7 +153,7 @@ def replay(
                 request = _Offline(source.machine(key), machine, from_ns, to_ns, out, overwrite, progress)
                 _evaluate(source, request, wishes)
                 return
-            from service.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
+            from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
 
             plan = NetworkPlan(
                 link=_link(connect, listen),
@@ -185,9 +185,9 @@ class _Offline:
 
 def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") -> None:
     from rotorwatch.records.replays import ReplayLine  # noqa: PLC0415
-    from service.replay.choice import choose_machine  # noqa: PLC0415  # keeps --help quick
-    from service.replay.console import show  # noqa: PLC0415
-    from service.replay.offline import OfflineReplay  # noqa: PLC0415
+    from service.recordings.replay.choice import choose_machine  # noqa: PLC0415  # keeps --help quick
+    from service.recordings.replay.console import show  # noqa: PLC0415
+    from service.recordings.replay.offline import OfflineReplay  # noqa: PLC0415
 
     as_json = request.progress == "json"
     if as_json and request.out is None:
@@ -261,7 +261,7 @@ def _discard(_: object) -> None:
 @contextmanager
 def _stoppable(control: "Control") -> Iterator[None]:
     """SIGINT and SIGTERM end the replay in order."""
-    from service.stopping import stop_request  # noqa: PLC0415  # keeps --help quick
+    from service.terminal.stopping import stop_request  # noqa: PLC0415  # keeps --help quick
 
     over = threading.Event()
 

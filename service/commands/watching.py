@@ -17,7 +17,7 @@ from service.commands.running import ENDPOINT, ConnectOption, LinkOption, exit_c
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from rotorwatch.records.health import Health
-    from service.transport import TopicMessage
+    from service.stream.transport import TopicMessage
 
 __all__ = ["register"]
 
@@ -72,8 +72,8 @@ def watch(
             raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
         from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
         from models.signals.link import LinkSettings  # noqa: PLC0415
-        from service.stopping import stop_request  # noqa: PLC0415
-        from service.transport import follow  # noqa: PLC0415
+        from service.stream.transport import follow  # noqa: PLC0415
+        from service.terminal.stopping import stop_request  # noqa: PLC0415
 
         topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
         base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
@@ -182,7 +182,7 @@ class _Lines:
 
     def __call__(self, message: "TopicMessage") -> None:
         from rotorwatch import AlarmCloudEvent, AlarmStates, Health, Report  # noqa: PLC0415  # keeps --help quick
-        from service import lines  # noqa: PLC0415
+        from service.terminal import lines  # noqa: PLC0415
 
         if message.key.endswith("/alarm/event"):
             event = AlarmCloudEvent.model_validate_json(message.text)

@@ -26,7 +26,7 @@ def secret() -> None:
 
     [cyan](umask 077; rotorwatch webhook secret > pager.secret)[/cyan]
     """
-    from service.webhooks.signature import new_secret  # noqa: PLC0415  # keeps --help quick
+    from service.delivery.webhooks.signature import new_secret  # noqa: PLC0415  # keeps --help quick
 
     typer.echo(new_secret())
 
@@ -42,8 +42,8 @@ def test(
     [cyan]rotorwatch webhook test pager --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.config import load_settings  # noqa: PLC0415  # keeps --help quick
-        from service.webhooks.desk import send_test  # noqa: PLC0415
+        from service.delivery.webhooks.desk import send_test  # noqa: PLC0415
+        from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
         webhooks = load_settings(config).webhooks
         settings = next((webhook for webhook in webhooks if webhook.name == name), None)

@@ -5,7 +5,7 @@ import pytest
 from models.commissioning.commission import Commissioning
 from models.commissioning.installed import Installed
 from models.diagnosis.readings import ParameterReading
-from service.residuals import Evaluation, evaluator_for
+from service.monitor.evaluation import Evaluation, evaluator_for
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream
 

@@ -23,8 +23,8 @@ from models.errors import CheckpointError
 from models.ingest import Gate, Reason, Verdict
 from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
-from service.monitor import MachineMonitor
-from service.reports import MonitorReport
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import MonitorReport
 from simulator.scenario import Event
 from tests.service.live import LAB, scenario_blocks
 

@@ -17,7 +17,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import load_machine
 from models.physics.possible import impossible
-from service.residuals import KnownMachineEvaluator
+from service.monitor.evaluation import KnownMachineEvaluator
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 MACHINE = load_machine("lab")

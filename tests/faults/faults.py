@@ -12,8 +12,8 @@ from pathlib import Path
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, STREAM_LOST
 from rotorwatch.records.health import HealthState
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.faults.rig import Plant, Seen, locked, pause
 from tests.service.hooked import Got, hook, settings_for
 from tests.service.live import Feed, endpoint, open_session, program, scenario_blocks, until

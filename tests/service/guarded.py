@@ -19,14 +19,14 @@ from pydantic import BaseModel
 
 from service.access.audit import AuditNote
 from service.access.guard import Guard
+from service.access.problems import add_problems
 from service.access.scopes import Caller, Scope
 from service.access.tls import server_arguments
 from service.access.tokens import new_token
-from service.access_settings import AccessSettings
-from service.problems import add_problems
-from service.store.records import AuditEntry, TokenRecord
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.records import AuditEntry, TokenRecord
+from service.history.retention import Retention
+from service.history.store import Store
+from service.settings.access import AccessSettings
 
 JSON = {"content-type": "application/json"}
 

@@ -14,9 +14,9 @@ from standardwebhooks import Webhook
 
 from rotorwatch.records.alarms import AlarmCloudEvent, EventKind, Severity
 from rotorwatch.records.example import example
-from service.store.records import StoredEvent
-from service.webhook_settings import WebhookSettings
-from service.webhooks.signature import new_secret
+from service.delivery.webhooks.signature import new_secret
+from service.history.records import StoredEvent
+from service.settings.webhooks import WebhookSettings
 
 __all__ = ["Got", "Hook", "alarm_event", "hook", "settings_for"]
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from models.signals.link import LinkSettings
 from rotorwatch.client.alarm_log import follow_alarms
 from rotorwatch.records.alarms import AlarmCloudEvent
-from service.transport import Link
+from service.stream.transport import Link
 
 PLACE = "demo/lab"
 ALARM = "data-gap"
@@ -65,10 +65,10 @@ def follow(connect: str, path: Path) -> None:
 def monitor(listen: str, history: str) -> None:
     """Run the service; its alarm is taken out of service and put back again and again."""
     from rotorwatch.records.operations import OperationKind  # noqa: PLC0415  # followers need none of this
-    from service.alarms.operation import Operation  # noqa: PLC0415  # followers need none of this
-    from service.config import HistorySettings, HttpSettings, LogSettings, MachineEntry, ServiceSettings  # noqa: PLC0415
-    from service.logs import configure_logging  # noqa: PLC0415
+    from service.monitor.alarms.operation import Operation  # noqa: PLC0415  # followers need none of this
     from service.runtime import running  # noqa: PLC0415
+    from service.settings.service import HistorySettings, HttpSettings, LogSettings, MachineEntry, ServiceSettings  # noqa: PLC0415
+    from service.terminal.logs import configure_logging  # noqa: PLC0415
     from tests.service.live import OPEN, Feed, open_session, until  # noqa: PLC0415
 
     settings = ServiceSettings(

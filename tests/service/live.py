@@ -21,10 +21,10 @@ from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
 from rotorwatch.records.health import Health
-from service.access_settings import AccessSettings, LimitSettings
-from service.config import HistorySettings, HttpSettings, MachineEntry, QueueSettings, ServiceSettings
 from service.runtime import Runtime, running
-from service.worker import MachineWorker
+from service.settings.access import AccessSettings, LimitSettings
+from service.settings.service import HistorySettings, HttpSettings, MachineEntry, QueueSettings, ServiceSettings
+from service.stream.worker import MachineWorker
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks

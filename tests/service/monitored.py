@@ -13,9 +13,9 @@ from models.machine import load_machine
 from rotorwatch.records.monitor import Problem
 from service.access.scopes import Scope
 from service.access.tokens import new_token
-from service.access_settings import AccessSettings, LimitSettings
 from service.runtime import Runtime, running
-from service.worker import MachineWorker
+from service.settings.access import AccessSettings, LimitSettings
+from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.live import Feed, endpoint, machine_file, open_session, scenario_blocks, send, settings, until
 

@@ -10,7 +10,7 @@ from models.alarm_names import STREAM_LOST
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
-from service.worker import MachineWorker
+from service.stream.worker import MachineWorker
 from simulator.recorder import record
 from tests.service.live import LAB
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner, Result
 
 from service.access.scopes import Scope
 from service.commands import access as access_commands
-from service.config import HistorySettings
+from service.settings.service import HistorySettings
 from tests.service.guarded import Guarded, guarded
 from tests.service.live import ROOT, endpoint, program
 

@@ -12,7 +12,7 @@ from fastapi import FastAPI, WebSocket
 from service.access.guard import AccessError
 from service.access.routes import undeclared_routes
 from service.access.scopes import Scope
-from service.access_settings import AccessSettings
+from service.settings.access import AccessSettings
 from tests.service.guarded import JSON, Guarded, application, basic, guarded, problem, send, served
 
 READ, OPERATE, CONFIGURE = Scope

@@ -17,8 +17,8 @@ from structlog.testing import capture_logs
 from service.access.audit import STARTED
 from service.access.guard import Guard
 from service.access.scopes import Caller, Scope
-from service.access_settings import AccessSettings, LimitSettings
-from service.store.records import TokenRecord
+from service.history.records import TokenRecord
+from service.settings.access import AccessSettings, LimitSettings
 from tests.service.guarded import JSON, Guarded, application, basic, guarded, problem
 from tests.service.live import until
 

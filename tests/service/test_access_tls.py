@@ -10,7 +10,7 @@ import trustme
 from models.errors import MachineFileError
 from service.access.scopes import Scope
 from service.access.tls import server_arguments, tls_context
-from service.access_settings import AccessSettings, TlsSettings
+from service.settings.access import AccessSettings, TlsSettings
 from tests.service.guarded import guarded
 
 

@@ -11,8 +11,8 @@ from service.access.presented import network_of
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.scopes import ANONYMOUS, Scope
 from service.access.tokens import masked, new_token, parse_token, token_is_valid
-from service.access_settings import AccessSettings, TlsSettings, check_access
-from service.store.records import TokenRecord
+from service.history.records import TokenRecord
+from service.settings.access import AccessSettings, TlsSettings, check_access
 
 DAY_NS = 86_400 * 10**9
 ALPHABET = "0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz"

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from models.machine import AlarmSettings
 from rotorwatch.records.alarms import AlarmState, EventKind
-from service.alarms.alarm import Alarm, AlarmEvent
-from service.alarms.book import AlarmBook
-from service.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, Happening, follow
-from service.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, Happening, follow
+from service.monitor.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
 
 ROOT = Path(__file__).parents[2]
 S = 10**9

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from service.store.alarm_log import committed_events
-from service.store.errors import StoreError
-from service.store.records import Step
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.alarm_log import committed_events
+from service.history.errors import StoreError
+from service.history.records import Step
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import alarm_event
 

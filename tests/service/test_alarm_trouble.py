@@ -18,22 +18,22 @@ from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from rotorwatch.records.alarms import AlarmState
 from rotorwatch.records.health import HealthState
-from service.alarm_conversion import Identity
-from service.alarms.alarm import Alarm, AlarmEvent
-from service.alarms.book import AlarmBook
-from service.alarms.operation import Operation
-from service.config import QueueSettings
-from service.conversion import machine_hash
-from service.inbox import RawBlock
-from service.monitor import MachineMonitor
-from service.remembered import checkpoint_step, restored, stored_readings
-from service.reports import WindowReport
-from service.store.errors import StoreError
-from service.store.machine import MachineStore
-from service.store.records import Checkpoint, Step
-from service.store.retention import Retention
-from service.store.store import Store
-from service.worker import Clocks, MachineWorker
+from service.history.errors import StoreError
+from service.history.machine import MachineStore
+from service.history.records import Checkpoint, Step
+from service.history.retention import Retention
+from service.history.store import Store
+from service.monitor.alarm_conversion import Identity
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.alarms.operation import Operation
+from service.monitor.conversion import machine_hash
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import WindowReport
+from service.settings.service import QueueSettings
+from service.stream.checkpoints import checkpoint_step, restored, stored_readings
+from service.stream.inbox import RawBlock
+from service.stream.worker import Clocks, MachineWorker
 from simulator.scenario import load_scenario
 from tests.service.live import START_NS, until
 

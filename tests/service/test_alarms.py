@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from models.alarm_names import MODEL, STREAM_LOST
 from models.machine import AlarmSettings
 from rotorwatch.records.alarms import Severity
-from service.alarms.alarm import AlarmEvent
-from service.alarms.book import AlarmBook
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.alarms.book import AlarmBook
 
 CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6}
 MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}

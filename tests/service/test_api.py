@@ -16,7 +16,7 @@ from rotorwatch.records.machines import DetectableChanges, MachineConfiguration,
 from rotorwatch.records.monitor import Alive, Readiness
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.runtime import Runtime
-from service.worker import MachineWorker
+from service.stream.worker import MachineWorker
 from tests.service.live import START_NS
 from tests.service.monitored import PLACE, answered, client, faulty, problem
 

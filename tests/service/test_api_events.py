@@ -16,15 +16,15 @@ import pytest
 
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
-from service import event_feed
 from service.access.scopes import Scope
-from service.access_settings import AccessSettings, LimitSettings
-from service.alarms.operation import Operation
-from service.config import MachineEntry
-from service.event_feed import CursorError, cursor_text, parsed_cursor
+from service.delivery import event_feed
+from service.delivery.event_feed import CursorError, cursor_text, parsed_cursor
+from service.history.errors import StoreError
+from service.monitor.alarms.operation import Operation
 from service.runtime import Runtime, running
-from service.store.errors import StoreError
-from service.worker import MachineWorker
+from service.settings.access import AccessSettings, LimitSettings
+from service.settings.service import MachineEntry
+from service.stream.worker import MachineWorker
 from tests.service.live import endpoint, settings, until
 from tests.service.monitored import OPEN, client, problem, token
 

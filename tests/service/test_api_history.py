@@ -13,10 +13,10 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report, StreamStatus
 from rotorwatch.records.history import AlarmEventList, AuditList
 from rotorwatch.records.machines import MachineDescription
-from service import conversion
-from service.alarm_conversion import Identity, alarm_cloud_event
-from service.alarms.alarm import Alarm, AlarmEvent
-from service.reports import DataQuality, MachineHealth, WindowReport
+from service.monitor import conversion
+from service.monitor.alarm_conversion import Identity, alarm_cloud_event
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.reports import DataQuality, MachineHealth, WindowReport
 from service.runtime import Runtime
 from tests.service.live import LAB
 from tests.service.monitored import PLACE, answered, client, fed

@@ -15,9 +15,9 @@ import pytest
 from models.machine import load_machine
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
-from service.asyncapi import asyncapi
+from service.api.asyncapi import asyncapi
 from service.runtime import running
-from service.transport import route
+from service.stream.transport import route
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks

@@ -10,7 +10,7 @@ from models.ingest import Reason
 from models.signals.block import SampleBlock
 from models.signals.wire import BLOCK_ENCODING, encode_block
 from service.runtime import Runtime
-from service.worker import MachineWorker
+from service.stream.worker import MachineWorker
 from tests.service.live import LAB, Feed, endpoint, open_session, service, until
 
 HASH = LAB.descriptor.schema_hash

@@ -26,10 +26,10 @@ from rotorwatch import (
 )
 from rotorwatch.client import errors
 from service.access.scopes import Scope
-from service.access_settings import AccessSettings, TlsSettings
-from service.config import HistorySettings, HttpSettings, ServiceSettings
 from service.runtime import Runtime, running
-from service.worker import MachineWorker
+from service.settings.access import AccessSettings, TlsSettings
+from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
+from service.stream.worker import MachineWorker
 from tests.service.live import ROOT, Feed, endpoint, machine_file, open_session, settings, until
 from tests.service.monitored import GUARDED, OPEN, faulty, token
 

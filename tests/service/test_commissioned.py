@@ -12,11 +12,11 @@ from models.errors import BundleError
 from models.machine import AlarmSettings, MachineFile
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState
-from service.alarm_conversion import Identity
-from service.alarms.alarm import AlarmEvent
-from service.conversion import report
-from service.monitor import MachineMonitor
-from service.reports import WindowReport
+from service.monitor.alarm_conversion import Identity
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.conversion import report
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import WindowReport
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
     LAB,

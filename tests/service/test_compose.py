@@ -14,8 +14,8 @@ import pytest
 import typer.main
 import yaml
 
-from service.config import load_settings
 from service.rotorwatch import app as rotorwatch
+from service.settings.service import load_settings
 from simulator.rotorsim import app as rotorsim
 from tests.service.live import ROOT, endpoint, program, until
 

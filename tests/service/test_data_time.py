@@ -11,14 +11,14 @@ from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, read_recording
 from models.signals.wire import decode_block
 from rotorwatch.records.replays import ReplayLine, ReplayProgress
+from service.analysis.plots.request import PlotRequest, draw_plot
+from service.analysis.plots.spectrum import read_spectrum, read_waterfall
+from service.analysis.plots.stretches import RecordedStream
 from service.commands.replay import summary_lines
-from service.plots.request import PlotRequest, draw_plot
-from service.plots.spectrum import read_spectrum, read_waterfall
-from service.plots.stretches import RecordedStream
-from service.replay.control import Control
-from service.replay.data_time import data_start_ns
-from service.replay.player import PlayPlan, play
-from service.replay.source import RecordingSource
+from service.recordings.replay.control import Control
+from service.recordings.replay.data_time import data_start_ns
+from service.recordings.replay.player import PlayPlan, play
+from service.recordings.replay.source import RecordingSource
 from service.rotorwatch import app
 from tests.service.live import LAB, START_NS, scenario_blocks
 from tests.service.replaying import hurried, recording, split, write

@@ -13,7 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.demo import FAULTS, Outcome
+from service.commands.demo import FAULTS, Outcome
 from simulator.scenario import load_scenario
 from tests.service.live import endpoint, until
 from tests.service.preloaded import ran

@@ -8,8 +8,8 @@ from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState
-from service.monitor import MachineMonitor
-from service.reports import WindowReport
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import WindowReport
 from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign
 
 DURATION_S = 80.0

@@ -9,12 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 from models.alarm_names import FAULT
-from service.config import HistorySettings
+from service.history.records import StoredEvent, TokenRecord
+from service.history.retention import Retention
+from service.history.store import Store
 from service.rotorwatch import app
 from service.runtime import running as running_here
-from service.store.records import StoredEvent, TokenRecord
-from service.store.retention import Retention
-from service.store.store import Store
+from service.settings.service import HistorySettings
 from tests.service.live import endpoint, machine_file, settings, until
 from tests.service.monitored import client
 from tests.service.test_alarm_trouble import Bench, bench, block

@@ -20,11 +20,11 @@ from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_arrow, encode_block, sender_of
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
-from service.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
-from service.inbox import Inbox, RawBlock
-from service.monitor import MachineMonitor
+from service.monitor.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
+from service.monitor.monitor import MachineMonitor
 from service.runtime import running
-from service.transport import Link, route
+from service.stream.inbox import Inbox, RawBlock
+from service.stream.transport import Link, route
 from tests.service.live import (
     LAB,
     Feed,

@@ -15,10 +15,10 @@ import trustme
 from fastapi import FastAPI
 from structlog.testing import capture_logs
 
-from service.access_settings import AccessSettings, LimitSettings
-from service.config import HttpSettings
-from service.http.server import HttpServer, http_connections
+from service.api.server import HttpServer, http_connections
 from service.runtime import Runtime, running
+from service.settings.access import AccessSettings, LimitSettings
+from service.settings.service import HttpSettings
 from tests.service.live import OPEN, endpoint, program, settings, until
 from tests.service.test_access_tls import files, trusting
 

@@ -15,14 +15,14 @@ from models.commissioning.installed import Installed, install
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
-from service.alarms.alarm import AlarmEvent
-from service.config import QueueSettings
-from service.inbox import RawBlock
-from service.monitor import MachineMonitor
-from service.remembered import stored_event
-from service.store.retention import Retention
-from service.store.store import Store
-from service.worker import MachineWorker
+from service.history.retention import Retention
+from service.history.store import Store
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.monitor import MachineMonitor
+from service.settings.service import QueueSettings
+from service.stream.checkpoints import stored_event
+from service.stream.inbox import RawBlock
+from service.stream.worker import MachineWorker
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 from tests.service.live import START_NS, until

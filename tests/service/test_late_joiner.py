@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.service.live import ROOT, endpoint, until
 
 KILLS = int(os.environ.get("ROTORWATCH_KILLS", "12"))

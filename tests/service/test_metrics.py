@@ -11,10 +11,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from service.access.scopes import Scope
-from service.config import HistorySettings
-from service.metrics.requests import RequestCounts
+from service.delivery.metrics.requests import RequestCounts
+from service.history.errors import StoreError
 from service.runtime import Runtime, running
-from service.store.errors import StoreError
+from service.settings.service import HistorySettings
 from tests.service.hooked import hook, settings_for
 from tests.service.live import ROOT, Feed, endpoint, machine_file, open_session, settings, until
 from tests.service.monitored import GUARDED, PLACE, client, token

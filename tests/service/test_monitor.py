@@ -12,9 +12,9 @@ from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState
-from service.alarms.alarm import AlarmEvent
-from service.monitor import MachineMonitor
-from service.reports import WindowReport
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import WindowReport
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 

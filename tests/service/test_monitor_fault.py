@@ -15,16 +15,16 @@ from models.signals.arrow import write_arrow
 from models.signals.wire import ARROW_ENCODING, encode_block
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState
-from service.alarm_conversion import Identity
-from service.alarms.alarm import AlarmEvent, Evidence
-from service.conversion import machine_hash
-from service.inbox import Inbox, RawBlock
-from service.monitor import MachineMonitor
-from service.remembered import checkpoint_step, restored
-from service.residuals import KnownMachineEvaluator
+from service.history.errors import StoreError
+from service.history.records import Checkpoint, Step
+from service.monitor.alarm_conversion import Identity
+from service.monitor.alarms.alarm import AlarmEvent, Evidence
+from service.monitor.conversion import machine_hash
+from service.monitor.evaluation import KnownMachineEvaluator
+from service.monitor.monitor import MachineMonitor
 from service.runtime import running
-from service.store.errors import StoreError
-from service.store.records import Checkpoint, Step
+from service.stream.checkpoints import checkpoint_step, restored
+from service.stream.inbox import Inbox, RawBlock
 from tests.service.live import (
     LAB,
     START_NS,

@@ -27,7 +27,7 @@ from schemathesis.specs.openapi import checks
 from rotorwatch import __version__
 from service.access.guard import Guard
 from service.access.scopes import Scope
-from service.http.app import create_app
+from service.api.app import create_app
 from service.runtime import Runtime
 from tests.service.monitored import GUARDED, client, faulty, problem, token
 

@@ -16,15 +16,15 @@ from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Report
-from service.plots.correlation import correlations_of, latest_window
-from service.plots.orbit import read_orbits
-from service.plots.spectrum import read_spectrum, read_waterfall, shown_as
-from service.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
-from service.plots.stretches import RecordedStream
-from service.plots.style import Look
-from service.plots.trend import read_trend, trend_machine, trend_of
-from service.replay.offline import OfflineReplay
-from service.replay.source import RecordingSource
+from service.analysis.plots.correlation import correlations_of, latest_window
+from service.analysis.plots.orbit import read_orbits
+from service.analysis.plots.spectrum import read_spectrum, read_waterfall, shown_as
+from service.analysis.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
+from service.analysis.plots.stretches import RecordedStream
+from service.analysis.plots.style import Look
+from service.analysis.plots.trend import read_trend, trend_machine, trend_of
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from tests.service.live import LAB, START_NS, scenario_blocks

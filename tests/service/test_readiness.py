@@ -9,12 +9,12 @@ import pytest
 
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.monitor import MachineReadiness, Readiness
-from service.config import HistorySettings, ServiceSettings
-from service.pulse import Pulse
-from service.readiness import readiness_of
+from service.api.readiness import readiness_of
+from service.history.retention import Retention
+from service.history.store import Store
 from service.runtime import Runtime, running
-from service.store.retention import Retention
-from service.store.store import Store
+from service.settings.service import HistorySettings, ServiceSettings
+from service.stream.liveness import Pulse
 from tests.service.hooked import hook, settings_for
 from tests.service.live import Feed, endpoint, machine_file, open_session, service, settings, until
 from tests.service.monitored import client
@@ -73,7 +73,7 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(tmp_path: Pat
 
 
 def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.readiness.STUCK_S", 0.5)
+    monkeypatch.setattr("service.api.readiness.STUCK_S", 0.5)
     release = threading.Event()
     with service(endpoint()) as (runtime, worker):
         until(lambda: worker.alive, "the thread")
@@ -98,7 +98,7 @@ def void(_: object) -> None:
 
 
 def test_webhooks_and_recorders_are_stated_and_no_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.webhooks.dispatcher._QUIET_S", 1e6)  # they are woken, or they sleep on
+    monkeypatch.setattr("service.delivery.webhooks.dispatcher._QUIET_S", 1e6)  # they are woken, or they sleep on
     address = endpoint()
     machine = machine_file(
         tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")

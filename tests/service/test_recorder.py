@@ -19,12 +19,12 @@ import zenoh
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording, summarize_recording
 from models.signals.salvage import inspect_recording, salvage_recording
 from models.signals.wire import encode_block
-from service.config import RecordingSettings, ServiceSettings
-from service.recording.backlog import Backlog
-from service.recording.catalogue import Catalogue
-from service.recording.leftovers import is_locked
-from service.recording.recorder import MachineRecorder
+from service.recordings.backlog import Backlog
+from service.recordings.catalogue import Catalogue
+from service.recordings.leftovers import is_locked
+from service.recordings.recorder import MachineRecorder
 from service.runtime import running
+from service.settings.service import RecordingSettings, ServiceSettings
 from tests.service.live import (
     LAB,
     ROOT,

@@ -13,7 +13,7 @@ import zenoh
 
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
 from models.signals.salvage import inspect_recording, salvage_recording
-from service.recording.leftovers import DAMAGED
+from service.recordings.leftovers import DAMAGED
 from tests.service.live import LAB, Program, endpoint, program, until
 from tests.service.preloaded import ran
 

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
-from service.config import RecordingSettings
-from service.recording.catalogue import Catalogue, Recording, kept_reasons, name_of
-from service.recording.recorder import MachineRecorder
-from service.recording.retention import AlarmMark, alarm_mark, decide
+from service.history.errors import StoreError
+from service.history.records import StoredEvent
+from service.recordings.catalogue import Catalogue, Recording, kept_reasons, name_of
+from service.recordings.recorder import MachineRecorder
+from service.recordings.retention import AlarmMark, alarm_mark, decide
 from service.runtime import Runtime, running
-from service.store.errors import StoreError
-from service.store.records import StoredEvent
+from service.settings.service import RecordingSettings
 from tests.service.live import LAB, Feed, Program, endpoint, machine_file, open_session, program, settings, until
 from tests.service.test_store import alarm_event
 from tests.service.test_survives import PATIENT, do, log

@@ -17,7 +17,9 @@ from models.signals.link import LinkSettings
 from rotorwatch.records.monitor import Problem
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
-from service.config import (
+from service.api.routes.replays import ReplayDesk
+from service.runtime import Runtime, running
+from service.settings.service import (
     HistorySettings,
     HttpSettings,
     MachineEntry,
@@ -25,8 +27,6 @@ from service.config import (
     ReplaySettings,
     ServiceSettings,
 )
-from service.http.replays import ReplayDesk
-from service.runtime import Runtime, running
 from simulator.scenario import parse_fault
 from tests.service.live import START_NS, endpoint, scenario_blocks, until
 from tests.service.monitored import OPEN

@@ -14,14 +14,14 @@ from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import read_recording
 from rotorwatch.records.replays import OfflineSummary
-from service.monitor import MachineMonitor
-from service.replay.control import Control
-from service.replay.offline import OfflineReplay
-from service.replay.source import RecordingSource
-from service.replay_link import NetworkPlan, replay_to_network
+from service.monitor.monitor import MachineMonitor
+from service.recordings.replay.control import Control
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
 from service.runtime import running
-from service.transport import TopicMessage, follow
-from service.worker import MachineWorker
+from service.stream.replay_link import NetworkPlan, replay_to_network
+from service.stream.transport import TopicMessage, follow
+from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.live import LAB, endpoint, scenario_blocks, send, service, settings, until
 from tests.service.replaying import digest_of, lines_of, recording, split

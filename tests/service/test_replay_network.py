@@ -10,11 +10,11 @@ import zenoh
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import RecordedMessage, read_recording
-from service.inbox import RawBlock
-from service.replay.control import Control
-from service.replay.source import RecordingSource
-from service.replay_link import LiveMachineError, NetworkPlan, replay_to_network
-from service.transport import Link, MachineCallbacks, MachineLink, route
+from service.recordings.replay.control import Control
+from service.recordings.replay.source import RecordingSource
+from service.stream.inbox import RawBlock
+from service.stream.replay_link import LiveMachineError, NetworkPlan, replay_to_network
+from service.stream.transport import Link, MachineCallbacks, MachineLink, route
 from tests.service.live import LAB, endpoint, scenario_blocks, service, until
 from tests.service.replaying import recording, write
 

@@ -7,10 +7,10 @@ import pytest
 
 from models.errors import MachineFileError, RecordingError
 from models.signals.recording import RecordedMessage
-from service.replay.console import obey
-from service.replay.control import Control
-from service.replay.player import PlayPlan, play
-from service.replay.source import RecordingSource, parse_moment
+from service.recordings.replay.console import obey
+from service.recordings.replay.control import Control
+from service.recordings.replay.player import PlayPlan, play
+from service.recordings.replay.source import RecordingSource, parse_moment
 from tests.service.replaying import write
 
 SECOND = 10**9

@@ -13,7 +13,7 @@ import pytest
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
-from service.lines import alarm_event_line, alarm_state_lines, health_line, report_line
+from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
 from simulator.scenario import parse_fault
 from tests.service.live import (
     ROOT,
@@ -55,8 +55,8 @@ def test_help_is_quick_because_nothing_heavy_is_imported() -> None:
 
 def test_the_service_never_imports_torch() -> None:
     code = (
-        "import sys, service.runtime, service.transport, service.http.app\n"
-        "from service.config import MachineEntry, ServiceSettings\n"
+        "import sys, service.runtime, service.stream.transport, service.api.app\n"
+        "from service.settings.service import MachineEntry, ServiceSettings\n"
         "service.runtime.Runtime(ServiceSettings(machines=(MachineEntry(file='lab', bundle='lab'),)))\n"
         "assert 'numpy' in sys.modules\nassert 'torch' not in sys.modules"
     )

@@ -7,7 +7,7 @@ import pytest
 from pydantic import BaseModel
 
 from models.errors import MachineFileError
-from service.config import DEFAULT_LISTEN, ServiceSettings, load_settings
+from service.settings.service import DEFAULT_LISTEN, ServiceSettings, load_settings
 from tests.service.live import ROOT, machine_file
 from tests.service.test_rotorwatch_cli import run
 

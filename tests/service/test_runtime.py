@@ -20,15 +20,15 @@ from models.machine import load_machine
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
-from service import conversion
-from service.alarm_conversion import alarm_cloud_event
-from service.config import HttpSettings, MachineEntry, ServiceSettings
-from service.logs import Limiter
-from service.monitor import MachineMonitor
-from service.remembered import stored_event, stored_report
-from service.reports import MonitorReport
+from service.monitor import conversion
+from service.monitor.alarm_conversion import alarm_cloud_event
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import MonitorReport
 from service.runtime import HttpError, Runtime, running
-from service.transport import LinkError, TopicMessage, follow
+from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
+from service.stream.checkpoints import stored_event, stored_report
+from service.stream.transport import LinkError, TopicMessage, follow
+from service.terminal.logs import Limiter
 from simulator.scenario import parse_fault
 from tests.service.live import (
     IN_MEMORY,
@@ -156,7 +156,7 @@ class _Poisoned(MachineMonitor):
 
 
 def test_defect_in_the_monitor_costs_one_block_and_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.worker.MachineMonitor", _Poisoned)
+    monkeypatch.setattr("service.stream.worker.MachineMonitor", _Poisoned)
     address = endpoint()
     with service(address) as (runtime, worker), open_session(address) as session:
         feed = Feed(session)

@@ -17,12 +17,12 @@ from models.signals.block import SampleBlock
 from models.signals.channels import state_name
 from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
-from service.snapshots import desk as desk_module
-from service.snapshots.choice import SnapshotError
-from service.snapshots.desk import LatestData
-from service.snapshots.path import MOST_REVOLUTIONS
-from service.snapshots.prediction import Prediction, predict
-from service.snapshots.revolutions import NewestBlocks
+from service.analysis.snapshots import desk as desk_module
+from service.analysis.snapshots.choice import SnapshotError
+from service.analysis.snapshots.desk import LatestData
+from service.analysis.snapshots.path import MOST_REVOLUTIONS
+from service.analysis.snapshots.prediction import Prediction, predict
+from service.analysis.snapshots.revolutions import NewestBlocks
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (

@@ -12,9 +12,9 @@ import pytest
 from sqlalchemy import create_engine, event, make_url, text
 from sqlalchemy.exc import DBAPIError
 
-from service.store.errors import StoreError
-from service.store.machine import MachineStore
-from service.store.records import (
+from service.history.errors import StoreError
+from service.history.machine import MachineStore
+from service.history.records import (
     AuditEntry,
     Checkpoint,
     CheckpointHead,
@@ -25,8 +25,8 @@ from service.store.records import (
     StoredReport,
     TokenRecord,
 )
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 
 NS = 1_000_000_000

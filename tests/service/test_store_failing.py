@@ -17,13 +17,13 @@ import psycopg
 import pytest
 from sqlalchemy import Select, func, literal, select, text
 
-from service.store.database import Database
-from service.store.errors import StoreError
-from service.store.machine import MachineStore
-from service.store.records import Step
-from service.store.retention import Retention
-from service.store.schema import MIGRATING
-from service.store.store import Store
+from service.history.database import Database
+from service.history.errors import StoreError
+from service.history.machine import MachineStore
+from service.history.records import Step
+from service.history.retention import Retention
+from service.history.schema import MIGRATING
+from service.history.store import Store
 from tests.service.live import until
 from tests.service.postgres import KINDS, USER, PostgresServer, database_url, postgres_server
 from tests.service.test_store import T0, alarm_event, head, hop_step
@@ -359,7 +359,7 @@ ENDLESS = select(func.count()).select_from(ONES.union_all(select(ONES.c.n)))
 def test_whoever_asks_while_the_history_is_closed_is_answered(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.store.database._FINISH_S", 0.05)
+    monkeypatch.setattr("service.history.database._FINISH_S", 0.05)
     database = Database(database_url(kind, tmp_path), QUICK_S)
     database.answer_s = 5.0  # as long as a PostgreSQL server goes on with a query that nobody waits for
     database.start()

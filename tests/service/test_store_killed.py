@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.service.live import program
 from tests.service.postgres import KINDS, database_url
 

@@ -11,11 +11,11 @@ from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, inspect, make_url, text
 from sqlalchemy.engine import Engine
 
-from service.store.errors import StoreError
-from service.store.retention import Retention
-from service.store.schema import migrate
-from service.store.store import Store
-from service.store.tables import REVISION, metadata
+from service.history.errors import StoreError
+from service.history.retention import Retention
+from service.history.schema import migrate
+from service.history.store import Store
+from service.history.tables import REVISION, metadata
 from tests.service.postgres import KINDS, database_url
 
 
@@ -73,7 +73,7 @@ def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
 def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_need(url: str) -> None:
     opened_and_closed(url)
     code = (
-        "import sys; from service.store.store import Store; from service.store.retention import Retention; "
+        "import sys; from service.history.store import Store; from service.history.retention import Retention; "
         "store = Store(sys.argv[1], Retention()); store.open(); store.machine('demo', 'lab'); store.close(); "
         "print({'alembic', 'sqlalchemy.orm', 'sqlalchemy.ext.asyncio'} & set(sys.modules))"
     )
@@ -84,7 +84,7 @@ def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_ne
 def test_buckets_of_an_older_version_get_the_readings_that_are_still_there(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.store.trend._SINGLE", 0)
+    monkeypatch.setattr("service.history.trend._SINGLE", 0)
     engine = engine_for(url)
     statements = (
         "INSERT INTO machines VALUES (1, 'demo', 'lab', '', 3, 0, 3)",

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.store.records import Step, StoredEvent, StoredReading, StoredReport
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.records import Step, StoredEvent, StoredReading, StoredReport
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import alarm_event
 

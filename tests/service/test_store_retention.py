@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from service.store.machine import MachineStore
-from service.store.records import Bucket, Dropped, Step, StoredReading, StoredReport
-from service.store.retention import Retention
-from service.store.store import Store
+from service.history.machine import MachineStore
+from service.history.records import Bucket, Dropped, Step, StoredReading, StoredReport
+from service.history.retention import Retention
+from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import AUDIT, T0, alarm_event
 
@@ -164,7 +164,7 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
 def test_a_trend_over_many_windows_is_taken_from_buckets_to_the_reading(
     store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.store.trend._SINGLE", 100)
+    monkeypatch.setattr("service.history.trend._SINGLE", 100)
     lab = store.machine("demo", "lab")
     written = write(lab, clock, 1500)
     bounds = (None, int(written.ends[137])), (int(written.ends[137]), int(written.ends[1301])), (None, None)

@@ -18,7 +18,7 @@ from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates, EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
-from service.config import ServiceSettings, load_settings
+from service.settings.service import ServiceSettings, load_settings
 from simulator.truth import TruthRecord
 from tests.service.live import LAB, ROOT, Feed, endpoint, open_session, service, until
 

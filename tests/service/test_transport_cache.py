@@ -9,7 +9,7 @@ import zenoh
 import zenoh.ext
 
 from models.signals.link import LinkSettings
-from service.inbox import RawBlock
+from service.stream.inbox import RawBlock
 from tests.service.live import LAB, endpoint, until
 from tests.service.test_transport import machine_link
 

@@ -10,15 +10,15 @@ import pytest
 import trustme
 from standardwebhooks.webhooks import WebhookVerificationError
 
-from service.store.errors import StoreError
-from service.store.machine import MachineStore
-from service.store.records import Step, StoredEvent
-from service.store.retention import Retention
-from service.store.store import Store
-from service.webhook_settings import WebhookSettings
-from service.webhooks.dispatcher import Cursors, Dispatcher
-from service.webhooks.receiver import CONTENT_TYPE, Receiver
-from service.webhooks.signature import new_secret
+from service.delivery.webhooks.dispatcher import Cursors, Dispatcher
+from service.delivery.webhooks.receiver import CONTENT_TYPE, Receiver
+from service.delivery.webhooks.signature import new_secret
+from service.history.errors import StoreError
+from service.history.machine import MachineStore
+from service.history.records import Step, StoredEvent
+from service.history.retention import Retention
+from service.history.store import Store
+from service.settings.webhooks import WebhookSettings
 from tests.service.guarded import Clock
 from tests.service.hooked import Got, alarm_event, hook, settings_for
 from tests.service.live import until

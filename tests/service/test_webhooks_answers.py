@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.webhooks.answer import Answer, Meaning, answer_of, no_answer, pause_s
+from service.delivery.webhooks.answer import Answer, Meaning, answer_of, no_answer, pause_s
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.webhooks.signature import new_secret
+from service.delivery.webhooks.signature import new_secret
 from tests.service.hooked import Got, Hook, hook, settings_for
 from tests.service.live import START_NS, Feed, Program, endpoint, machine_file, open_session, program, until
 from tests.service.monitored import PLACE

@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 from models.errors import MachineFileError
 from rotorwatch.records.alarms import EventKind, Severity
 from service.commands import webhook as webhook_commands
-from service.config import load_settings
+from service.delivery.webhooks.receiver import Receiver
+from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
 from service.runtime import Runtime
-from service.webhook_settings import WebhookKind, WebhookSettings
-from service.webhooks.receiver import Receiver
-from service.webhooks.signature import new_secret, parse_secret, signing_keys
+from service.settings.service import load_settings
+from service.settings.webhooks import WebhookKind, WebhookSettings
 from tests.service.hooked import hook, settings_for
 from tests.service.live import ROOT, endpoint, settings
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from models.link_file import load_link
-from service.config import HttpSettings, MachineEntry, ServiceSettings
 from service.runtime import running
-from service.transport import Link, TopicMessage, follow
+from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
+from service.stream.transport import Link, TopicMessage, follow
 from tests.service.live import LAB, ROOT, endpoint, program, until
 from tests.service.plant import kept
 

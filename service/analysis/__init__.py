@@ -1,0 +1,1 @@
+"""What windows and recordings show: correlations, spectra and orbits beside theory, as records and as pictures."""

@@ -1,0 +1,184 @@
+"""Correlations of one window against what the trained networks predict, equation by equation."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.moments import plan_for
+from models.diagnosis.networks.bundle import Bundle
+from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
+from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
+from models.diagnosis.readings import EquationReading
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.errors import RotorwatchError, WireError
+from models.ingest import Gate
+from models.machine import Machine, MachineFile
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.keys import MachineKeys
+from models.signals.wire import decode_block
+from service.monitor.descriptor import descriptor_mismatch
+from service.recordings.replay.source import RecordingSource
+
+__all__ = ["Correlations", "Curve", "Panel", "correlations_of", "latest_window"]
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One reference's correlation.
+
+    Attributes
+    ----------
+    label : str
+        Reference channel's state, or plane.
+    measured, predicted : ndarray, shape (n_points,)
+        Target as estimated in the window, and by the network from the other correlations; over the target's rms.
+    """
+
+    label: str
+    measured: FloatArray
+    predicted: FloatArray
+
+    @property
+    def residual(self) -> FloatArray:
+        """Measured less predicted."""
+        return np.asarray(self.measured - self.predicted, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """One equation.
+
+    Attributes
+    ----------
+    number, title, target : str
+        Number and subject of the equation, and name of its target correlation.
+    over : str
+        ``lag`` or ``angle``: what `x` is.
+    x : ndarray, shape (n_points,)
+        Lags, s; or shaft angles, rad.
+    curves : tuple of Curve
+        Empty if it cannot be evaluated.
+    reading : EquationReading
+        What the monitor reports of it: mean squared deviation, that of healthy windows, parameters, or the reason.
+    """
+
+    number: str
+    title: str
+    target: str
+    over: str
+    x: FloatArray
+    curves: tuple[Curve, ...]
+    reading: EquationReading
+
+
+@dataclass(frozen=True, slots=True)
+class Correlations:
+    """All equations of one window.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Oldest and newest data in the window.
+    speed_rad_s : float
+        Mean speed; nan without a shaft angle.
+    panels : tuple of Panel
+    """
+
+    start_ns: int
+    end_ns: int
+    speed_rad_s: float
+    panels: tuple[Panel, ...]
+
+
+def latest_window(
+    source: RecordingSource, keys: MachineKeys, machine: MachineFile, from_ns: int, to_ns: int
+) -> WindowStatistics:
+    """The latest full window of what was recorded, as a monitor that hears it from `from_ns` on has it.
+
+    Raises
+    ------
+    RotorwatchError
+        If there is none; the message says what is there.
+    """
+    window, gate = SlidingWindow(plan_for(machine)), Gate(machine)
+    latest: WindowStatistics | None = None
+    refusal, data_s = "", 0.0
+    for block, schema_hash in _blocks(source, keys, machine, from_ns, to_ns):
+        verdict = gate.judge(block, schema_hash)
+        if not verdict.accepted:
+            refusal = verdict.text
+            continue
+        data_s += block.samples.shape[0] / block.rate_hz
+        if not verdict.continuous:
+            window.gap()
+        if verdict.clock_step_s:
+            window.clear()
+        for _ in window.feed(window.plan.to_si(block.samples), block.start_ns):
+            latest = window.statistics() or latest
+    if latest is None:
+        raise RotorwatchError(
+            f"{', '.join(path.name for path in source.paths)}: no full window of {keys.site}/{keys.machine} before "
+            f"this time: a window is {machine.window.length_s:g} s, usable data are {data_s:.3g} s"
+            + (f"; latest refusal: {refusal}" if refusal else "")
+        )
+    return latest
+
+
+def correlations_of(window: WindowStatistics, machine: Machine, bundle: Bundle) -> Correlations:
+    """Every equation in a window: the figures of the monitor's report, and the curves they come from."""
+    trained = {network.equation.number: network for network in bundle.networks}
+    panels = tuple(_panel(equation, trained.get(equation.number), window, machine) for equation in EQUATIONS)
+    return Correlations(window.start_ns, window.end_ns, window.speed_rad_s, panels)
+
+
+def _panel(
+    equation: Equation | SynchronousEquation,
+    trained: EquationNetwork | None,
+    window: WindowStatistics,
+    machine: Machine,
+) -> Panel:
+    synchronous = isinstance(equation, SynchronousEquation)
+    target = "R[n,disc]" if isinstance(equation, SynchronousEquation) else equation.target.name
+    over = "angle" if synchronous else "lag"
+    if trained is None:
+        reading = EquationReading(equation.number, equation.title, reason="no trained network")
+    else:
+        reading = read_equation(trained, window, machine)
+    if trained is None or reading.reason:
+        return Panel(equation.number, equation.title, target, over, np.empty(0), (), reading)
+    view = window_view(window, machine)
+    rows = equation.rows(view, machine)
+    measured = rows.target / rows.norm
+    predicted = trained.network(rows.inputs / rows.norm)
+    if synchronous:  # one plane after the other, each at all shaft angles
+        labels = ["disc y", "disc z"]
+        n_points = measured.size // len(labels)
+        x = np.asarray(np.arange(n_points) * (2 * np.pi / n_points), dtype=np.float64)
+        columns = (measured.reshape(-1, n_points), predicted.reshape(-1, n_points))
+    else:  # at each lag all references, which the equation's channels begin with, each with its rate
+        n_points = view.correlation.shape[0]
+        x = window.lags_s[-n_points:]
+        columns = (measured.reshape(n_points, -1).T, predicted.reshape(n_points, -1).T)
+        labels = list(equation.channels[: 2 * columns[0].shape[0] : 2])
+    curves = tuple(Curve(label, one, other) for label, one, other in zip(labels, *columns, strict=True))
+    return Panel(equation.number, equation.title, target, over, x, curves, reading)
+
+
+def _blocks(
+    source: RecordingSource, keys: MachineKeys, machine: MachineFile, from_ns: int, to_ns: int
+) -> Iterator[tuple[SampleBlock, str]]:
+    """Blocks as the gate wants them; undecodable ones are left out.
+
+    The schema hash covers site and name: where only these differ from the machine file it says nothing.
+    """
+    descriptor = source.descriptor(keys, from_ns)
+    differences = () if descriptor is None else descriptor_mismatch(descriptor.payload, machine)
+    only_named = all(text.startswith(("site is ", "machine is ")) for text in differences)
+    other_name = (machine.site, machine.name) != (keys.site, keys.machine)
+    for message in source.messages({keys.stream}, from_ns=from_ns, to_ns=to_ns):
+        try:
+            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        except WireError:
+            continue
+        yield block, "" if other_name and only_named else schema_hash

@@ -1,0 +1,91 @@
+"""Picture of the correlations: measured against the networks' prediction, the residual below."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from service.analysis.plots.correlation import Correlations, Panel
+from service.analysis.plots.style import COLOURS, GREY, INK, Look, heading, rpm, stretch_text
+
+__all__ = ["paint_correlations"]
+
+
+def paint_correlations(found: Correlations, name: str, networks: str, look: Look) -> Figure:
+    """Two panels for each equation."""
+    figure = Figure(figsize=look.size_in or (11.0, 8.4))
+    figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0)
+    rows = (len(found.panels) + 1) // 2
+    grid = figure.add_gridspec(3 * rows - 1, 2, height_ratios=([2.2, 1.0, 0.1] * rows)[:-1])
+    for number, panel in enumerate(found.panels):
+        row, column = 3 * (number // 2), number % 2
+        upper = figure.add_subplot(grid[row, column])
+        upper.set_title(f"({panel.number})  {panel.title}", fontweight="bold")
+        if panel.curves:
+            _curves(upper, figure.add_subplot(grid[row + 1, column], sharex=upper), panel)
+        else:
+            _empty(upper, panel)
+    figure.legend(
+        handles=[
+            Line2D([], [], color=INK, linewidth=3.2, alpha=0.35, label="measured in the window"),
+            Line2D([], [], color=INK, linewidth=1.2, linestyle=(0, (3, 1.5)), label="network's prediction"),
+        ],
+        loc="outside lower center",
+        ncols=2,
+    )
+    heading(
+        figure,
+        look,
+        f"{name}: correlations against the networks' prediction",
+        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), f"networks {networks}"),
+    )
+    return figure
+
+
+def _curves(upper: Axes, lower: Axes, panel: Panel) -> None:
+    factor, x_label = (1e3, "lag, ms") if panel.over == "lag" else (180 / np.pi, "shaft angle, °")
+    x = panel.x * factor
+    for number, curve in enumerate(panel.curves):
+        colour = COLOURS[number]
+        label = f"i = {curve.label}" if panel.over == "lag" else curve.label
+        upper.plot(x, curve.measured, color=colour, linewidth=3.2, alpha=0.4, label=label)
+        upper.plot(x, curve.predicted, color=colour, linewidth=1.2, linestyle=(0, (3, 1.5)))
+        lower.plot(x, curve.residual, color=colour, linewidth=1.2)
+    upper.legend(loc="upper right", ncols=len(panel.curves), fontsize=8, handlelength=1.3)
+    low, high = upper.get_ylim()
+    upper.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
+    upper.set_ylabel(f"{panel.target} / its rms")
+    upper.tick_params(labelbottom=False)
+    lower.axhline(0, color=GREY, linewidth=0.8)
+    lower.set_ylabel("residual")
+    lower.set_xlabel(x_label)
+    reading = panel.reading
+    reach = max(float(np.max(np.abs(curve.residual))) for curve in panel.curves)
+    text = f"MSD {reading.msd:.3g}"
+    if reading.msd_healthy is not None:
+        healthy = float(np.sqrt(reading.msd_healthy))
+        lower.axhspan(-healthy, healthy, color=COLOURS[2], alpha=0.18, linewidth=0)
+        reach = max(reach, 1.5 * healthy)
+        text += f", healthy {reading.msd_healthy:.3g} (band: ± its root)"
+    lower.set_ylim(-1.15 * reach, 1.6 * reach)
+    lower.text(0.01, 0.96, text, transform=lower.transAxes, ha="left", va="top", fontsize=8, color=INK)
+    if panel.over == "angle":
+        lower.set_xlim(0, 360)
+        lower.set_xticks(np.arange(0, 361, 90))
+
+
+def _empty(axes: Axes, panel: Panel) -> None:
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.text(
+        0.5,
+        0.5,
+        f"not evaluable\n{panel.reading.reason}",
+        transform=axes.transAxes,
+        ha="center",
+        va="center",
+        color=GREY,
+        wrap=True,
+    )

@@ -1,0 +1,321 @@
+"""Spectra of a recorded stream: of its latest seconds, and over time or speed."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import welch
+
+from models.errors import MachineFileError, RotorwatchError
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, Quantity
+from service.analysis.plots.stretches import RecordedStream, Stretch, begins_again
+
+__all__ = [
+    "Scaling",
+    "Spectrum",
+    "Waterfall",
+    "lowest_hz",
+    "read_spectrum",
+    "read_waterfall",
+    "shown_as",
+    "summed_power",
+]
+
+_MOST_SPECTRA = 400
+_MOST_SPEEDS = 120
+_STEADY = 0.02
+_NYQUIST_OVER_SHOWN = 1.28
+"""Analysers show spectra up to the sampling rate over 2.56."""
+
+Scaling = Literal["amplitude", "density"]
+
+_SHOWN = {
+    "m": ("µm", 1e6),
+    "mm": ("µm", 1e3),
+    "um": ("µm", 1.0),
+    "m/s": ("mm/s", 1e3),
+    "m/s2": ("m/s²", 1.0),
+    "in/s2": ("in/s²", 1.0),
+}
+_SWINGS = (Quantity.DISPLACEMENT, Quantity.TILT)
+_CLEAR_OF_MEAN = 2
+_SHARE = 0.999
+_HIGHEST_ORDER = 4
+_ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
+
+
+def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
+    """How values of a spectrum are stated, and the factor on a peak amplitude or a density in the channel's unit.
+
+    Amplitudes of displacement and tilt are peak to peak (ISO 20816-1: S_p-p), those of velocity, tilt rate and
+    acceleration root mean square.
+    """
+    unit, factor = _SHOWN.get(channel.unit, (channel.unit, 1.0))
+    if scaling == "density":
+        return (f"({unit})²/Hz" if "/" in unit or "²" in unit else f"{unit}²/Hz"), factor**2
+    if channel.quantity in _SWINGS:
+        return f"{unit} p-p", 2 * factor
+    return f"{unit} rms", float(factor / np.sqrt(2))
+
+
+@dataclass(frozen=True, slots=True)
+class Spectrum:
+    """Averaged spectra of some channels.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        Oldest and newest data in it.
+    channels : tuple of Channel
+    frequencies_hz : ndarray, shape (n_bins,)
+    values : ndarray, shape (n_channels, n_bins)
+        As `shown_as` states them.
+    scaling : str
+        ``amplitude`` or ``density``.
+    resolution_hz : float
+        Distance of the lines.
+    averages : int
+        Segments, overlapping by half, whose power was averaged.
+    speed_rad_s : float
+        Mean speed; nan without a shaft angle.
+    """
+
+    start_ns: int
+    end_ns: int
+    channels: tuple[Channel, ...]
+    frequencies_hz: FloatArray
+    values: FloatArray
+    scaling: Scaling
+    resolution_hz: float
+    averages: int
+    speed_rad_s: float
+
+    @property
+    def useful_hz(self) -> float:
+        """Up to which frequency there is something to be seen."""
+        return max(_useful_hz(self.frequencies_hz, one, self.scaling, self.speed_rad_s) for one in self.values)
+
+
+@dataclass(frozen=True, slots=True)
+class Waterfall:
+    """Spectra of one channel, one after the other.
+
+    Attributes
+    ----------
+    channel : Channel
+    frequencies_hz : ndarray, shape (n_bins,)
+    start_ns, end_ns : ndarray of int, shape (n_spectra,)
+        Data in each.
+    speed_rad_s : ndarray, shape (n_spectra,)
+        Mean speed; nan without a shaft angle.
+    values : ndarray, shape (n_spectra, n_bins)
+        As `shown_as` states them.
+    scaling : str
+        ``amplitude`` or ``density``.
+    resolution_hz : float
+    """
+
+    channel: Channel
+    frequencies_hz: FloatArray
+    start_ns: npt.NDArray[np.int64]
+    end_ns: npt.NDArray[np.int64]
+    speed_rad_s: FloatArray
+    values: FloatArray
+    scaling: Scaling
+    resolution_hz: float
+
+    @property
+    def useful_hz(self) -> float:
+        """Up to which frequency there is something to be seen."""
+        fastest = float(np.max(np.abs(self.speed_rad_s)))
+        return _useful_hz(self.frequencies_hz, self.values.max(axis=0), self.scaling, fastest)
+
+    def over_speed(self) -> tuple[FloatArray, FloatArray]:
+        """Mean spectra over the speed: edges of the speeds, rad/s, shape (n + 1,), and spectra, shape (n, n_bins).
+
+        Raises
+        ------
+        RotorwatchError
+            Without a shaft angle, or if the speed does not change.
+        """
+        speed = np.abs(self.speed_rad_s)
+        if not np.isfinite(speed).all():
+            raise RotorwatchError("--axis speed needs the shaft angle (keyphasor), which is not measured")
+        slowest, fastest = float(speed.min()), float(speed.max())
+        if fastest - slowest < _STEADY * max(fastest, 1e-9):
+            raise RotorwatchError(
+                f"--axis speed needs a run-up or coast-down: the speed stays between {slowest * 30 / np.pi:.4g} and "
+                f"{fastest * 30 / np.pi:.4g} rpm; --axis time shows it"
+            )
+        count = min(_MOST_SPEEDS, max(2, speed.size // 2))
+        edges = np.linspace(slowest, fastest, count + 1)
+        place = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, count - 1)
+        mean = np.full((count, self.frequencies_hz.size), np.nan)
+        for number in range(count):
+            if (place == number).any():
+                of = self.values[place == number]
+                mean[number] = of.mean(axis=0) if self.scaling == "density" else np.sqrt(np.mean(of**2, axis=0))
+        return edges, mean
+
+
+def read_spectrum(
+    stream: RecordedStream, channels: tuple[Channel, ...], window_s: float, resolution_hz: float, scaling: Scaling
+) -> Spectrum:
+    """Spectra of the latest `window_s` of a recorded stream; segments never reach across a gap.
+
+    Raises
+    ------
+    MachineFileError
+        If the window is shorter than one segment, which is 1 / `resolution_hz` long.
+    RotorwatchError
+        If there is no stretch so long without a gap.
+    """
+    segment = _segment(stream, window_s, resolution_hz)
+    found = stream.latest(channels, window_s)
+    used = [stretch for stretch in found if stretch.samples.shape[0] >= segment]
+    if not used:
+        longest_s = max((stretch.length_s for stretch in found), default=0.0)
+        raise RotorwatchError(
+            f"{stream.place}: a spectrum with --resolution {resolution_hz:g} Hz needs {1 / resolution_hz:g} s without "
+            f"a gap, the longest stretch of {stream.name} in the last {window_s:g} s is {longest_s:.3g} s"
+        )
+    total, averages = np.zeros((len(channels), segment // 2 + 1)), 0
+    for stretch in used:
+        power, count = summed_power(stretch, segment, scaling)
+        total, averages = total + power, averages + count
+    lengths = np.array([stretch.length_s for stretch in used])
+    speeds = np.array([stretch.speed_rad_s for stretch in used])
+    rate_hz = stream.descriptor.rate_hz
+    return Spectrum(
+        start_ns=used[0].start_ns,
+        end_ns=used[-1].end_ns,
+        channels=channels,
+        frequencies_hz=_lines(segment, rate_hz),
+        values=np.stack([_values(power, one, scaling) for power, one in zip(total / averages, channels, strict=True)]),
+        scaling=scaling,
+        resolution_hz=rate_hz / segment,
+        averages=averages,
+        speed_rad_s=float(np.sum(speeds * lengths) / np.sum(lengths)),
+    )
+
+
+def read_waterfall(
+    stream: RecordedStream, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
+) -> Waterfall:
+    """Spectra of one channel over a recorded stream, one per window; in long recordings over longer windows.
+
+    Raises
+    ------
+    MachineFileError
+        If the window is shorter than one segment, which is 1 / `resolution_hz` long.
+    RotorwatchError
+        If there are not two stretches so long without a gap.
+    """
+    segment = _segment(stream, window_s, resolution_hz)
+    each_s = max(window_s, (stream.to_ns - stream.from_ns) / 1e9 / _MOST_SPECTRA)
+    rows: list[tuple[int, int, float, FloatArray]] = []
+    for stretch in stream.stretches((channel,), each_s):
+        if stretch.samples.shape[0] < segment:
+            continue
+        while rows and begins_again(rows[-1][1], stretch.start_ns):
+            rows.pop()  # of several runs at the same time the one that was recorded last is shown
+        power, count = summed_power(stretch, segment, scaling)
+        rows.append(
+            (stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power[0] / count, channel, scaling))
+        )
+    if len(rows) < 2:
+        raise RotorwatchError(
+            f"{stream.place}: {len(rows)} spectra of {stream.name} over {window_s:g} s without a gap, expected at "
+            "least 2 for a waterfall; a shorter --window may do"
+        )
+    starts, ends, speeds, values = zip(*rows, strict=True)
+    rate_hz = stream.descriptor.rate_hz
+    return Waterfall(
+        channel=channel,
+        frequencies_hz=_lines(segment, rate_hz),
+        start_ns=np.array(starts, dtype=np.int64),
+        end_ns=np.array(ends, dtype=np.int64),
+        speed_rad_s=np.array(speeds),
+        values=np.stack(values),
+        scaling=scaling,
+        resolution_hz=rate_hz / segment,
+    )
+
+
+def summed_power(stretch: Stretch, segment: int, scaling: Scaling) -> tuple[FloatArray, int]:
+    """Power of Hann-windowed segments that overlap by half, each about its mean, summed.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        At least one segment long.
+    segment : int
+        Samples of a segment.
+    scaling : str
+        ``amplitude``: squared amplitude of a sine; ``density``: one-sided power spectral density.
+
+    Returns
+    -------
+    ndarray, shape (n_channels, segment // 2 + 1)
+        Sum over the segments.
+    int
+        How many segments.
+    """
+    overlap = segment // 2
+    count = (stretch.samples.shape[0] - overlap) // (segment - overlap)
+    _, mean = welch(
+        stretch.samples,
+        stretch.rate_hz,
+        window="hann",
+        nperseg=segment,
+        noverlap=overlap,
+        scaling="spectrum" if scaling == "amplitude" else "density",
+        axis=0,
+    )
+    factor = 2.0 if scaling == "amplitude" else 1.0  # the spectrum is that of rms values
+    return np.asarray(mean.T * factor * count, dtype=np.float64), count
+
+
+def lowest_hz(resolution_hz: float) -> float:
+    """From which frequency on a Hann window lets nothing of the mean through."""
+    return _CLEAR_OF_MEAN * resolution_hz
+
+
+def _useful_hz(frequencies_hz: FloatArray, values: FloatArray, scaling: Scaling, speed_rad_s: float) -> float:
+    """Up to four times the running speed, or as far as all but a thousandth of the power lies and half as far again."""
+    resolved = frequencies_hz >= lowest_hz(float(frequencies_hz[1]))
+    power = np.cumsum((values if scaling == "density" else values**2) * resolved)
+    reached_hz = float(frequencies_hz[np.searchsorted(power, _SHARE * power[-1])])
+    turns_hz = abs(speed_rad_s) / (2 * np.pi) if np.isfinite(speed_rad_s) else 0.0
+    wanted_hz = max(1.5 * reached_hz, _HIGHEST_ORDER * turns_hz, 8 * float(frequencies_hz[1]))
+    decade = 10.0 ** np.floor(np.log10(wanted_hz))
+    rounded_hz = next((step * decade for step in _ROUND if step * decade >= wanted_hz * (1 - 1e-3)), 10 * decade)
+    return min(float(rounded_hz), float(frequencies_hz[-1]) / _NYQUIST_OVER_SHOWN)
+
+
+def _values(power: FloatArray, channel: Channel, scaling: Scaling) -> FloatArray:
+    _, factor = shown_as(channel, scaling)
+    return factor * (np.sqrt(power) if scaling == "amplitude" else power)
+
+
+def _segment(stream: RecordedStream, window_s: float, resolution_hz: float) -> int:
+    """Samples of a segment, even."""
+    rate_hz = stream.descriptor.rate_hz
+    segment = 2 * round(rate_hz / resolution_hz / 2)
+    if segment < 8:
+        raise MachineFileError(
+            f"--resolution is {resolution_hz:g} Hz, expected at most {rate_hz / 8:g} Hz at {rate_hz:g} samples per "
+            "second"
+        )
+    if window_s * rate_hz < segment - 1e-6:
+        raise MachineFileError(
+            f"--window is {window_s:g} s, expected at least {1 / resolution_hz:g} s for --resolution "
+            f"{resolution_hz:g} Hz"
+        )
+    return segment
+
+
+def _lines(segment: int, rate_hz: float) -> FloatArray:
+    return np.arange(segment // 2 + 1, dtype=np.float64) * (rate_hz / segment)

@@ -1,0 +1,257 @@
+"""Pictures of spectra: of a moment, and one after the other."""
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+
+from models.signals.channels import Channel
+from rotorwatch.records.alarms import AlarmEventData
+from service.analysis.plots.spectrum import Spectrum, Waterfall, lowest_hz, shown_as
+from service.analysis.plots.style import (
+    COLOURS,
+    INK,
+    PLATE,
+    Look,
+    alarm_lines,
+    as_dates,
+    heading,
+    rpm,
+    stretch_text,
+    time_axis,
+)
+
+__all__ = ["paint_cascade", "paint_map", "paint_spectrum"]
+
+_DECADES = 4
+_MOST_TRACES = 60
+_ORDERS = (1, 2)
+
+
+def paint_spectrum(found: Spectrum, name: str, look: Look, *, log: bool, up_to_hz: float | None = None) -> Figure:
+    """A panel for each channel."""
+    count = len(found.channels)
+    figure = Figure(figsize=look.size_in or (9.5, 1.2 + 1.75 * count), layout="constrained")
+    panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
+    limits_hz, shown = _shown(found, up_to_hz)
+    frequency = found.frequencies_hz[shown]
+    for axes, channel, values in zip(panels, found.channels, found.values[:, shown], strict=True):
+        axes.plot(frequency, values, color=COLOURS[0], linewidth=0.9)
+        axes.set_title(f"{channel.name}   {_place(channel)}", fontweight="bold")
+        axes.set_ylabel(shown_as(channel, found.scaling)[0])
+        top = float(values.max()) or 1.0
+        if log:
+            axes.set_yscale("log")
+            floor = max(float(values[values > 0].min(initial=top)), top * _depth(found))
+            axes.set_ylim(0.7 * floor, 2.5 * top)
+        else:
+            axes.set_ylim(0, 1.15 * top)
+        _orders(axes, found, values, frequency, channel)
+    panels[-1].set_xlim(limits_hz)
+    panels[-1].set_xlabel("frequency, Hz")
+    heading(
+        figure,
+        look,
+        f"{name}: " + ("power spectral density" if found.scaling == "density" else "amplitude spectrum"),
+        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), _method(found)),
+    )
+    return figure
+
+
+def paint_map(
+    found: Waterfall,
+    name: str,
+    look: Look,
+    alarms: tuple[AlarmEventData, ...],
+    *,
+    over_speed: bool,
+    log: bool,
+    up_to_hz: float | None = None,
+) -> Figure:
+    """Spectra as rows of colour."""
+    figure = Figure(figsize=look.size_in or (9.5, 6.0), layout="constrained")
+    axes = figure.subplots()
+    limits_hz, shown = _shown(found, up_to_hz)
+    frequency = found.frequencies_hz[shown]
+    half = found.resolution_hz / 2
+    columns = np.append(frequency - half, frequency[-1] + half)
+    if over_speed:
+        edges, values = found.over_speed()
+        rows = edges * 30 / np.pi
+        values = values[:, shown]
+    else:
+        rows, values = _rows_in_time(found, found.values[:, shown])
+    top = float(np.nanmax(values)) or 1.0
+    norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * _depth(found)), top)
+    mesh = axes.pcolormesh(
+        columns, rows, values, norm=norm if log else Normalize(0, top), cmap="cividis", rasterized=True
+    )
+    figure.colorbar(mesh, ax=axes, label=shown_as(found.channel, found.scaling)[0], pad=0.02, aspect=32)
+    axes.grid(visible=False)
+    axes.set_xlim(limits_hz)
+    axes.set_xlabel("frequency, Hz")
+    _order_lines(axes, found, rows, over_speed=over_speed)
+    if over_speed:
+        axes.set_ylabel("speed, rpm")
+    else:
+        time_axis(axes, vertical=True)
+        alarm_lines(axes, alarms, vertical=True)
+    _waterfall_heading(figure, look, found, name)
+    return figure
+
+
+def paint_cascade(
+    found: Waterfall,
+    name: str,
+    look: Look,
+    alarms: tuple[AlarmEventData, ...],
+    *,
+    over_speed: bool,
+    log: bool,
+    up_to_hz: float | None = None,
+) -> Figure:
+    """Spectra as lines, one behind the other."""
+    figure = Figure(figsize=look.size_in or (9.5, 7.0), layout="constrained")
+    axes = figure.subplots()
+    limits_hz, shown = _shown(found, up_to_hz)
+    frequency = found.frequencies_hz[shown]
+    if over_speed:
+        edges, values = found.over_speed()
+        base = (edges[:-1] + edges[1:]) / 2 * 30 / np.pi
+    else:
+        base, values = as_dates(found.end_ns), found.values
+    there = np.flatnonzero(np.isfinite(values[:, -1]))
+    there = there[:: -(-there.size // _MOST_TRACES)]
+    base, values = base[there], values[there][:, shown]
+    top = float(values.max()) or 1.0
+    height = np.clip(np.log10(np.maximum(values, 1e-300) / top) / 3 + 1, 0, 1) if log else values / top
+    step = (base[-1] - base[0]) / max(1, base.size - 1)
+    scale = max(8.0, 0.2 * base.size) * step
+    for order, (at, line) in enumerate(zip(base[::-1], height[::-1], strict=True)):
+        axes.fill_between(frequency, at, at + scale * line, color="white", linewidth=0, zorder=2 + order)
+        axes.plot(frequency, at + scale * line, color=COLOURS[0], linewidth=0.7, zorder=2 + order)
+    axes.set_ylim(base[0] - step, base[-1] + 1.05 * scale)
+    axes.set_xlim(limits_hz)
+    axes.set_xlabel("frequency, Hz")
+    axes.grid(visible=False)
+    if over_speed:
+        axes.set_ylabel("speed, rpm")
+    else:
+        time_axis(axes, vertical=True)
+        alarm_lines(axes, alarms, vertical=True)
+    if np.isfinite(found.speed_rad_s).all():
+        running = base / 60 if over_speed else np.abs(found.speed_rad_s[there]) / (2 * np.pi)
+        for number in _ORDERS:
+            axes.plot(
+                number * running, base, color=COLOURS[1], linewidth=0.9, linestyle=(0, (1, 2)), zorder=300,
+                scalex=False, scaley=False,
+            )  # fmt: skip
+            axes.annotate(
+                f"{number}×", (number * running[-1], base[-1]), xytext=(6, 12), textcoords="offset points",
+                fontsize=9, color=COLOURS[1], annotation_clip=True, zorder=300, bbox=PLATE,
+            )  # fmt: skip
+    full = f"{top:.3g} {shown_as(found.channel, found.scaling)[0]}"
+    right = axes.get_xlim()[1]
+    axes.annotate(
+        "", (right * 0.985, base[-1]), (right * 0.985, base[-1] + scale), arrowprops={"arrowstyle": "|-|", "color": INK}
+    )
+    axes.text(
+        right * 0.975,
+        base[-1] + scale / 2,
+        f"{full}, 3 decades" if log else full,
+        ha="right",
+        va="center",
+        fontsize=8,
+        zorder=400,
+        bbox=PLATE,
+    )
+    _waterfall_heading(figure, look, found, name)
+    return figure
+
+
+def _waterfall_heading(figure: Figure, look: Look, found: Waterfall, name: str) -> None:
+    low, high = float(np.min(np.abs(found.speed_rad_s))), float(np.max(np.abs(found.speed_rad_s)))
+    steady = not np.isfinite(low) or high - low < 0.005 * high
+    heading(
+        figure,
+        look,
+        f"{name}: spectra of {found.channel.name}, {_place(found.channel)}",
+        (
+            stretch_text(int(found.start_ns[0]), int(found.end_ns[-1])),
+            rpm(low) if steady else f"{rpm(low)} to {rpm(high)}",
+            f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann",
+        ),
+    )
+
+
+def _rows_in_time(found: Waterfall, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of the rows as dates, and rows with an empty one in each gap."""
+    edges, rows = [found.start_ns[0]], []
+    for start_ns, end_ns, row in zip(found.start_ns, found.end_ns, values, strict=True):
+        if start_ns > edges[-1] + 10**6:
+            edges.append(start_ns)
+            rows.append(np.full_like(row, np.nan))
+        edges.append(max(end_ns, edges[-1]))
+        rows.append(row)
+    return as_dates(np.array(edges, dtype=np.int64)), np.stack(rows)
+
+
+def _orders(axes: Axes, found: Spectrum, values: np.ndarray, frequency: np.ndarray, channel: Channel) -> None:
+    """Marks at running speed and twice that, with the height of the line there."""
+    if not np.isfinite(found.speed_rad_s) or abs(found.speed_rad_s) < 1e-6:
+        return
+    texts = []
+    for order in _ORDERS:
+        at = order * abs(found.speed_rad_s) / (2 * np.pi)
+        if at > frequency[-1]:
+            continue
+        near = np.abs(frequency - at) <= 1.5 * found.resolution_hz
+        axes.axvline(at, color=COLOURS[1], linewidth=0.9, linestyle=(0, (3, 2)), zorder=1)
+        unit, _ = shown_as(channel, found.scaling)
+        high = f": {values[near].max():.3g} {unit}" if found.scaling == "amplitude" and near.any() else ""
+        axes.annotate(
+            f"{order}×", (at, 1.0), xycoords=("data", "axes fraction"), xytext=(3, -2),
+            textcoords="offset points", ha="left", va="top", fontsize=8, color=COLOURS[1],
+        )  # fmt: skip
+        texts.append(f"{order}× {at:.4g} Hz{high}")
+    axes.set_title("     ".join(texts), loc="right", color=COLOURS[1])
+
+
+def _order_lines(axes: Axes, found: Waterfall, rows: np.ndarray, *, over_speed: bool) -> None:
+    if not np.isfinite(found.speed_rad_s).all():
+        return
+    right = axes.get_xlim()[1]
+    for order in _ORDERS:
+        if over_speed:
+            place, at = order * rows / 60, rows
+        else:
+            place = order * np.abs(found.speed_rad_s) / (2 * np.pi)
+            at = as_dates((found.start_ns + found.end_ns) // 2)
+        if place.min() > right:
+            continue
+        axes.plot(place, at, color="white", linewidth=0.8, linestyle=(0, (2, 4)), scalex=False, scaley=False)
+        axes.annotate(
+            f"{order}×", (place[-1], at[-1]), xytext=(4, -3), textcoords="offset points", ha="left", va="top",
+            fontsize=9, color="white", annotation_clip=True,
+        )  # fmt: skip
+
+
+def _place(channel: Channel) -> str:
+    return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.direction}"
+
+
+def _shown(found: Spectrum | Waterfall, up_to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
+    """Ends of the frequency axis, and the lines between them."""
+    low, high = lowest_hz(found.resolution_hz), found.useful_hz if up_to_hz is None else up_to_hz
+    slack = 1e-6 * found.resolution_hz
+    return (low, high), (found.frequencies_hz >= low - slack) & (found.frequencies_hz <= high + slack)
+
+
+def _depth(found: Spectrum | Waterfall) -> float:
+    """Smallest height that is shown, over the greatest: 80 dB below."""
+    return float(10.0 ** (-_DECADES if found.scaling == "amplitude" else -2 * _DECADES))
+
+
+def _method(found: Spectrum) -> str:
+    return f"{found.resolution_hz:.3g} Hz, Hann, {found.averages} averages"

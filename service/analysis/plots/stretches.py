@@ -1,0 +1,202 @@
+"""Samples of a recording as they are plotted: channels by name, stretches without a gap, the shaft's speed."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import ValidationError
+
+from models.errors import MachineFileError, RecordingError, WireError
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.channels import Channel, ChannelDescriptor, Quantity
+from models.signals.keys import MachineKeys
+from models.signals.wire import decode_block
+from service.recordings.replay.source import RecordingSource
+
+__all__ = ["RecordedStream", "Stretch", "begins_again"]
+
+_TOLERANCE_S = 2e-4
+_RATE_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Consecutive samples of some channels, in the units of the channels.
+
+    Attributes
+    ----------
+    start_ns : int
+        Acquisition time of the first sample.
+    rate_hz : float
+    samples : ndarray, shape (n_samples, n_channels)
+    angle_rad : ndarray, shape (n_samples,) or None
+        Shaft angle; None if it is not measured.
+    """
+
+    start_ns: int
+    rate_hz: float
+    samples: FloatArray
+    angle_rad: FloatArray | None
+
+    @property
+    def length_s(self) -> float:
+        """Length."""
+        return float(self.samples.shape[0] / self.rate_hz)
+
+    @property
+    def end_ns(self) -> int:
+        """Acquisition time of the sample after the last one."""
+        return self.start_ns + round(self.length_s * 1e9)
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Mean speed, negative where the shaft turns from z to y; nan without a shaft angle."""
+        if self.angle_rad is None or self.angle_rad.size < 2:
+            return float("nan")
+        whole = np.unwrap(self.angle_rad)
+        return float((whole[-1] - whole[0]) / (whole.size - 1) * self.rate_hz)
+
+
+def begins_again(end_ns: int, start_ns: int) -> bool:
+    """Whether data that follow others in a recording are earlier than these: of a new run, or after a clock was set."""
+    return start_ns < end_ns - _TOLERANCE_S * 1e9
+
+
+class RecordedStream:
+    """The sample blocks of one machine.
+
+    Parameters
+    ----------
+    source : RecordingSource
+    keys : MachineKeys
+    from_ns, to_ns : int
+        Only data from `from_ns` up to, and without, `to_ns`.
+
+    Raises
+    ------
+    RecordingError
+        If no channel descriptor was recorded, or it cannot be read: the columns have no names and units then.
+    """
+
+    def __init__(self, source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> None:
+        self._source, self._keys = source, keys
+        self.from_ns, self.to_ns = from_ns, to_ns
+        self.name = f"{keys.site}/{keys.machine}"
+        self.place = ", ".join(path.name for path in source.paths)
+        message = source.descriptor(keys, to_ns)
+        if message is None:
+            raise RecordingError(f"{self.place}: no channel descriptor on {keys.descriptor}, so no channel has a name")
+        try:
+            self.descriptor = ChannelDescriptor.model_validate_json(message.payload)
+        except ValidationError as error:
+            raise RecordingError(
+                f"{self.place}: the channel descriptor on {keys.descriptor} cannot be read: {error}"
+            ) from error
+
+    @property
+    def displacements(self) -> tuple[Channel, ...]:
+        """Channels that measure a displacement."""
+        return tuple(channel for channel in self.descriptor.channels if channel.quantity is Quantity.DISPLACEMENT)
+
+    @property
+    def has_angle(self) -> bool:
+        """Whether the shaft angle is measured."""
+        return "theta" in self.descriptor.states
+
+    def channels(self, names: Sequence[str]) -> tuple[Channel, ...]:
+        """Channels by name.
+
+        Raises
+        ------
+        MachineFileError
+            If there is no such channel, or it is the shaft angle; the message lists those that can be plotted.
+        """
+        there = {channel.name: channel for channel in self.descriptor.channels}
+        vibration = [name for name, channel in there.items() if channel.quantity is not Quantity.SHAFT_ANGLE]
+        for name in names:
+            if name not in vibration:
+                what = "is the shaft angle" if name in there else "is not a channel"
+                raise MachineFileError(
+                    f"--channel is {name!r}, which {what} of {self.name}; expected one of {', '.join(vibration)}"
+                )
+        return tuple(there[name] for name in dict.fromkeys(names))
+
+    def stretches(
+        self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
+    ) -> Iterator[Stretch]:
+        """Samples of some channels, cut at gaps and after `longest_s`; what is left before a gap is shorter.
+
+        Blocks that cannot be decoded, have other channels or a sample that is not finite are left out, which is a gap.
+
+        Parameters
+        ----------
+        channels : sequence of Channel
+        longest_s : float, optional
+            Length of a stretch, s; without it only gaps cut.
+        from_ns : int, optional
+            Only data from this time on.
+        """
+        names = [channel.name for channel in self.descriptor.channels]
+        columns = [names.index(channel.name) for channel in channels]
+        angle = self.descriptor.states.index("theta") if self.has_angle else None
+        used = columns if angle is None else [*columns, angle]
+        size = None if longest_s is None else max(1, round(longest_s * self.descriptor.rate_hz))
+        pending: list[FloatArray] = []
+        start_ns = count = 0
+        for block, continues in self._blocks(from_ns, used):
+            if pending and not continues:
+                yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
+                pending, count = [], 0
+            # Anchored anew by every block, as the monitor does: the device's clock is the time.
+            start_ns = block.start_ns - round(count * 1e9 / self.descriptor.rate_hz)
+            pending.append(block.samples[:, used].astype(np.float64))
+            count += pending[-1].shape[0]
+            while size is not None and count >= size:
+                rows = np.concatenate(pending)
+                yield self._stretch(start_ns, rows[:size], angle is not None)
+                start_ns += round(size * 1e9 / self.descriptor.rate_hz)
+                pending, count = [rows[size:]], count - size
+        if count:
+            yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
+
+    def latest(self, channels: Sequence[Channel], length_s: float) -> list[Stretch]:
+        """The newest `length_s` of data before `to_ns`, in pieces if there are gaps."""
+        span = self._source.span(self._keys)
+        end_ns = self.to_ns if self.to_ns <= span.end_ns else span.newest_ns
+        found: list[Stretch] = []
+        for stretch in self.stretches(channels, from_ns=max(self.from_ns, end_ns - round(length_s * 1e9))):
+            if found and begins_again(found[-1].end_ns, stretch.start_ns):
+                found.clear()
+            found.append(stretch)
+        return found
+
+    def _stretch(self, start_ns: int, rows: FloatArray, with_angle: bool) -> Stretch:
+        rate_hz = self.descriptor.rate_hz
+        if with_angle:
+            return Stretch(start_ns, rate_hz, rows[:, :-1], rows[:, -1])
+        return Stretch(start_ns, rate_hz, rows, None)
+
+    def _blocks(self, from_ns: int | None, used: list[int]) -> Iterator[tuple[SampleBlock, bool]]:
+        """Usable blocks, and whether each continues the one before it."""
+        descriptor = self.descriptor
+        tolerance_ns = round(max(_TOLERANCE_S, 0.5 / descriptor.rate_hz) * 1e9)
+        last: SampleBlock | None = None
+        since = self.from_ns if from_ns is None else from_ns
+        for message in self._source.messages({self._keys.stream}, from_ns=since, to_ns=self.to_ns):
+            try:
+                block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+            except WireError:
+                continue
+            if (
+                (schema_hash and schema_hash != descriptor.schema_hash)
+                or block.samples.shape[1] != len(descriptor.channels)
+                or abs(block.rate_hz / descriptor.rate_hz - 1) > _RATE_TOLERANCE
+                or not np.isfinite(block.samples[:, used]).all()
+            ):
+                continue
+            late_ns = 0 if last is None else block.start_ns - last.end_ns
+            if last is not None and (block.run == last.run and block.sequence <= last.sequence and late_ns < 0):
+                continue  # a repetition
+            continues = last is not None and abs(late_ns) <= tolerance_ns
+            last = block
+            yield block, continues

@@ -1,0 +1,191 @@
+"""How the pictures look, and how they are written: the same data make the same bytes."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from models.errors import RotorwatchError
+from models.signals.block import FloatArray
+from rotorwatch.records.alarms import AlarmEventData
+from service.recordings.replay.source import clock
+
+__all__ = [
+    "COLOURS",
+    "GREY",
+    "INK",
+    "PLATE",
+    "SEVERITY_COLOURS",
+    "STATE_COLOURS",
+    "Look",
+    "alarm_lines",
+    "alarm_text",
+    "as_date",
+    "as_dates",
+    "draw",
+    "heading",
+    "rpm",
+    "stretch_text",
+    "time_axis",
+    "write_figure",
+]
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+"""After Okabe and Ito: told apart with any colour vision."""
+INK, GREY = "#222222", "#777777"
+STATE_COLOURS = {
+    "healthy": "#009E73",
+    "alert": "#E69F00",
+    "danger": "#D55E00",
+    "outside-model": "#CC79A7",
+    "not-evaluable": "#999999",
+    "unchanged": "#56B4E9",
+    "data-health": "#882255",
+    "warming": "#dddddd",
+    "no-data": "#000000",
+}
+SEVERITY_COLOURS = {"alert": "#E69F00", "danger": "#D55E00"}
+PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
+"""Behind a text that stands on lines or colours."""
+
+_STYLE = {
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#555555",
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "grid.color": "#e2e2e2",
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+    "text.hinting": "none",  # letters keep their distances in small pictures
+    "svg.hashsalt": "rotorwatch",
+    "svg.fonttype": "path",  # no font is needed to look at it
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What the command line says of the picture itself.
+
+    Attributes
+    ----------
+    title : str or None
+        Instead of the picture's own.
+    size_in : (float, float) or None
+        Width and height, inches; the kind's own if left out.
+    dpi : float
+        Pixels per inch of a PNG.
+    """
+
+    title: str | None = None
+    size_in: tuple[float, float] | None = None
+    dpi: float = 120.0
+
+
+def draw(path: Path, look: Look, paint: Callable[[Look], Figure]) -> None:
+    """Draw in the house style, whatever the settings of the person who draws, and write it.
+
+    Raises
+    ------
+    RotorwatchError
+        If the file cannot be written.
+    """
+    with style.context(["default", _STYLE]):
+        write_figure(paint(look), path, look.dpi)
+
+
+def write_figure(figure: Figure, path: Path, dpi: float) -> None:
+    """Write a figure as PNG or SVG by its suffix, without time and program in it.
+
+    Raises
+    ------
+    RotorwatchError
+        If the file cannot be written.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    try:
+        if kind == "svg":
+            figure.savefig(path, format="svg", metadata={"Date": None})
+        else:
+            figure.savefig(path, format="png", dpi=dpi, metadata={"Software": None}, pil_kwargs={"optimize": True})
+    except OSError as error:
+        raise RotorwatchError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def heading(figure: Figure, look: Look, title: str, details: Iterable[str]) -> None:
+    """Title, and a line on what is shown."""
+    figure.suptitle(look.title or title, x=0.012, y=0.995, ha="left", va="top", fontsize=11.5, fontweight="bold")
+    height = figure.get_figheight()
+    figure.text(
+        0.012, 1 - 0.27 / height, "   ·   ".join(text for text in details if text), ha="left", va="top", color=GREY
+    )
+    engine = figure.get_layout_engine()
+    if isinstance(engine, ConstrainedLayoutEngine):
+        engine.set(rect=(0.006, 0.006, 0.988, 1 - 0.48 / height - 0.006))
+
+
+def rpm(speed_rad_s: float) -> str:
+    """Speed in words; nothing if it is not known."""
+    if not np.isfinite(speed_rad_s):
+        return "speed not measured"
+    return f"{abs(speed_rad_s) * 30 / np.pi:.0f} rpm"
+
+
+def stretch_text(start_ns: int, end_ns: int) -> str:
+    """From when to when, UTC; the date once if it is the same."""
+    first, last = clock(start_ns), clock(end_ns)
+    return f"{first} to {last[11:] if last[:10] == first[:10] else last} UTC"
+
+
+def as_dates(time_ns: npt.NDArray[np.int64]) -> FloatArray:
+    """Nanoseconds since 1970 as matplotlib counts time."""
+    counted = date2num(time_ns.astype("datetime64[ns]"))  # type: ignore[no-untyped-call]  # stub without types
+    return np.asarray(counted, dtype=np.float64)
+
+
+def as_date(time_ns: int) -> float:
+    """One time as matplotlib counts it."""
+    return float(as_dates(np.array([time_ns], dtype=np.int64))[0])
+
+
+def time_axis(axes: Axes, *, vertical: bool = False) -> None:
+    """UTC clock times along an axis."""
+    axis = axes.yaxis if vertical else axes.xaxis
+    locator = AutoDateLocator(tz="UTC", minticks=4, maxticks=9)  # type: ignore[no-untyped-call]  # stub without types
+    axis.set_major_locator(locator)
+    formatter = ConciseDateFormatter(locator, tz="UTC", show_offset=not vertical)  # type: ignore[no-untyped-call]  # same
+    axis.set_major_formatter(formatter)
+    axis.set_label_text("time, UTC")
+
+
+def alarm_text(alarm: AlarmEventData) -> str:
+    """An alarm event in two words."""
+    return f"{alarm.name} cleared" if alarm.kind == "cleared" else f"{alarm.severity} {alarm.name}"
+
+
+def alarm_lines(axes: Axes, alarms: Iterable[AlarmEventData], *, vertical: bool = False) -> None:
+    """A line at each alarm event: full where raised or escalated, dashed where cleared."""
+    for alarm in sorted(alarms, key=lambda event: event.severity):  # danger over alert
+        at = as_date(alarm.time_ns)
+        colour = SEVERITY_COLOURS.get(alarm.severity, INK)
+        dashes = "--" if alarm.kind == "cleared" else "-"
+        if not vertical:
+            axes.axvline(at, color=colour, linewidth=1.3, linestyle=dashes, zorder=1.5)
+            continue
+        axes.axhline(at, color=colour, linewidth=1.3, linestyle=dashes, zorder=250)  # over the lines of a cascade
+        axes.annotate(
+            alarm_text(alarm), (0.0, at), xycoords=("axes fraction", "data"), xytext=(4, 3),
+            textcoords="offset points", fontsize=8, color=INK, zorder=251, bbox=PLATE,
+        )  # fmt: skip

@@ -1,0 +1,235 @@
+"""Trends: what the monitor read of every parameter over time, and what it said."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ValidationError
+
+from models.commissioning.installed import Installed
+from models.errors import MachineFileError, RotorwatchError
+from models.machine import AlarmSettings
+from models.physics.parameters import PARAMETER_TEXT
+from models.signals.block import FloatArray
+from models.signals.keys import PREFIX, MachineKeys
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
+from rotorwatch.records.health import HealthState, Report
+from service.monitor.conversion import machine_hash
+from service.recordings.replay.choice import choose_machine
+from service.recordings.replay.offline import OfflineReplay
+from service.recordings.replay.source import RecordingSource
+
+__all__ = ["SHOWN", "ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of"]
+
+
+SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
+"""Events that say something of the machine; what operators did to alarms is left out of the picture."""
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterTrend:
+    """Relative change of one parameter, window by window; nan where it was not read.
+
+    Attributes
+    ----------
+    name, text : str
+    change, low, high : ndarray, shape (n_reports,)
+        Change and the ends of its 95 % interval, plain ratios.
+    """
+
+    name: str
+    text: str
+    change: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Trend:
+    """Reports and alarm events of one machine.
+
+    Attributes
+    ----------
+    name : str
+        ``site/machine``.
+    end_ns : ndarray of int, shape (n_reports,)
+        End of each window.
+    states : tuple of HealthState
+    speed_rad_s : ndarray, shape (n_reports,)
+        nan where it is not known.
+    parameters : tuple of ParameterTrend
+    alarms : tuple of AlarmEventData
+    limits : AlarmSettings or None
+        Those in force, where the machine file is at hand.
+    origin : str
+        Where the reports come from, in words.
+    """
+
+    name: str
+    end_ns: npt.NDArray[np.int64]
+    states: tuple[HealthState, ...]
+    speed_rad_s: FloatArray
+    parameters: tuple[ParameterTrend, ...]
+    alarms: tuple[AlarmEventData, ...]
+    limits: AlarmSettings | None
+    origin: str
+
+
+def trend_machine(source: RecordingSource, wanted: str | None) -> MachineKeys:
+    """Keys of the machine to plot; reports will do where the samples were not kept.
+
+    Raises
+    ------
+    MachineFileError
+        If the recordings hold neither, or not the wanted machine, or several and none was named.
+    """
+    there: dict[str, MachineKeys] = {}
+    for key in sorted(source.keys):
+        parts = key.split("/")
+        if len(parts) == 4 and parts[0] == PREFIX and parts[3] in ("report", "stream"):
+            there[f"{parts[1]}/{parts[2]}"] = MachineKeys(parts[1], parts[2])
+    place, listed = ", ".join(path.name for path in source.paths), ", ".join(there) or "none"
+    if wanted is not None and wanted in there:
+        return there[wanted]
+    if wanted is None and len(there) == 1:
+        return next(iter(there.values()))
+    raise MachineFileError(
+        f"{place}: machines with reports or sample blocks: {listed}; "
+        + (f"{wanted} is not among them" if wanted is not None else "expected one, or --key SITE/MACHINE")
+    )
+
+
+def read_trend(source: RecordingSource, keys: MachineKeys, machine: str | None, from_ns: int, to_ns: int) -> Trend:
+    """The recorded reports; or, without any or with another machine file, those of an offline replay.
+
+    Parameters
+    ----------
+    source : RecordingSource
+    keys : MachineKeys
+        The recorded machine.
+    machine : str or None
+        ``FILE`` or ``FILE@BUNDLE``, to be evaluated anew with it.
+    from_ns, to_ns : int
+        Only data from `from_ns` up to, and without, `to_ns`.
+
+    Raises
+    ------
+    RotorwatchError
+        If there are no reports and none can be computed, or no parameter was read in any.
+    """
+    if machine is None and keys.report in source.keys:
+        reports = list(_recorded_reports(source, keys, from_ns, to_ns))
+        if reports:
+            events = recorded_alarms(source, keys, from_ns, to_ns)
+            return trend_of(reports, events, _limits(keys, reports[-1]), "as recorded")
+    if keys.stream not in source.keys:
+        place = ", ".join(path.name for path in source.paths)
+        raise RotorwatchError(
+            f"{place}: no reports of {keys.site}/{keys.machine} in this stretch of time, and no sample blocks to "
+            "compute them from"
+        )
+    return _computed(source, keys, choose_machine(keys, machine), from_ns, to_ns)
+
+
+def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> tuple[AlarmEventData, ...]:
+    """Alarm events that were recorded, each once, by their time; unreadable ones are left out."""
+    found: dict[str, AlarmEventData] = {}
+    for message in source.messages({keys.alarm_event}, from_ns=from_ns, to_ns=to_ns):
+        try:
+            event = AlarmCloudEvent.model_validate_json(message.payload)
+        except ValidationError:
+            continue
+        if event.data.kind in SHOWN:
+            found[event.id] = event.data
+    return tuple(sorted(found.values(), key=lambda data: data.time_ns))
+
+
+def trend_of(
+    reports: list[Report], alarms: tuple[AlarmEventData, ...], limits: AlarmSettings | None, origin: str
+) -> Trend:
+    """Reports as series, in the order in which they were recorded.
+
+    While a window straddles a change, the readings are those of the data since the change: a mean of before and after
+    describes no state of the machine.
+
+    Raises
+    ------
+    RotorwatchError
+        If no parameter was read in any report.
+    """
+    ordered: list[Report] = []
+    for report in {report.model_dump_json(): report for report in reports}.values():  # repetitions left out
+        while ordered and ordered[-1].end_ns >= report.end_ns:
+            ordered.pop()  # of several runs at the same time the one that was recorded last is shown
+        ordered.append(report)
+    series = {name: np.full((3, len(ordered)), np.nan) for name in PARAMETER_TEXT}
+    for number, report in enumerate(ordered):
+        verdict = report.verdict
+        shown = report.parameters if verdict is None or verdict.settled else verdict.current
+        for reading in shown:
+            if reading.relative_change is not None and reading.interval_95 is not None and reading.name in series:
+                series[reading.name][:, number] = reading.relative_change, *reading.interval_95
+    if not ordered or all(np.isnan(values).all() for values in series.values()):
+        reasons = dict.fromkeys(report.reason for report in ordered if report.reason)
+        why = "; ".join(reasons) or f"{len(ordered)} reports, while the window was filling"
+        raise RotorwatchError(f"no parameter was read in this stretch of time: {why}")
+    return Trend(
+        name=f"{ordered[-1].site}/{ordered[-1].machine}",
+        end_ns=np.array([report.end_ns for report in ordered], dtype=np.int64),
+        states=tuple(report.state for report in ordered),
+        speed_rad_s=np.array([np.nan if r.speed_rad_s is None else r.speed_rad_s for r in ordered]),
+        parameters=tuple(
+            ParameterTrend(name, PARAMETER_TEXT[name], *values)
+            for name, values in series.items()
+            if not np.isnan(values).all()
+        ),
+        alarms=alarms,
+        limits=limits,
+        origin=origin,
+    )
+
+
+def _recorded_reports(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> Iterator[Report]:
+    for message in source.messages({keys.report}, from_ns=from_ns, to_ns=to_ns):
+        try:
+            report = Report.model_validate_json(message.payload)
+        except ValidationError:
+            continue  # of another version of the program
+        yield _slim(report)
+
+
+def _slim(report: Report) -> Report:
+    """What a trend shows of a report; a month of them must fit into memory."""
+    return report.model_copy(update={"opinions": (), "equations": (), "detectable": ()})
+
+
+def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
+    """Limits of the shipped machine, if it was this one that reported."""
+    try:
+        machine = choose_machine(keys, None).machine
+    except MachineFileError:
+        return None
+    return machine.alarms if machine_hash(machine) == report.machine_hash else None
+
+
+def _computed(source: RecordingSource, keys: MachineKeys, installed: Installed, from_ns: int, to_ns: int) -> Trend:
+    """Reports of an offline replay, the same to the last bit as those of ``rotorwatch replay``."""
+    machine = installed.machine
+    reports: list[Report] = []
+    alarms: list[AlarmEventData] = []
+
+    def take(line: str) -> None:
+        message = json.loads(line)
+        if message["topic"] == machine.keys.report:
+            reports.append(_slim(Report.model_validate(message["message"])))
+        else:
+            alarms.append(AlarmCloudEvent.model_validate(message["message"]).data)
+
+    run = OfflineReplay(source, keys, installed, take, from_ns=from_ns, to_ns=to_ns)
+    summary = run.run()
+    if summary.blocks == 0:
+        raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")
+    origin = f"computed with machine file {summary.machine_hash}"
+    return trend_of(reports, tuple(alarms), machine.alarms, origin)

@@ -1,0 +1,188 @@
+"""Picture of a trend: a panel for every parameter, over them the machine's state."""
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from models.alarm_names import MODEL
+from models.machine import AlarmSettings
+from models.physics.parameters import PARAMETER_TEXT
+from rotorwatch.records.alarms import AlarmEventData
+from service.analysis.plots.style import (
+    COLOURS,
+    GREY,
+    INK,
+    SEVERITY_COLOURS,
+    STATE_COLOURS,
+    Look,
+    alarm_lines,
+    alarm_text,
+    as_date,
+    as_dates,
+    heading,
+    stretch_text,
+    time_axis,
+)
+from service.analysis.plots.trend import ParameterTrend, Trend
+
+__all__ = ["paint_trend"]
+
+_GAP = 2.5
+_DASHES = (0, (4, 3))
+_LEAST_PERCENT = 5.0
+
+
+def paint_trend(trend: Trend, look: Look) -> Figure:
+    """Small multiples over one time axis."""
+    count = len(trend.parameters)
+    figure = Figure(figsize=look.size_in or (9.5, 1.9 + 1.15 * (count + 1)), layout="constrained")
+    panels = figure.subplots(
+        count + 2, 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": [0.16, *[1.0] * count, 0.75]}
+    )[:, 0]
+    step_ns = int(np.median(np.diff(trend.end_ns))) if trend.end_ns.size > 1 else 10**9
+    _states(panels[0], trend, step_ns)
+    for axes, parameter in zip(panels[1:-1], trend.parameters, strict=True):
+        _parameter(axes, parameter, trend, step_ns)
+    _speed(panels[-1], trend, step_ns)
+    for axes in panels[1:]:
+        alarm_lines(axes, trend.alarms)
+    for name, axes in zip((MODEL, *(one.name for one in trend.parameters)), panels, strict=False):
+        _name_alarms(axes, [alarm for alarm in trend.alarms if _panel_of(alarm) == name])
+    panels[-1].set_xlim(*as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns])))
+    time_axis(panels[-1])
+    figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
+    speeds = trend.speed_rad_s[np.isfinite(trend.speed_rad_s)] * 30 / np.pi
+    heading(
+        figure,
+        look,
+        f"{trend.name}: changes from nominal",
+        (
+            stretch_text(int(trend.end_ns[0]), int(trend.end_ns[-1])),
+            f"{np.median(speeds):.0f} rpm" if speeds.size else "",
+            f"reports {trend.origin}",
+        ),
+    )
+    return figure
+
+
+def _legend(trend: Trend) -> list[Patch | Line2D]:
+    handles: list[Patch | Line2D] = [Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval")]
+    if trend.limits is not None:
+        limits = trend.limits
+        near = any(_danger_near(parameter, limits) for parameter in trend.parameters)
+        for severity in ("alert", "danger") if near else ("alert",):
+            colour = SEVERITY_COLOURS[severity]
+            handles.append(Line2D([], [], color=colour, linewidth=0.9, linestyle=_DASHES, label=f"{severity} limit"))
+    if trend.alarms:
+        handles.append(Line2D([], [], color=SEVERITY_COLOURS["alert"], linewidth=1.3, label="alarm raised"))
+    if any(alarm.kind == "cleared" for alarm in trend.alarms):
+        handles.append(
+            Line2D([], [], color=SEVERITY_COLOURS["alert"], linewidth=1.3, linestyle="--", label="alarm cleared")
+        )
+    return handles
+
+
+def _states(axes: Axes, trend: Trend, step_ns: int) -> None:
+    """A strip: what the monitor said of the machine, from each report on to the next."""
+    after = np.minimum(np.diff(trend.end_ns, append=trend.end_ns[-1] + step_ns), round(_GAP * step_ns))
+    for begin, end, state in zip(as_dates(trend.end_ns), as_dates(trend.end_ns + after), trend.states, strict=True):
+        axes.axvspan(float(begin), float(end), color=STATE_COLOURS[state], linewidth=0)
+    axes.set_yticks([])
+    axes.grid(visible=False)
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+    axes.set_ylabel("state", rotation=0, ha="right", va="center")
+    seen = [state for state in STATE_COLOURS if state in trend.states]
+    axes.legend(
+        handles=[Patch(color=STATE_COLOURS[state], label=state) for state in seen],
+        loc="lower right",
+        bbox_to_anchor=(1.0, 2.0),
+        ncols=len(seen),
+        borderpad=0,
+        handlelength=1.0,
+        columnspacing=1.2,
+    )
+
+
+def _name_alarms(axes: Axes, alarms: list[AlarmEventData]) -> None:
+    """Events of a parameter in the line of its title; those of the model over the states."""
+    for alarm in alarms[:8]:
+        axes.annotate(
+            alarm_text(alarm),
+            (as_date(alarm.time_ns), 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=8,
+            color=INK,
+        )
+
+
+def _parameter(axes: Axes, parameter: ParameterTrend, trend: Trend, step_ns: int) -> None:
+    time, low, high, change = _with_gaps(
+        trend.end_ns, step_ns, 100 * parameter.low, 100 * parameter.high, 100 * parameter.change
+    )
+    axes.axhline(0, color=GREY, linewidth=0.8)
+    axes.fill_between(time, low, high, color=COLOURS[0], alpha=0.28, linewidth=0)
+    axes.plot(time, change, color=COLOURS[0], marker=".", markersize=3)
+    axes.set_title(f"{parameter.name}   {parameter.text}")
+    axes.set_ylabel("%")
+    far = float(np.nanmax(np.abs(np.append(change, 0.0))))
+    wide = float(np.nanmedian(np.maximum(np.abs(low - change), np.abs(high - change))))
+    limit = _limits(axes, parameter, trend.limits)
+    ends = float(np.nanmax(np.abs(np.append(low, high))))
+    # One window with an endless interval must not hide the others.
+    top = max(_LEAST_PERCENT, 1.15 * limit, min(1.15 * ends, 2.5 * max(far + wide, limit)))
+    axes.set_ylim(-top, top)
+
+
+def _panel_of(alarm: AlarmEventData) -> str:
+    """A parameter's alarm belongs to its panel, any other to the one of the states."""
+    return alarm.name if alarm.name in PARAMETER_TEXT else MODEL
+
+
+def _danger_near(parameter: ParameterTrend, alarms: AlarmSettings) -> bool:
+    return float(np.nanmax(np.abs(parameter.change))) > 0.6 * alarms.for_parameter(parameter.name).danger_above
+
+
+def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None) -> float:
+    """Lines at the alarm limits, either sign; danger only where it is near. The largest one drawn, in percent."""
+    if alarms is None:
+        return 0.0
+    limits = alarms.for_parameter(parameter.name)
+    drawn = [(100 * limits.raise_above, "alert")]
+    if _danger_near(parameter, alarms):
+        drawn.append((100 * limits.danger_above, "danger"))
+    for value, severity in drawn:
+        for sign in (-1, 1):
+            axes.axhline(sign * value, color=SEVERITY_COLOURS[severity], linewidth=0.9, linestyle=_DASHES)
+    return drawn[-1][0]
+
+
+def _speed(axes: Axes, trend: Trend, step_ns: int) -> None:
+    time, speed = _with_gaps(trend.end_ns, step_ns, trend.speed_rad_s * 30 / np.pi)
+    axes.plot(time, speed, color=INK, linewidth=1.0)
+    axes.set_title("speed")
+    axes.set_ylabel("rpm")
+    known = speed[np.isfinite(speed)]
+    if known.size:
+        middle = float(np.median(known))
+        spread = max(0.02 * middle, 1.2 * float(np.max(np.abs(known - middle))))
+        axes.set_ylim(middle - spread, middle + spread)
+    else:
+        axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=GREY)
+        axes.set_yticks([])
+
+
+def _with_gaps(
+    end_ns: npt.NDArray[np.int64], step_ns: int, *series: npt.NDArray[np.float64]
+) -> tuple[npt.NDArray[np.float64], ...]:
+    """Times for matplotlib, and series with a nan where reports are missing: no line is drawn across."""
+    after = np.flatnonzero(np.diff(end_ns) > _GAP * step_ns) + 1
+    time = as_dates(np.insert(end_ns, after, end_ns[after - 1] + 1))
+    return (time, *(np.insert(values, after, np.nan) for values in series))

@@ -1,0 +1,112 @@
+"""Correlation functions of the latest window beside what theory predicts."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from models.diagnosis.window import WindowStatistics
+from models.machine import MachineFile
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, state_name
+from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
+from service.analysis.snapshots.choice import chosen_pairs, figures, product_unit
+from service.analysis.snapshots.measured import MeasuredCorrelations, measured_correlations
+from service.analysis.snapshots.prediction import Prediction
+from service.analysis.snapshots.statement import Speaker, heading, no_window, theory
+
+__all__ = ["correlation_snapshot"]
+
+
+def correlation_snapshot(
+    identity: Speaker,
+    machine: MachineFile,
+    window: WindowStatistics | None,
+    prediction: Prediction,
+    filled: float,
+    first: Sequence[str] = (),
+    second: Sequence[str] = (),
+    units: Units = "channel",
+) -> CorrelationSnapshot:
+    """Correlation functions of pairs of channels, with standard errors and predictions.
+
+    Parameters
+    ----------
+    identity : Speaker
+    machine : MachineFile
+    window : WindowStatistics or None
+        The latest full window.
+    prediction : Prediction
+        Theory for it.
+    filled : float
+        Fraction of a full window that is there now.
+    first, second : sequence of str
+        Channels by name: the references, and as many responses; without `second` every channel with itself, without
+        both a few pairs (`service.analysis.snapshots.choice.chosen_pairs`).
+    units : str
+        ``channel`` or ``SI``.
+
+    Raises
+    ------
+    SnapshotError
+        If there is no such channel.
+    """
+    pairs = chosen_pairs(machine, first, second)
+    stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
+    if window is None:
+        return CorrelationSnapshot(
+            **heading(identity, window, filled),
+            lags_s=(),
+            method="samples",
+            band_hz=None,
+            pairs=(),
+            theory=stated,
+            reason=no_window(machine, filled),
+        )
+    states = tuple(dict.fromkeys(state_name(channel) for pair in pairs for channel in pair))
+    columns = [window.states.index(state) for state in states]
+    places = [(states.index(state_name(one)), states.index(state_name(other))) for one, other in pairs]
+    measured = measured_correlations(machine, window, [(columns[i], columns[j]) for i, j in places])
+    nominal, estimated = prediction.correlations(states, places, measured.lags_s, measured.band_hz)
+    return CorrelationSnapshot(
+        **heading(identity, window, filled),
+        lags_s=tuple(measured.lags_s.tolist()),
+        method="samples" if measured.band_hz is None else "spectrum",
+        band_hz=measured.band_hz,
+        pairs=tuple(_pair(pair, number, measured, nominal, estimated, units) for number, pair in enumerate(pairs)),
+        theory=stated,
+        reason="",
+    )
+
+
+def _pair(
+    pair: tuple[Channel, Channel],
+    number: int,
+    measured: MeasuredCorrelations,
+    nominal: FloatArray | None,
+    estimated: FloatArray | None,
+    units: Units,
+) -> CorrelationPair:
+    unit, factor = product_unit(*pair, units)
+    values, errors = measured.values[:, number], measured.errors[:, number]
+    (z_nominal, series_nominal), (z_estimated, series_estimated) = (
+        (None, None) if one is None else (_rms_z(values - one[:, number], errors), figures(factor * one[:, number]))
+        for one in (nominal, estimated)
+    )
+    return CorrelationPair(
+        first=pair[0].name,
+        second=pair[1].name,
+        unit=unit,
+        measured=figures(factor * values),
+        standard_error=figures(factor * errors),
+        nominal=series_nominal,
+        estimated=series_estimated,
+        nominal_z=z_nominal,
+        estimated_z=z_estimated,
+        outside_band=figures(measured.outside_band[number : number + 1])[0],
+    )
+
+
+def _rms_z(difference: FloatArray, errors: FloatArray) -> float | None:
+    if not np.all(errors > 0):
+        return None
+    return figures([np.sqrt(np.mean((difference / errors) ** 2))])[0]

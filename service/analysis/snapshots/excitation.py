@@ -1,0 +1,208 @@
+"""The excitation of a window: what shakes the machine, given its parameters.
+
+Nobody measures it, and every prediction needs it. It is the one that the likelihood would find with the rotor's
+parameters held: a level matrix of all forces, a low-pass, a smooth colour of each force, and the noise of each sensor
+(`models.diagnosis.likelihood.spectral_model`).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN, BinGroups, group_bins
+from models.diagnosis.likelihood.integrated import integrated
+from models.diagnosis.likelihood.motions import Motions
+from models.diagnosis.likelihood.scoring import FisherScoring
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SpectralModel
+from models.diagnosis.likelihood.start import starting_point
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine
+from models.physics.excitation import low_pass
+from models.physics.matrices import COORDINATES
+from models.physics.parameters import RotorParameters
+from models.signals.block import FloatArray
+from service.analysis.snapshots.sensor_noise import noise_density, sensor_noise
+
+__all__ = ["LEFT_OUT_BINS", "Excitation", "excitation_of", "window_speed"]
+
+LEFT_OUT_BINS = 3
+"""Lines on either side of the rotation that are not compared: what is left of 1× there is not stochastic."""
+_GROUPS = 150
+_HELD = 1e9
+_STEPS, _NEAR, _GAIN = 60, 0.15, 3.0
+_SMOOTH = 2000.0
+"""The search begins with forces of one colour, and the window says how far they differ."""
+
+
+@dataclass(frozen=True, slots=True)
+class Excitation:
+    """Forces and sensor noise of one window.
+
+    Attributes
+    ----------
+    machine : Machine
+        Whose rotor they were found with.
+    motions : Motions
+        What was measured.
+    theta : ndarray
+        Point of `SpectralModel` with all structural ratios at nought.
+    force_scale : float
+        Its unit of force, N/√Hz.
+    speed_rad_s : float
+        Speed of the gyroscopic terms.
+    noise : dict of str to ndarray
+        Parameters of every sensor's noise (`service.analysis.snapshots.sensor_noise`), by state; an
+        accelerometer's as that of the velocity it was integrated to.
+    """
+
+    machine: Machine
+    motions: Motions
+    theta: FloatArray
+    force_scale: float
+    speed_rad_s: float
+    noise: dict[str, FloatArray]
+
+    def spectra(self, rotor: RotorParameters, states: tuple[str, ...], frequencies_hz: FloatArray) -> ComplexArray:
+        """Cross-spectra that this excitation gives a rotor, sensor noise included, two-sided, SI²/Hz.
+
+        Outside the window's band the forces' low-pass goes on; their colour and the noise stay as at its edge.
+
+        Parameters
+        ----------
+        rotor : RotorParameters
+        states : tuple of str
+            Measured states and accelerations.
+        frequencies_hz : ndarray, shape (n_frequencies,)
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n, n)
+        """
+        low_hz, high_hz = self.machine.window.band_hz
+        size = frequencies_hz.size
+        one = np.ones((size, 1))
+        lines = BinGroups(
+            edges=tuple((k, k + 1) for k in range(size)),
+            bins=one[:, 0],
+            centre_hz=np.clip(frequencies_hz, low_hz, high_hz),
+            nodes_hz=frequencies_hz[:, None],
+            weights=one,
+            shared=np.empty((0, 0)),
+        )
+        machine = self.machine.model_copy(update={"rotor": rotor})
+        model = SpectralModel(machine, self.motions, lines, self.force_scale)
+        point = model.at(self.theta, self.speed_rad_s)
+        w = 2 * np.pi * frequencies_hz
+        gain = low_pass(frequencies_hz, *model.filter(self.theta))
+        dofs = [_dof(state) for state in states]
+        seen = point.H[:, 0][:, dofs] * np.stack([(1j * w) ** _order(state) for state in states], axis=1)[:, :, None]
+        spectra = (seen * gain[:, None, None]) @ point.C @ seen.conj().transpose(0, 2, 1)
+        diagonal = np.arange(len(states))
+        spectra[:, diagonal, diagonal] += np.stack([self._noise(state, frequencies_hz) for state in states], axis=1)
+        return np.asarray(spectra, dtype=np.complex128)
+
+    def _noise(self, state: str, frequencies_hz: FloatArray) -> FloatArray:
+        """Density of one sensor's noise; none where the likelihood left the sensor out."""
+        low_hz, high_hz = self.machine.window.band_hz
+        within_hz = np.clip(frequencies_hz, low_hz, high_hz)
+        if state in self.noise:
+            return noise_density(self.noise[state], within_hz, high_hz)
+        velocity = state.replace("_ddot", "_dot")
+        if velocity in self.noise and velocity not in self.machine.descriptor.states:
+            return (2 * np.pi * within_hz) ** 2 * noise_density(self.noise[velocity], within_hz, high_hz)
+        return np.zeros_like(frequencies_hz)
+
+
+def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
+    """Find the excitation with which a machine explains a window best.
+
+    Parameters
+    ----------
+    machine : Machine
+        Its rotor is taken as it is.
+    window : WindowStatistics
+
+    Raises
+    ------
+    EstimationError
+        If a channel does not move, or no excitation is the best one.
+    """
+    window = integrated(window)
+    place = f"{machine.site}/{machine.name}"
+    speed = window_speed(machine, window)
+    frequencies_hz = window.frequencies_hz
+    spacing_hz = float(frequencies_hz[1] - frequencies_hz[0])
+    excluded = np.abs(frequencies_hz - abs(speed) / (2 * np.pi)) <= LEFT_OUT_BINS * spacing_hz
+    power = np.einsum("fii->i", window.spectrum[~excluded]).real / np.count_nonzero(~excluded)
+    still = [state for state, one in zip(window.states, power, strict=True) if not one > 0]
+    if still:
+        raise EstimationError(f"{place}: no fluctuation in {', '.join(still)}: nothing to compare with theory")
+    motions = Motions(window.states, np.sqrt(power))
+    low_hz, high_hz = machine.window.band_hz
+    groups = group_bins(frequencies_hz, machine, np.asarray(excluded, dtype=np.bool_), (high_hz - low_hz) / _GROUPS)
+    usual_cutoff_hz = math.sqrt(math.prod(machine.condition.cutoff_hz))
+    force_scale = _force_scale(machine, motions, groups, speed, usual_cutoff_hz)
+    model = SpectralModel(machine, motions, groups, force_scale)
+    observed = motions.spectra(groups.average(window.spectrum), model.centre)
+    search = FisherScoring(model, observed, window.n_segments, speed, usual_cutoff_hz, _SMOOTH)
+    search.weights.ridge[: model.cutoff_at] = _HELD
+    try:
+        # Trial points may lie far out; what comes of them is checked, not warned of.
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            start = starting_point(model, observed, search.centre, speed)
+            theta = search.maximise(start, _STEPS, _NEAR, _GAIN).theta
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(f"{place}: no excitation explains this window with these parameters: {error}") from error
+    if not np.all(np.isfinite(theta)):
+        raise EstimationError(f"{place}: no excitation explains this window with these parameters")
+    theta = theta.copy()
+    theta[: model.cutoff_at] = 0.0
+    noise = _noise_of(machine, model, theta, window, speed)
+    return Excitation(machine, motions, theta, force_scale, speed, noise)
+
+
+def window_speed(machine: Machine, window: WindowStatistics) -> float:
+    """Speed in the window; the nominal one where it is not known, rad/s."""
+    return float(window.speed_rad_s) if np.isfinite(window.speed_rad_s) else machine.operation.speed_rad_s
+
+
+def _noise_of(
+    machine: Machine, model: SpectralModel, theta: FloatArray, window: WindowStatistics, speed: float
+) -> dict[str, FloatArray]:
+    """Noise of every sensor, beside what the excitation lets it see."""
+    groups, point = model.groups, model.at(theta, speed)
+    dofs = [_dof(state) for state in window.states]
+    seen = point.H[:, :, dofs]
+    power = np.einsum("gksa,ab,gksb->gks", seen, point.C, seen.conj(), optimize=True).real
+    gain = low_pass(groups.nodes_hz, *model.filter(theta)) * groups.weights
+    w = 2 * np.pi * groups.nodes_hz
+    averages = AVERAGES_PER_BIN * window.n_segments * groups.bins
+    measured = np.einsum("gss->gs", groups.average(window.spectrum)).real
+    found = {}
+    for at, state in enumerate(window.states):
+        theory = np.sum(gain * w ** (2 * _order(state)) * power[:, :, at], axis=1)
+        found[state] = sensor_noise(measured[:, at], theory, averages, groups.centre_hz, machine.window.band_hz[1])
+    return found
+
+
+def _force_scale(machine: Machine, motions: Motions, groups: BinGroups, speed: float, cutoff_hz: float) -> float:
+    """Unit of forces in which equal independent sources of level one make the mean power that was measured."""
+    model = SpectralModel(machine, motions, groups, shapes=0)
+    theta = np.zeros(model.size)
+    theta[model.cutoff_at], theta[model.order_at] = np.log(cutoff_hz), np.log(2)
+    theta[model.noise_at] = -np.inf
+    theta[model.level_at] = np.eye(6)[ROWS, COLUMNS]
+    explained = groups.bins @ np.einsum("fii->f", model.at(theta, speed).S).real / (model.n * groups.bins.sum())
+    return float(explained**-0.5)
+
+
+def _dof(state: str) -> int:
+    return COORDINATES.index(state.partition("_")[0])
+
+
+def _order(state: str) -> int:
+    """How often the coordinate is differentiated."""
+    return {"": 0, "dot": 1, "ddot": 2}[state.partition("_")[2]]

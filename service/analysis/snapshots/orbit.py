@@ -1,0 +1,225 @@
+"""Orbits of the latest window at running speed, and the newest revolutions as measured."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.readings import ParameterReading
+from models.diagnosis.window import WindowStatistics
+from models.machine import Machine, MachineFile
+from models.physics.lyapunov import synchronous_response
+from models.physics.matrices import STATE_INDEX
+from models.physics.parameters import RotorParameters, changed
+from models.signals.block import SampleBlock
+from models.signals.channels import Channel, state_name
+from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
+from service.analysis.snapshots.choice import figures, orbit_pairs
+from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
+from service.analysis.snapshots.path import NewestPath, newest_path
+from service.analysis.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
+from service.analysis.snapshots.statement import Speaker, heading, no_window, theory
+
+__all__ = ["orbit_snapshot"]
+
+_NO_SPEED = "the speed of rotation is not known"
+
+
+@dataclass(frozen=True, slots=True)
+class _Vectors:
+    """Vectors q of x = Re{q e^{jθ}} in the window, SI, of all its states.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (n,)
+    hops : ndarray, shape (n_hops, n)
+        The same of every hop; their scatter gives standard errors.
+    direction : int
+        1 if θ grows, -1 if it falls.
+    absolute : bool
+        Whether θ is the shaft's own angle; else it begins anywhere, and which way the shaft turns is not known.
+    """
+
+    mean: ComplexArray
+    hops: ComplexArray
+    direction: int
+    absolute: bool
+
+
+def orbit_snapshot(
+    identity: Speaker,
+    machine: MachineFile,
+    known: Machine | None,
+    window: WindowStatistics | None,
+    readings: Iterable[ParameterReading],
+    why_not: str,
+    filled: float,
+    blocks: tuple[SampleBlock, ...] = (),
+    revolutions: int = 0,
+    units: Units = "channel",
+) -> OrbitSnapshot:
+    """Orbits at every place where displacements are measured in both directions.
+
+    Parameters
+    ----------
+    identity : Speaker
+    machine : MachineFile
+    known : Machine or None
+        The machine with all its parameters.
+    window : WindowStatistics or None
+        The latest full window; its ellipses are those of all its data.
+    readings : iterable of ParameterReading
+        Of that window; empty if it was not evaluated.
+    why_not : str
+        Why it was not evaluated.
+    filled : float
+        Fraction of a full window that is there now.
+    blocks : tuple of SampleBlock
+        The newest accepted blocks, without a gap.
+    revolutions : int
+        Whole revolutions to be shown as measured; none with 0.
+    units : str
+        ``channel`` or ``SI``.
+
+    Raises
+    ------
+    SnapshotError
+        If `revolutions` is negative or too large.
+    """
+    places = orbit_pairs(machine.sensors)
+    path = newest_path(machine, blocks, revolutions, None if window is None else window.speed_rad_s)
+    changes = read_changes(readings)
+    lacking = NO_PARAMETERS if known is None else ""
+    estimated_reason = lacking or ("" if changes else why_not or NOTHING_READ)
+    vectors = None if window is None else _vectors(window)
+    if not places:
+        there = ", ".join(channel.name for channel in machine.sensors if channel.quantity == "displacement") or "none"
+        reason = (
+            f"{machine.site}/{machine.name}: an orbit needs the displacements in y and z at one place; measured "
+            f"displacements: {there}"
+        )
+    elif window is None:
+        reason = no_window(machine, filled)
+    else:
+        reason = _NO_SPEED if vectors is None else ""
+    rotors = (
+        None if known is None else known.rotor,
+        None if known is None or estimated_reason else changed(known.rotor, changes),
+    )
+    head = heading(identity, window, filled)
+    return OrbitSnapshot(
+        **head,
+        speed_source="unknown" if window is None else window.speed_source,
+        orbits=tuple(_place(pair, window, vectors, known, rotors, path, units) for pair in places),
+        revolutions=path.revolutions,
+        path_start_ns=path.start_ns,
+        pulses_s=tuple(one for one in figures(path.pulses_s) if one is not None),
+        theory=theory(changes, lacking, estimated_reason),
+        reason=reason,
+        path_reason=path.reason,
+    )
+
+
+def _vectors(window: WindowStatistics) -> _Vectors | None:
+    if window.synchronous is not None and window.hop_synchronous is not None:
+        return _Vectors(window.synchronous, window.hop_synchronous, 1 if window.speed_rad_s >= 0 else -1, absolute=True)
+    if window.relative_synchronous is None:
+        return None
+    seen = window.relative_synchronous[np.any(window.relative_synchronous != 0, axis=1)]
+    return _Vectors(seen.mean(axis=0), seen, 1, absolute=False) if seen.shape[0] else None
+
+
+def _place(
+    pair: tuple[Channel, Channel],
+    window: WindowStatistics | None,
+    vectors: _Vectors | None,
+    known: Machine | None,
+    rotors: tuple[RotorParameters | None, RotorParameters | None],
+    path: NewestPath,
+    units: Units,
+) -> PlaceOrbit:
+    factor = 1.0 if units == "SI" else 1 / pair[0].to_si
+    y = z = ellipse = nominal = estimated = None
+    if window is not None and vectors is not None:
+        at = [window.states.index(state_name(channel)) for channel in pair]
+        y, z = (_vector(channel, column, vectors, factor) for channel, column in zip(pair, at, strict=True))
+        ellipse = _ellipse(factor * vectors.mean[at], vectors.direction, absolute=vectors.absolute)
+        nominal, estimated = (
+            None if known is None or rotor is None else _predicted(known, rotor, pair, window, vectors, factor)
+            for rotor in rotors
+        )
+    return PlaceOrbit(
+        location=pair[0].location,
+        unit="m" if units == "SI" else pair[0].unit,
+        y=y,
+        z=z,
+        ellipse=ellipse,
+        nominal=nominal,
+        estimated=estimated,
+        path=_path(pair, path, factor),
+    )
+
+
+def _vector(channel: Channel, column: int, vectors: _Vectors, factor: float) -> RunningSpeedVector:
+    q = complex(vectors.mean[column])
+    hops = vectors.hops[:, column]
+    count = hops.shape[0]
+    error = phase_error = None
+    if count > 1 and abs(q) > 0:
+        along = (hops - hops.mean()) * np.conj(q) / abs(q)
+        error = figures([factor * along.real.std(ddof=1) / np.sqrt(count)])[0]
+        phase_error = figures([np.degrees(along.imag.std(ddof=1) / np.sqrt(count) / abs(q))])[0]
+    return RunningSpeedVector(
+        channel=channel.name,
+        amplitude=_rounded(factor * abs(q)),
+        amplitude_error=error,
+        phase_lag_deg=_rounded(phase_lag_deg(q, vectors.direction)) if vectors.absolute else None,
+        phase_error_deg=phase_error if vectors.absolute else None,
+    )
+
+
+def _predicted(
+    known: Machine,
+    rotor: RotorParameters,
+    pair: tuple[Channel, Channel],
+    window: WindowStatistics,
+    vectors: _Vectors,
+    factor: float,
+) -> OrbitEllipse:
+    """Orbit that the unbalance makes at the window's speed."""
+    q1, q2 = synchronous_response(rotor, window.speed_rad_s)
+    rows = [STATE_INDEX[state_name(channel)] for channel in pair]
+    q = (q1 - 1j * q2)[rows] * np.exp(1j * known.operation.unbalance_phase_rad)
+    return _ellipse(factor * q, vectors.direction, absolute=vectors.absolute)
+
+
+def _ellipse(vectors: ComplexArray, direction: int, *, absolute: bool) -> OrbitEllipse:
+    found = Ellipse(complex(vectors[0]), complex(vectors[1]))
+    with_shaft = found.precession == "forward"
+    sense: Literal["y to z", "z to y"] = "y to z" if with_shaft == (direction > 0) else "z to y"
+    precession: Literal["forward", "backward"] = "forward" if with_shaft else "backward"
+    return OrbitEllipse(
+        semi_major=_rounded(found.semi_major),
+        semi_minor=_rounded(found.semi_minor),
+        tilt_deg=_rounded(found.tilt_deg),
+        sense=sense,
+        precession=precession if absolute else None,
+    )
+
+
+def _path(pair: tuple[Channel, Channel], path: NewestPath, factor: float) -> PathSamples | None:
+    if not path.revolutions:
+        return None
+    y, z = (path.values_si(channel) * factor for channel in pair)
+    times_s = np.arange(y.size) / path.rate_hz
+    return PathSamples(
+        times_s=tuple(one for one in figures(times_s) if one is not None),
+        y=figures(y - y.mean()),
+        z=figures(z - z.mean()),
+    )
+
+
+def _rounded(value: float) -> float:
+    return figures([value])[0] or 0.0

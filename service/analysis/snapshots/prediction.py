@@ -1,0 +1,214 @@
+"""What theory predicts of a window: for the machine as nominal, and as it is estimated now.
+
+Both under one excitation, that of the window with the machine as estimated, or as nominal where there is no estimate.
+So the difference between the two is what the parameters have changed, and nothing else. Spectra are averaged under the
+kernel of the segments, as the measured ones are. Correlation functions are their Fourier transforms (Eq. 18),
+
+    R_ij(τ) = 2 Re ∫ S_ij(f) e^{-2πjfτ} df,
+
+by Gauss-Legendre quadrature over panels that are narrow around the natural frequencies.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.diagnosis.likelihood.bins import group_bins
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.readings import ParameterReading
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+from models.machine import Machine
+from models.physics.matrices import system_A
+from models.physics.parameters import PARAMETERS, RotorParameters, changed
+from models.signals.block import FloatArray
+from service.analysis.snapshots.excitation import Excitation, excitation_of
+
+__all__ = ["NOTHING_READ", "NO_PARAMETERS", "Prediction", "predict", "read_changes"]
+
+NOTHING_READ = "no parameter was read in this window"
+NO_PARAMETERS = "the machine's parameters are not known, so there is no theory to predict from"
+_POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(5)
+_HALF_WIDTHS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
+"""Edges of panels on either side of a natural frequency, in units of half its half-power bandwidth."""
+_CYCLES = 1.2
+"""Most periods of the longest lag in one panel."""
+_GROWTH = 0.05
+_OVER_BAND = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Theory for one window.
+
+    Attributes
+    ----------
+    machine : Machine
+        As nominal.
+    excitation : Excitation or None
+    changes : dict of str to float
+        Relative changes of the machine as estimated.
+    nominal_reason, estimated_reason : str
+        Why there is no prediction for the machine as nominal, or as estimated; empty where there is one.
+    """
+
+    machine: Machine | None
+    excitation: Excitation | None
+    changes: dict[str, float]
+    nominal_reason: str
+    estimated_reason: str
+
+    @property
+    def nominal(self) -> RotorParameters | None:
+        """Rotor as nominal, where a prediction can be made for it."""
+        return None if self.machine is None or self.nominal_reason else self.machine.rotor
+
+    @property
+    def estimated(self) -> RotorParameters | None:
+        """Rotor as now estimated, where a prediction can be made for it."""
+        if self.machine is None or self.estimated_reason:
+            return None
+        return changed(self.machine.rotor, self.changes)
+
+    def spectra(
+        self, states: tuple[str, ...], frequencies_hz: FloatArray
+    ) -> tuple[ComplexArray | None, ComplexArray | None]:
+        """Cross-spectra as segments are expected to show them, two-sided, SI²/Hz, shape (n_lines, n, n).
+
+        Parameters
+        ----------
+        states : tuple of str
+        frequencies_hz : ndarray, shape (n_lines,)
+            Lines of the window's spectrum, evenly spaced.
+
+        Returns
+        -------
+        nominal, estimated : ndarray or None
+            None where there is no prediction.
+        """
+        if self.excitation is None or self.machine is None:
+            return None, None
+        spacing_hz = float(frequencies_hz[1] - frequencies_hz[0])
+        none_left_out = np.zeros(frequencies_hz.size, dtype=np.bool_)
+        lines = group_bins(frequencies_hz, self.machine, none_left_out, spacing_hz)
+        nodes, place = np.unique(np.round(lines.nodes_hz / spacing_hz, 6), return_inverse=True)
+        found: list[ComplexArray | None] = []
+        for rotor in (self.nominal, self.estimated):
+            if rotor is None:
+                found.append(None)
+                continue
+            at_nodes = self.excitation.spectra(rotor, states, nodes * spacing_hz)[place.reshape(lines.nodes_hz.shape)]
+            found.append(np.asarray(np.einsum("lk,lkij->lij", lines.weights, at_nodes), dtype=np.complex128))
+        return found[0], found[1]
+
+    def correlations(
+        self,
+        states: tuple[str, ...],
+        pairs: list[tuple[int, int]],
+        lags_s: FloatArray,
+        within_hz: tuple[float, float] | None = None,
+    ) -> tuple[FloatArray | None, FloatArray | None]:
+        """Correlation functions R_ij(τ), SI, shape (n_lags, n_pairs).
+
+        Parameters
+        ----------
+        states : tuple of str
+        pairs : list of (int, int)
+            Reference and response, as places in `states`.
+        lags_s : ndarray, shape (n_lags,)
+        within_hz : tuple of float, optional
+            Only what lies between these frequencies; all of them without it.
+
+        Returns
+        -------
+        nominal, estimated : ndarray or None
+            None where there is no prediction.
+        """
+        return (
+            self._correlations(self.nominal, states, pairs, lags_s, within_hz),
+            self._correlations(self.estimated, states, pairs, lags_s, within_hz),
+        )
+
+    def _correlations(
+        self,
+        rotor: RotorParameters | None,
+        states: tuple[str, ...],
+        pairs: list[tuple[int, int]],
+        lags_s: FloatArray,
+        within_hz: tuple[float, float] | None,
+    ) -> FloatArray | None:
+        if rotor is None or self.excitation is None:
+            return None
+        low_hz, high_hz = within_hz or (0.0, self._highest_hz(states))
+        frequencies_hz, weights = self._nodes(rotor, low_hz, high_hz, float(lags_s[-1]))
+        spectra = self.excitation.spectra(rotor, states, frequencies_hz)
+        of_pairs = np.stack([spectra[:, i, j] for i, j in pairs], axis=1) * weights[:, None]
+        phase = 2 * np.pi * np.outer(lags_s, frequencies_hz)
+        return np.asarray(2 * (np.cos(phase) @ of_pairs.real + np.sin(phase) @ of_pairs.imag), dtype=np.float64)
+
+    def _highest_hz(self, states: tuple[str, ...]) -> float:
+        """Where what is measured ends, or what is left is next to nothing."""
+        assert self.machine is not None  # noqa: S101  # asked by those who have it
+        nyquist_hz = self.machine.rate_hz / 2
+        if any(state.endswith("_ddot") for state in states):
+            return nyquist_hz
+        poles = np.linalg.eigvals(system_A(self.machine.rotor, self.machine.operation.speed_rad_s))
+        fastest_hz = float(np.abs(poles).max()) / (2 * np.pi)
+        return min(nyquist_hz, max(_OVER_BAND * self.machine.window.band_hz[1], 1.5 * fastest_hz))
+
+    def _nodes(
+        self, rotor: RotorParameters, low_hz: float, high_hz: float, longest_s: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Frequencies and weights of the quadrature."""
+        assert self.excitation is not None  # noqa: S101  # asked by those who have it
+        assert self.machine is not None  # noqa: S101
+        poles = np.linalg.eigvals(system_A(rotor, self.excitation.speed_rad_s))
+        poles = poles[poles.imag > 0]
+        modes_hz, half_hz = poles.imag / (2 * np.pi), np.maximum(-poles.real / (2 * np.pi), 1e-9)
+        around = (modes_hz[:, None] + half_hz[:, None] * np.concatenate([-_HALF_WIDTHS[:0:-1], _HALF_WIDTHS])).ravel()
+        widest_hz = _CYCLES / max(longest_s, 1 / self.machine.window.band_hz[1])
+        even, at = [low_hz], low_hz
+        beyond_hz = _OVER_BAND * self.machine.window.band_hz[1]
+        while at < high_hz:
+            at += widest_hz if at < beyond_hz else max(widest_hz, _GROWTH * at)
+            even.append(min(at, high_hz))
+        edges = np.unique(np.concatenate([even, around[(around > low_hz) & (around < high_hz)]]))
+        middle, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
+        return (
+            np.asarray((middle[:, None] + half[:, None] * _POINTS).ravel()),
+            np.asarray((half[:, None] * _WEIGHTS).ravel()),
+        )
+
+
+def predict(
+    known: Machine | None, window: WindowStatistics, readings: Iterable[ParameterReading], why_not: str = ""
+) -> Prediction:
+    """Theory for a window; what stands against it is stated in it, never raised.
+
+    Parameters
+    ----------
+    known : Machine or None
+        The machine with all its parameters.
+    window : WindowStatistics
+    readings : iterable of ParameterReading
+        Of this window, by the diagnostician that decides; empty if it was not evaluated.
+    why_not : str
+        Why it was not evaluated.
+    """
+    if known is None:
+        return Prediction(None, None, {}, NO_PARAMETERS, NO_PARAMETERS)
+    changes = read_changes(readings)
+    estimated_reason = "" if changes else why_not or NOTHING_READ
+    rotor = changed(known.rotor, changes)
+    try:
+        excitation = excitation_of(known.model_copy(update={"rotor": rotor}), window)
+    except EstimationError as error:
+        return Prediction(known, None, changes, str(error), estimated_reason or str(error))
+    return Prediction(known, excitation, changes, "", estimated_reason)
+
+
+def read_changes(readings: Iterable[ParameterReading]) -> dict[str, float]:
+    """Relative changes of the parameters that were read; a total loss is one of 99 %, for nothing stands without."""
+    read = {reading.name: reading.change for reading in readings if reading.change is not None}
+    return {name: max(read[name], -0.99) for name in PARAMETERS if name in read}

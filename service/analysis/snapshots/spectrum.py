@@ -1,0 +1,210 @@
+"""Power spectral densities of the latest window beside what theory predicts, and coherence of pairs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from scipy.special import chdtri
+
+from models.diagnosis.moments import ComplexArray
+from models.diagnosis.window import WindowStatistics
+from models.machine import MachineFile
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, state_name
+from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, SpectrumSnapshot, Units
+from service.analysis.snapshots.choice import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
+from service.analysis.snapshots.excitation import LEFT_OUT_BINS
+from service.analysis.snapshots.prediction import Prediction
+from service.analysis.snapshots.statement import Speaker, heading, no_window, theory
+
+__all__ = ["MOST_LINES", "spectrum_snapshot"]
+
+MOST_LINES = 1000
+"""Lines in a snapshot; where the band has more, neighbours are averaged."""
+_SHARED = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)
+"""Squared correlations of half-overlapping Hann segments' power in one line, and in lines one and two apart."""
+_OUTER = (0.025, 0.975)
+_Array = TypeVar("_Array", FloatArray, ComplexArray)
+
+
+@dataclass(frozen=True, slots=True)
+class _Spectra:
+    """Two-sided cross-spectra, SI²/Hz, each of shape (n_lines, n, n) with the states in one order."""
+
+    measured: ComplexArray
+    nominal: ComplexArray | None
+    estimated: ComplexArray | None
+
+
+def spectrum_snapshot(
+    identity: Speaker,
+    machine: MachineFile,
+    window: WindowStatistics | None,
+    prediction: Prediction,
+    filled: float,
+    channels: Sequence[str] = (),
+    first: Sequence[str] = (),
+    second: Sequence[str] = (),
+    band_hz: tuple[float, float] | None = None,
+    units: Units = "channel",
+) -> SpectrumSnapshot:
+    """Power spectral densities of channels, and cross-spectra and coherence of pairs.
+
+    Parameters
+    ----------
+    identity : Speaker
+    machine : MachineFile
+    window : WindowStatistics or None
+        The latest full window.
+    prediction : Prediction
+        Theory for it.
+    filled : float
+        Fraction of a full window that is there now.
+    channels : sequence of str
+        By name; without names all displacements, or all of the first quantity that is measured.
+    first, second : sequence of str
+        Pairs to be given with cross-spectrum and coherence; none without names.
+    band_hz : tuple of float, optional
+        Lines from and to, within those of the machine file's band.
+    units : str
+        ``channel`` or ``SI``.
+
+    Raises
+    ------
+    SnapshotError
+        If there is no such channel, or the band holds no line.
+    """
+    chosen = chosen_channels(machine, channels)
+    pairs = chosen_pairs(machine, first, second) if first or second else ()
+    within = _checked(machine, band_hz)
+    stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
+    head = heading(identity, window, filled)
+    if window is None:
+        return SpectrumSnapshot(
+            **head,
+            frequencies_hz=(),
+            line_spacing_hz=None,
+            averaged_lines=1,
+            degrees_of_freedom=None,
+            interval_95=None,
+            coherence_95=None,
+            rotation_hz=None,
+            left_out_hz=None,
+            densities=(),
+            cross=(),
+            theory=stated,
+            reason=no_window(machine, filled),
+        )
+    lines = (window.frequencies_hz >= within[0] - 1e-9) & (window.frequencies_hz <= within[1] + 1e-9)
+    frequencies_hz = window.frequencies_hz[lines]
+    spacing_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
+    states = tuple(dict.fromkeys(state_name(one) for one in (*chosen, *(one for pair in pairs for one in pair))))
+    columns = [window.states.index(state) for state in states]
+    group = -(-frequencies_hz.size // MOST_LINES)
+    nominal, estimated = prediction.spectra(states, frequencies_hz)
+    spectra = _Spectra(
+        _grouped(window.spectrum[lines][:, columns][:, :, columns], group),
+        None if nominal is None else _grouped(nominal, group),
+        None if estimated is None else _grouped(estimated, group),
+    )
+    averages = _averages(window.n_segments, group)
+    freedom = 2 * averages
+    speed = head["speed_rad_s"]
+    rotation_hz = None if speed is None else abs(speed) / (2 * np.pi)
+    reach_hz = LEFT_OUT_BINS * spacing_hz
+    low, high = (float(freedom / chdtri(freedom, 1 - part)) for part in reversed(_OUTER))
+    return SpectrumSnapshot(
+        **head,
+        frequencies_hz=tuple(one for one in figures(_grouped(frequencies_hz, group)) if one is not None),
+        line_spacing_hz=spacing_hz * group,
+        averaged_lines=group,
+        degrees_of_freedom=float(freedom),
+        interval_95=(low, high),
+        coherence_95=float(1 - 0.05 ** (1 / (averages - 1))) if averages > 1 else None,
+        rotation_hz=rotation_hz,
+        left_out_hz=None if rotation_hz is None else (rotation_hz - reach_hz, rotation_hz + reach_hz),
+        densities=tuple(
+            _density(channel, states.index(state_name(channel)), spectra, spacing_hz * group, units)
+            for channel in chosen
+        ),
+        cross=tuple(
+            _cross(pair, states.index(state_name(pair[0])), states.index(state_name(pair[1])), spectra, units)
+            for pair in pairs
+        ),
+        theory=stated,
+        reason="",
+    )
+
+
+def _checked(machine: MachineFile, band_hz: tuple[float, float] | None) -> tuple[float, float]:
+    """Lines from and to; two at least, so that they have a distance."""
+    there = machine.window.band_hz
+    if band_hz is None:
+        return there
+    low_hz, high_hz = max(band_hz[0], there[0]), min(band_hz[1], there[1])
+    if not high_hz - low_hz >= 2 / machine.window.segment_s:
+        raise SnapshotError(
+            f"{machine.site}/{machine.name}: band is {band_hz[0]:g} to {band_hz[1]:g} Hz, expected at least "
+            f"{2 / machine.window.segment_s:g} Hz within {there[0]:g} to {there[1]:g} Hz"
+        )
+    return low_hz, high_hz
+
+
+def _grouped(values: _Array, group: int) -> _Array:
+    """Means of `group` neighbours along the first axis; what is left at the end makes no group."""
+    if group == 1:
+        return values
+    whole = values[: values.shape[0] // group * group]
+    return np.asarray(whole.reshape(-1, group, *values.shape[1:]).mean(axis=1), dtype=values.dtype)
+
+
+def _averages(n_segments: int, group: int) -> float:
+    """Independent averages in one line."""
+    near = sum(2 * (1 - apart / group) * _SHARED[apart] for apart in (1, 2) if apart < group)
+    return n_segments * group / (_SHARED[0] + near)
+
+
+def _density(channel: Channel, at: int, spectra: _Spectra, spacing_hz: float, units: Units) -> ChannelDensity:
+    unit, factor = product_unit(channel, channel, units)
+    measured = 2 * factor * spectra.measured[:, at, at].real
+    nominal, estimated = (
+        None if one is None else figures(2 * factor * one[:, at, at].real)
+        for one in (spectra.nominal, spectra.estimated)
+    )
+    return ChannelDensity(
+        channel=channel.name,
+        quantity=channel.quantity.value,
+        unit=f"{unit}/Hz",
+        measured=figures(measured),
+        nominal=nominal,
+        estimated=estimated,
+        rms=figures([np.sqrt(spacing_hz * measured.sum())])[0],
+    )
+
+
+def _cross(pair: tuple[Channel, Channel], i: int, j: int, spectra: _Spectra, units: Units) -> CrossSpectrum:
+    unit, factor = product_unit(*pair, units)
+    (nominal, nominal_coherence), (estimated, estimated_coherence) = (
+        (None, None) if one is None else (figures(2 * factor * np.abs(one[:, i, j])), figures(_coherence(one, i, j)))
+        for one in (spectra.nominal, spectra.estimated)
+    )
+    return CrossSpectrum(
+        first=pair[0].name,
+        second=pair[1].name,
+        unit=f"{unit}/Hz",
+        magnitude=figures(2 * factor * np.abs(spectra.measured[:, i, j])),
+        phase_deg=figures(np.degrees(np.angle(spectra.measured[:, j, i]))),
+        coherence=figures(_coherence(spectra.measured, i, j)),
+        nominal_magnitude=nominal,
+        nominal_coherence=nominal_coherence,
+        estimated_magnitude=estimated,
+        estimated_coherence=estimated_coherence,
+    )
+
+
+def _coherence(spectra: ComplexArray, i: int, j: int) -> FloatArray:
+    power = spectra[:, i, i].real * spectra[:, j, j].real
+    with np.errstate(invalid="ignore", divide="ignore"):  # nothing is coherent with a channel that does not move
+        share = np.abs(spectra[:, i, j]) ** 2 / power
+    return np.asarray(np.where(power > 0, np.minimum(share, 1.0), np.nan), dtype=np.float64)

@@ -1,0 +1,174 @@
+"""The HTTP API over what the service knows; ``docs/api.md`` lists the routes."""
+
+from typing import Annotated, Any
+
+from fastapi import Depends, FastAPI, Query, Request
+from fastapi.responses import HTMLResponse, JSONResponse
+from pydantic import AfterValidator, Field, WithJsonSchema
+
+from models.machine import MachineFile, load_machine
+from rotorwatch import __version__
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health
+from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
+from rotorwatch.records.monitor import Alive, Readiness
+from service.access.guard import Guard
+from service.access.problems import add_problems, problem_answer, responses
+from service.api.description import DescribedApp, only_known_arguments
+from service.api.routes.docs import add_docs_routes
+from service.api.routes.events import add_event_routes
+from service.api.routes.history import add_history_routes
+from service.api.routes.operations import add_operation_routes
+from service.api.routes.page import front_page
+from service.api.routes.recordings import add_recording_routes
+from service.api.routes.replays import add_replay_routes
+from service.api.routes.service import add_service_routes
+from service.api.routes.snapshots import add_snapshot_routes
+from service.api.views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
+
+__all__ = ["MachineView", "ServiceView", "create_app"]
+
+_DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
+
+A token with the scope of the route is needed for everything but `/healthz`. Errors are problem details (RFC 9457).
+Times in ns count from 1970-01-01 UTC.
+"""
+_TAGS = [
+    {"name": "machines", "description": "What is monitored, and how it stands."},
+    {"name": "alarms", "description": "What needs attention, and what operators do about it."},
+    {"name": "history", "description": "What has happened and was read, and who asked for what."},
+    {"name": "snapshots", "description": "What the monitor holds now: correlations, spectra, orbits."},
+    {"name": "events", "description": "What happens, as it happens."},
+    {"name": "recordings", "description": "Recorded streams."},
+    {"name": "replays", "description": "Recordings sent through a monitor of their own, apart from what is live."},
+    {"name": "service", "description": "The monitor itself."},
+]
+_SMALLEST_CHANGE = 1e-6
+
+
+def _sizeable(change: float) -> float:
+    if abs(change) < _SMALLEST_CHANGE:
+        raise ValueError(f"{change:g} is no change that could be found, expected at least 0.000001 up or down")
+    return change
+
+
+_Sizeable = Annotated[
+    float,
+    Field(gt=-1, le=10, allow_inf_nan=False),
+    AfterValidator(_sizeable),
+    WithJsonSchema(
+        {
+            "type": "number",
+            "exclusiveMinimum": -1,
+            "maximum": 10,
+            "not": {"exclusiveMinimum": -_SMALLEST_CHANGE, "exclusiveMaximum": _SMALLEST_CHANGE},
+        }
+    ),
+]
+_Change = Annotated[_Sizeable | None, Query(description="relative change to be found, -0.05 for a loss of 5 %")]
+
+
+def create_app(service: ServiceView, guard: Guard) -> FastAPI:
+    """Build the application.
+
+    Parameters
+    ----------
+    service : ServiceView
+        Where the answers come from; called from the server's worker threads.
+    guard : Guard
+        Who may call what.
+    """
+    app = DescribedApp(
+        title="rotorwatch",
+        version=__version__,
+        description=_DESCRIPTION,
+        openapi_tags=_TAGS,
+        dependencies=[guard.gate, Depends(only_known_arguments)],
+        openapi_url=None,  # the guard serves it
+        docs_url=None,  # the usual pages load their scripts from elsewhere; `service.api.routes.docs` does not
+        redoc_url=None,
+    )
+    add_problems(app)
+    _add_machine_routes(app, service, guard)
+    add_history_routes(app, service, guard)
+    add_operation_routes(app, service, guard)
+    add_snapshot_routes(app, service, guard)
+    add_event_routes(app, service, guard)
+    add_recording_routes(app, service.catalogue, guard)
+    add_replay_routes(app, service.replays, guard)
+    add_service_routes(app, service, guard)
+    _add_readiness_routes(app, service, guard)
+    add_docs_routes(app, guard)
+    guard.protect(app)
+    return app
+
+
+def _configuration_example() -> dict[str, object]:
+    """A configuration of the shipped machine ``lab``."""
+    return {**example(MachineConfiguration), "file": load_machine("lab").model_dump(mode="json")}
+
+
+def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    common: dict[str, Any] = {"tags": ["machines"], "dependencies": [guard.read]}
+
+    @app.get("/api/v1/machines", responses=responses(MachineList), **common)
+    def machines() -> MachineList:
+        """Every monitored machine with its state."""
+        return MachineList(machines=tuple(machine.description() for machine in service.machines()))
+
+    @app.get(PLACE, responses=responses(MachineDescription, 404, 422), **common)
+    def machine(site: SiteName, machine: MachineName) -> MachineDescription:
+        """One machine: stream, channels, keys, state."""
+        return found_machine(service, site, machine).description()
+
+    @app.get(
+        f"{PLACE}/configuration",
+        responses=responses(MachineConfiguration, 404, 422, shown=_configuration_example()),
+        **common,
+    )
+    def configuration(site: SiteName, machine: MachineName) -> MachineConfiguration:
+        """The machine file as it is in use, defaults filled in, and what was trained or commissioned for it."""
+        view = found_machine(service, site, machine)
+        return MachineConfiguration(
+            site=view.identity.site,
+            machine=view.identity.machine,
+            file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json"),
+            bundle=view.identity.bundle,
+            machine_hash=view.identity.machine_hash,
+        )
+
+    @app.get(f"{PLACE}/health", responses=responses(Health, 404, 422), **common)
+    def health(site: SiteName, machine: MachineName) -> Health:
+        """Where a machine stands: state, parameters with intervals, equations, alarms, quality of the data."""
+        return found_machine(service, site, machine).health()
+
+    @app.get(f"{PLACE}/detectable", responses=responses(DetectableChanges, 404, 422), **common)
+    def detectable(site: SiteName, machine: MachineName, change: _Change = None) -> DetectableChanges:
+        """Smallest changes that would be found in a window as the machine runs now, and the data a wished one takes."""
+        return found_machine(service, site, machine).detectable(change)
+
+
+def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    @app.get("/healthz", tags=["service"], responses=responses(Alive, guarded=False))
+    def healthz() -> Alive:
+        """Whether the process answers."""
+        return Alive(alive=True)
+
+    @app.get(
+        "/readyz",
+        tags=["service"],
+        dependencies=[guard.read],
+        responses=responses(Readiness),
+        response_model=Readiness,
+    )
+    def readyz(request: Request) -> Readiness | JSONResponse:
+        """Whether the service can do its work, and if not, why; a machine without data is listed, not counted."""
+        readiness = service.readiness()
+        if readiness.ready:
+            return readiness
+        return problem_answer(request, 503, "; ".join(readiness.reasons), readiness.model_dump(mode="json"))
+
+    @app.get("/", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
+    def page() -> str:
+        """Serve a plain page for people."""
+        return front_page(tuple(machine.health() for machine in service.machines()))

@@ -1,0 +1,306 @@
+"""Connections of the HTTP server: how many there may be, and how long one may keep the server waiting.
+
+uvicorn limits neither (docs/decisions/0022-http-connections.md). Connections are counted where they are accepted, so
+that those whose TLS handshake never ends count as well, and looked at a few times a second::
+
+    handshake --> head --> body --> answering --> head ...
+       '------------'--------'---------------------'      these wait for the other side: for so long, and
+                                                          whoever waits longest goes when there is no more room
+
+Everything here runs in the event loop of the server.
+"""
+
+import asyncio
+import errno
+import fcntl
+import ipaddress
+import socket
+import struct
+import sys
+import termios
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
+
+from rotorwatch.records.monitor import Problem
+from service.access.presented import network_of
+from service.settings.service import HttpSettings
+from service.terminal.logs import Limiter, logger
+
+__all__ = ["HttpConnections"]
+
+_LOOK_S = 0.2
+_MINUTE_S = 60.0
+_MOMENTS_S = 5.0
+"""A reader that takes nothing for longer makes room when there is none."""
+_NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+_BUSY = Problem(
+    title="Service Unavailable",
+    status=503,
+    detail="as many connections are open as this service has for you, and all are being answered; try again in 5 s",
+    instance="",
+).model_dump_json()
+_REFUSAL = (
+    "HTTP/1.1 503 Service Unavailable\r\ncontent-type: application/problem+json\r\nretry-after: 5\r\n"
+    f"connection: close\r\ncontent-length: {len(_BUSY)}\r\n\r\n{_BUSY}"
+).encode()
+_BYTES_ACKED = 120
+"""Where ``tcpi_bytes_acked`` is in ``struct tcp_info`` (linux/tcp.h), since Linux 4.1."""
+
+_AT_ONCE = struct.pack("ii", 1, 0)
+_log = logger(part="http")
+
+_Doing = Literal["handshake", "head", "body", "answering"]
+
+
+@dataclass(slots=True, eq=False)
+class _Connection:
+    """One connection, and since when it does what it does."""
+
+    accepted: socket.socket
+    address: str
+    network: str
+    since_s: float
+    taken_s: float
+    doing: _Doing = "handshake"
+    request: RequestResponseCycle | None = None
+    unsent: int = 0
+    taken: int = 0
+    ended: bool = False
+    protocol: H11Protocol | None = None
+
+    def look(self, now_s: float) -> None:
+        """Find out what it does now, and whether anything of an answer was taken."""
+        request: RequestResponseCycle | None = None
+        doing: _Doing = "handshake"
+        unsent = taken = 0
+        if self.protocol is not None:
+            request = cast("RequestResponseCycle | None", self.protocol.cycle)  # None before the first request
+            taken, queued = _taken_and_queued(self.accepted)
+            unsent = self.protocol.transport.get_write_buffer_size() + queued
+            if self.protocol.conn.their_state is h11.SEND_BODY:
+                doing = "body"
+            elif (request is None or request.response_complete) and not unsent:
+                doing = "head"
+            else:
+                doing = "answering"
+        if doing != self.doing or request is not self.request:
+            self.doing, self.request, self.since_s = doing, request, now_s
+        if not unsent or unsent < self.unsent or taken != self.taken:
+            self.taken_s = now_s
+        self.unsent, self.taken = unsent, taken
+
+    def waited_for(self, now_s: float) -> float | None:
+        """Since when the server waits for the other side; None if it does not, or for moments."""
+        if self.doing != "answering":
+            return self.since_s
+        return self.taken_s if now_s - self.taken_s > _MOMENTS_S else None
+
+    def end(self) -> None:
+        """End it at once; what is unsent is dropped, or the system would keep it for who knows how long."""
+        self.ended = True
+        with suppress(OSError):
+            self.accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _AT_ONCE)
+        if self.protocol is not None:
+            self.protocol.transport.abort()
+            return
+        with suppress(OSError):  # the other side was faster
+            self.accepted.shutdown(socket.SHUT_RDWR)
+
+
+class HttpConnections:
+    """All connections of one server.
+
+    Parameters
+    ----------
+    settings : HttpSettings
+        Times, and connections of one address.
+    most : int
+        Connections in all.
+    proxies : sequence of str
+        Addresses and networks of whom only the connections in all count.
+    plain : bool
+        Whether a refusal can be said in plain HTTP.
+    clock : callable
+        Monotonic seconds.
+
+    Attributes
+    ----------
+    exhausted : int
+        How often a connection could not be accepted because the process or the system has no file left.
+    """
+
+    def __init__(
+        self,
+        settings: HttpSettings,
+        most: int,
+        proxies: Sequence[str],
+        *,
+        plain: bool = True,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.exhausted = 0
+        self._most = most
+        self._per_address = settings.connections_per_address
+        self._longest_s = {
+            "handshake": settings.head_timeout_s,
+            "head": settings.head_timeout_s,
+            "body": settings.body_timeout_s,
+        }
+        self._send_s = settings.send_timeout_s
+        self._proxies = [ipaddress.ip_network(proxy) for proxy in proxies]
+        self._plain = plain
+        self._clock = clock
+        self._limiter = Limiter(clock, _MINUTE_S)
+        self._looked_s = clock()
+        self._open: dict[Any, _Connection] = {}
+
+    def listener(self, listening: socket.socket) -> socket.socket:
+        """Take a listening socket over; what it accepts is counted."""
+        return _Listener(listening, self)
+
+    def protocol(self) -> type[asyncio.Protocol]:
+        """Class of the protocol for ``uvicorn.Config``."""
+        connections = self
+
+        class Protocol(H11Protocol):
+            """Tells when a connection is ready for requests."""
+
+            def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn has it
+                super().connection_made(transport)
+                connections.made(transport.get_extra_info("peername"), self)
+
+        return Protocol
+
+    def watch(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Look at all connections a few times a second from now on; accept errors are logged once a minute."""
+        self._looked_s = self._clock()
+        loop.set_exception_handler(self._on_error)
+        loop.call_later(_LOOK_S, self._look, loop)
+
+    def made(self, address: Any, protocol: H11Protocol) -> None:
+        """A connection has got past its handshake."""
+        if found := self._open.get(address):
+            found.protocol = protocol
+            found.look(self._clock())
+            if found.ended:
+                found.end()
+
+    def admit(self, accepted: socket.socket, address: Any) -> bool:
+        """Count a connection, and say whether there was room for it without ado.
+
+        If there is not, the one goes of which the service has waited longest; if it waits for none, the new one goes.
+        """
+        now_s = self._clock()
+        present = self._present()
+        network = network_of(address[0])
+        mine = [one for one in present if one.network == network]
+        crowd: Sequence[_Connection] = ()
+        if len(mine) >= self._per_address and not self._is_proxy(address[0]):
+            crowd = mine
+        elif len(present) >= self._most:
+            crowd = present
+        for one in crowd:
+            one.look(now_s)
+        waiting = {one: since_s for one in crowd if (since_s := one.waited_for(now_s)) is not None}
+        if crowd and not waiting:
+            self._say("refused", address[0], "all connections are in use")
+            if self._plain:
+                with suppress(OSError):
+                    accepted.setblocking(False)
+                    accepted.send(_REFUSAL)
+            accepted.close()
+            return False
+        self._open[address] = _Connection(accepted, address[0], network, now_s, now_s)
+        if waiting:
+            longest = min(waiting, key=waiting.__getitem__)
+            self._say("ended", longest.address, f"another one came; this one was waited for: {longest.doing}")
+            longest.end()
+        return not crowd
+
+    def _present(self) -> list[_Connection]:
+        self._open = {address: one for address, one in self._open.items() if one.accepted.fileno() >= 0}
+        return [one for one in self._open.values() if not one.ended]
+
+    def _look(self, loop: asyncio.AbstractEventLoop) -> None:
+        loop.call_later(_LOOK_S, self._look, loop)
+        now_s = self._clock()
+        # What the loop was late itself, because the computer is busy, is not charged to the other side.
+        late_s = max(0.0, now_s - self._looked_s - _LOOK_S)
+        self._looked_s = now_s
+        for one in self._present():
+            one.since_s = min(now_s, one.since_s + late_s)
+            one.taken_s = min(now_s, one.taken_s + late_s)
+            one.look(now_s)
+            if now_s - one.since_s > self._longest_s.get(one.doing, float("inf")):
+                self._say("ended", one.address, f"the {one.doing} took longer than {self._longest_s[one.doing]:g} s")
+                one.end()
+            elif now_s - one.taken_s > self._send_s:
+                self._say("ended", one.address, f"nothing of the answer was taken for {self._send_s:g} s")
+                one.end()
+
+    def _say(self, what: str, address: str, why: str) -> None:
+        withheld = self._limiter.admit(what)
+        if withheld is not None:
+            more = {"withheld": withheld} if withheld else {}
+            _log.warning(f"connection {what}; said at most once a minute", address=address, why=why, **more)
+
+    def _is_proxy(self, address: str) -> bool:
+        return any(ipaddress.ip_address(address.partition("%")[0]) in network for network in self._proxies)
+
+    def _on_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if not isinstance(error, OSError) or error.errno not in _NO_FILES:
+            loop.default_exception_handler(context)
+            return
+        self.exhausted += 1
+        withheld = self._limiter.admit("accept")
+        if withheld is not None:
+            more = {"withheld": withheld} if withheld else {}
+            _log.error("no connection can be accepted; said at most once a minute", why=error.strerror, **more)
+
+
+class _Listener(socket.socket):
+    """A listening socket that counts what it accepts."""
+
+    def __init__(self, listening: socket.socket, connections: HttpConnections) -> None:
+        super().__init__(fileno=listening.detach())
+        self._connections = connections
+        self._pause = False
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection that there is room for.
+
+        asyncio accepts until nobody waits any more, thousands in one go. It is told that nobody does when something
+        has to be done first: connections to be closed, or a second to pass until there may be a file again.
+        """
+        if self._pause:
+            self._pause = False
+            raise BlockingIOError
+        try:
+            accepted, address = super().accept()
+        except OSError as error:
+            self._pause = error.errno in _NO_FILES
+            raise
+        self._pause = not self._connections.admit(accepted, address)
+        if accepted.fileno() < 0:
+            self._pause = False
+            raise BlockingIOError
+        return accepted, address
+
+
+def _taken_and_queued(connection: socket.socket) -> tuple[int, int]:
+    """Bytes that the other side has acknowledged, and those that the system keeps for it; zeros if it does not tell.
+
+    The system takes megabytes off our hands: our own buffer may stand still for long although the other side reads.
+    """
+    if sys.platform != "linux":
+        return 0, 0
+    (taken,) = struct.unpack_from("Q", connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256), _BYTES_ACKED)
+    (queued,) = struct.unpack("i", fcntl.ioctl(connection.fileno(), termios.TIOCOUTQ, bytes(4)))
+    return taken, queued

@@ -1,0 +1,113 @@
+"""The application's description of itself (OpenAPI), with whole examples; nothing else can be asked for."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.routing import iter_route_contexts
+
+from service.access.problems import share_problems
+
+__all__ = ["DescribedApp", "only_known_arguments"]
+
+_STRICT = "/api/"
+
+
+class DescribedApp(FastAPI):
+    """An application with a description that programs can be generated from.
+
+    Operations are called as their functions, problems are described once, and examples keep their nulls, which FastAPI
+    leaves out wherever they are.
+    """
+
+    def __init__(self, **arguments: Any) -> None:
+        super().__init__(generate_unique_id_function=lambda route: route.name, **arguments)
+        self._arguments: Mapping[Any, frozenset[str]] | None = None
+
+    def arguments(self, endpoint: object) -> frozenset[str]:
+        """Names of the query arguments that an endpoint takes."""
+        if self._arguments is None:
+            paths = self.openapi()["paths"]
+            self._arguments = {
+                context.endpoint: frozenset(
+                    one["name"]
+                    for method in context.methods or ()
+                    for one in paths.get(context.path_format, {}).get(method.lower(), {}).get("parameters", [])
+                    if one["in"] == "query"
+                )
+                for context in iter_route_contexts(self.routes)
+            }
+        return self._arguments.get(endpoint, frozenset())
+
+    def openapi(self) -> dict[str, Any]:
+        """Return the description; made once."""
+        if self.openapi_schema is not None:
+            return self.openapi_schema
+        description = super().openapi()
+        for context in iter_route_contexts(self.routes):
+            routes = description["paths"].get(context.path_format, {})
+            for method in context.methods or ():
+                described = routes.get(method.lower())
+                if described is not None:
+                    _restore(described["responses"], context.responses)
+        share_problems(description)
+        _simplify(description)
+        return description
+
+
+def only_known_arguments(request: Request) -> None:
+    """Refuse a query argument that the route does not take: misspelt, it would be left out without a word.
+
+    Raises
+    ------
+    RequestValidationError
+        Naming it, and those that there are.
+    """
+    given = request.query_params.keys()
+    if not given or not request.scope["path"].startswith(_STRICT) or not isinstance(request.app, DescribedApp):
+        return
+    known = request.app.arguments(request.scope.get("endpoint"))
+    expected = f"expected one of {', '.join(sorted(known))}" if known else "expected none"
+    faults = [
+        {"loc": ("query", name[:64]), "msg": f"no argument of this route, {expected}"}
+        for name in given
+        if name not in known
+    ]
+    if faults:
+        raise RequestValidationError(faults)
+
+
+def _restore(described: dict[str, Any], declared: dict[int | str, dict[str, Any]]) -> None:
+    for status, answer in declared.items():
+        for kind, part in answer.get("content", {}).items():
+            if "example" in part:
+                described[str(status)]["content"][kind]["example"] = part["example"]
+
+
+def _simplify(schema: Any) -> None:
+    """Make a schema such that programs can be generated from it, and small.
+
+    Says of every tuple also what all of its values are, which generators read that do not know `prefixItems`, and
+    leaves out titles that only repeat the name of a field, and the null of an argument that may be left out: nobody
+    could send it.
+    """
+    if isinstance(schema, list):
+        for one in schema:
+            _simplify(one)
+    elif isinstance(schema, dict):
+        for one in schema.values():
+            _simplify(one)
+        properties, own = schema.get("properties"), schema.get("schema")
+        for field in (*(properties.values() if isinstance(properties, dict) else ()), own):
+            if isinstance(field, dict):
+                field.pop("title", None)
+        if isinstance(own, dict) and own.get("description") == schema.get("description"):  # an argument's
+            own.pop("description", None)
+        if isinstance(own, dict) and "in" in schema and isinstance(choice := own.get("anyOf"), list):
+            own["anyOf"] = choice = [one for one in choice if one != {"type": "null"}]
+            if len(choice) == 1:
+                own.update(*own.pop("anyOf"))
+        if isinstance(first := schema.get("prefixItems"), list):
+            different = [one for number, one in enumerate(first) if one not in first[:number]]
+            schema["items"] = different[0] if len(different) == 1 else {"anyOf": different}

@@ -1,0 +1,124 @@
+"""Server-sent events of all machines: what happens to alarms, and changes of health."""
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from fastapi import FastAPI, Header, HTTPException, Query
+from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
+
+from models.errors import RotorwatchError
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
+from service.access.guard import Guard
+from service.access.problems import problem_responses
+from service.access.scopes import Caller
+from service.api.views import ServiceView
+from service.delivery.event_feed import CURSOR_PATTERN, AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
+
+__all__ = ["add_event_routes", "stream_example"]
+
+_LONGEST = 20_000
+_FORM = {"pattern": CURSOR_PATTERN}  # described here, refused in words that say more
+
+_Machines = Annotated[
+    list[str],
+    Query(alias="machine", max_length=1000, description="only of this machine, as site/machine; may be repeated"),
+]
+_LastEventId = Annotated[
+    str | None,
+    Header(
+        alias="Last-Event-ID",
+        max_length=_LONGEST,
+        json_schema_extra=_FORM,
+        description="`id` of the last event; goes on right after it",
+    ),
+]
+_LastEventIdArgument = Annotated[
+    str | None,
+    Query(
+        max_length=_LONGEST,
+        json_schema_extra=_FORM,
+        description="the same for whoever cannot send the header, which counts if both are",
+    ),
+]
+_From = Annotated[
+    Literal["now", "beginning"], Query(alias="from", description="where to begin without the id of a last event")
+]
+
+
+def stream_example() -> str:
+    """What a stream looks like."""
+    event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
+    return (
+        "retry: 2000\nid: demo/lab=-1\nevent: start\ndata: {}\n\n"
+        f"id: demo/lab=0\nevent: alarm\ndata: {event.model_dump_json()}\n\n"
+    )
+
+
+def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    """Add the route."""
+
+    @app.get(
+        "/api/v1/events",
+        tags=["events"],
+        response_class=StreamingResponse,
+        responses={
+            200: {"content": {"text/event-stream": {"schema": {"type": "string"}, "example": stream_example()}}},
+            **problem_responses(404, 409, 422),
+        },
+    )
+    async def events(
+        caller: Annotated[Caller, guard.stream],
+        machine: _Machines = [],  # noqa: B006  # never changed
+        last_event_id: _LastEventIdArgument = None,
+        header: _LastEventId = None,
+        from_: _From = "now",
+    ) -> StreamingResponse:
+        """Alarm events out of the history, each once and in the order of its machine's log, and changes of health."""
+        if service.feed.closed:
+            raise HTTPException(503, "the service is being stopped")
+        logs = _logs(service, machine)
+        cursor = _cursor(logs, (header or "", last_event_id or ""), from_)
+
+        async def admitted() -> bool:
+            try:
+                return await run_in_threadpool(guard.still_valid, caller)
+            except RotorwatchError:  # the database: nothing but health can be told meanwhile
+                return True
+
+        return StreamingResponse(
+            service.feed.follow(logs, cursor, admitted),
+            media_type="text/event-stream",
+            headers={"X-Accel-Buffering": "no"},
+        )
+
+
+def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, AlarmLog]:
+    there = {f"{one.machine.site}/{one.machine.name}": one.history for one in service.machines()}
+    unknown = next((place for place in wanted if place not in there), None)
+    if unknown is not None:
+        raise HTTPException(404, f"no machine {unknown[:129]}; there are: {', '.join(there)}")
+    return {place: log for place, log in there.items() if place in wanted or not wanted}
+
+
+def _cursor(logs: Mapping[str, AlarmLog], texts: tuple[str, ...], begin: str) -> Cursor:
+    """Where to begin in each log; a machine that the first text does not name is new to the listener, who gets it all.
+
+    Texts after the first that is there must be understood, and do not count.
+    """
+    try:
+        given = [parsed_cursor(text) for text in texts if text]
+    except CursorError as error:
+        raise HTTPException(422, f"Last-Event-ID: {error}") from error
+    if not given:
+        return {place: log.last_sequence() if begin == "now" else -1 for place, log in logs.items()}
+    heard = given[0]
+    for place, log in logs.items():
+        if heard.get(place, -1) > log.last_sequence():
+            raise HTTPException(
+                409,
+                f"Last-Event-ID: {cursor_text({place: heard[place]})}, but the log of {place} ends at "
+                f"{log.last_sequence()}: it is another one than you followed",
+            )
+    return {place: heard.get(place, -1) for place in logs}

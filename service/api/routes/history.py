@@ -1,0 +1,177 @@
+"""The history over HTTP: alarm events, window reports, readings over time, and the audit log."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from fastapi import FastAPI, HTTPException, Query
+from fastapi.responses import Response
+
+from rotorwatch.records.alarms import EventKind, Severity
+from rotorwatch.records.history import (
+    AlarmEventList,
+    AuditList,
+    AuditRecord,
+    Reading,
+    ReadingBucket,
+    ReadingList,
+    ReportList,
+)
+from service.access.guard import Guard
+from service.access.problems import responses
+from service.api.views import (
+    PLACE,
+    AlarmName,
+    Limit,
+    MachineName,
+    ServiceView,
+    SinceNs,
+    SiteName,
+    UntilNs,
+    found_machine,
+)
+
+__all__ = ["add_history_routes"]
+
+_LARGEST = 2**63 - 1
+_SINGLE = {"misfit": "misfit", "speed": "speed"}
+
+_After = Annotated[
+    int | None,
+    Query(ge=-1, le=_LARGEST, description="only events with a greater sequence, oldest first; -1 for all there are"),
+]
+_Before = Annotated[int | None, Query(ge=0, le=_LARGEST, description="`next_before` of the answer before")]
+_Quantity = Annotated[
+    Literal["parameter", "equation", "misfit", "speed"], Query(description="what the windows are read for")
+]
+_ReadingName = Annotated[str, Query(pattern="^[A-Za-z0-9_.-]{1,64}$")]
+_Names = Annotated[
+    list[_ReadingName],
+    Query(
+        max_length=64,
+        description="which parameter or equation; may be given several times with `points`, where all is the default. "
+        "Not needed for misfit and speed",
+    ),
+]
+_Points = Annotated[
+    int | None,
+    Query(ge=1, le=5000, description="reduce each to at most so many buckets of equal length, instead of one by one"),
+]
+_Plain = Annotated[str | None, Query(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+
+def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    """Add the routes."""
+    common: dict[str, Any] = {"tags": ["history"], "dependencies": [guard.read]}
+
+    @app.get(
+        f"{PLACE}/alarms/events",
+        responses=responses(AlarmEventList, 404, 422),
+        response_model=AlarmEventList,
+        **common,
+    )
+    def alarm_events(
+        site: SiteName,
+        machine: MachineName,
+        after: _After = None,
+        before: _Before = None,
+        since_ns: SinceNs = None,
+        until_ns: UntilNs = None,
+        name: Annotated[AlarmName | None, Query(description="only of this alarm")] = None,
+        kind: Annotated[EventKind | None, Query(description="only of this kind")] = None,
+        severity: Annotated[Severity | None, Query(description="only of this severity")] = None,
+        limit: Limit = 100,
+    ) -> Response:
+        """What happened to alarms, as CloudEvents: newest first, or with `after` oldest first, as followers want it."""
+        history = found_machine(service, site, machine).history
+        found = history.events(
+            after=after,
+            before=before,
+            since_ns=since_ns,
+            until_ns=until_ns,
+            alarm=name,
+            kind=None if kind is None else kind.value,
+            severity=None if severity is None else severity.value,
+            limit=limit,
+            newest_first=after is None,
+        )
+        last = found[-1].sequence if found else after
+        more = len(found) == limit and last is not None and last > 0
+        return _listed(
+            "events",
+            [one.text for one in found],
+            next_before=last if after is None and more else None,
+            next_after=None if after is None else last,
+        )
+
+    @app.get(f"{PLACE}/reports", responses=responses(ReportList, 404, 422), response_model=ReportList, **common)
+    def reports(
+        site: SiteName,
+        machine: MachineName,
+        before: _Before = None,
+        since_ns: SinceNs = None,
+        until_ns: UntilNs = None,
+        limit: Limit = 100,
+    ) -> Response:
+        """Window reports, the latest to arrive first; since_ns and until_ns are about the window's end."""
+        history = found_machine(service, site, machine).history
+        found = history.reports(since_ns=since_ns, until_ns=until_ns, before=before, limit=limit)
+        return _listed(
+            "reports", [one.text for _, one in found], next_before=found[-1][0] if len(found) == limit else None
+        )
+
+    @app.get(f"{PLACE}/readings", responses=responses(ReadingList, 404, 422), **common)
+    def readings(
+        site: SiteName,
+        machine: MachineName,
+        quantity: _Quantity = "parameter",
+        name: _Names = [],  # noqa: B006  # never changed
+        since_ns: SinceNs = None,
+        until_ns: UntilNs = None,
+        points: _Points = None,
+        after: _After = None,
+        limit: Limit = 1000,
+    ) -> ReadingList:
+        """Parameters, residuals, misfit and speed over time: one by one, or with `points` for a plot of any length."""
+        history = found_machine(service, site, machine).history
+        names = name or [_SINGLE[quantity]] if quantity in _SINGLE else name
+        if points is not None:
+            if after is not None:
+                raise HTTPException(422, "after: goes with single readings, not with points")
+            buckets = history.downsampled(
+                quantity=quantity, names=names or None, since_ns=since_ns, until_ns=until_ns, points=points
+            )
+            shown = tuple(ReadingBucket.model_validate(_fields(one, ReadingBucket)) for one in buckets)
+            return ReadingList(quantity=quantity, readings=(), buckets=shown, next_after=None)
+        if len(names) != 1:
+            raise HTTPException(422, f"name: {len(names)} are given, expected one; several go with points")
+        found = history.readings(
+            quantity=quantity, name=names[0], since_ns=since_ns, until_ns=until_ns, after=after, limit=limit
+        )
+        single = tuple(
+            Reading(number=number, end_ns=one.end_ns, value=one.value, standard_error=one.standard_error)
+            for number, one in found
+        )
+        following = found[-1][0] if len(found) == limit else None
+        return ReadingList(quantity=quantity, readings=single, buckets=(), next_after=following)
+
+    @app.get("/api/v1/audit", tags=["service"], dependencies=[guard.configure], responses=responses(AuditList, 422))
+    def audit(
+        before: _Before = None,
+        machine: Annotated[_Plain, Query(description="only about this machine, as site/machine")] = None,
+        actor: Annotated[_Plain, Query(description="only by whom has a token of this name")] = None,
+        limit: Limit = 100,
+    ) -> AuditList:
+        """Who asked for what and what came of it, newest first; kept for ever."""
+        found = service.audit.entries(before, limit, machine=machine, actor=actor)
+        entries = tuple(AuditRecord.model_validate(_fields(one, AuditRecord)) for one in found)
+        return AuditList(entries=entries, next_before=found[-1].number if len(found) == limit else None)
+
+
+def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:
+    """Answer with what is stored as it was published, to the byte, whichever version of the program wrote it."""
+    tail = "".join(f',"{cursor}":{"null" if value is None else value}' for cursor, value in cursors.items())
+    return Response(f'{{"{name}":[{",".join(texts)}]{tail}}}', media_type="application/json")
+
+
+def _fields(record: object, model: type[ReadingBucket] | type[AuditRecord]) -> dict[str, object]:
+    return {name: getattr(record, name) for name in model.model_fields}

@@ -1,0 +1,214 @@
+"""Alarms over HTTP: what they are now, and what operators do to them."""
+
+import re
+from typing import Annotated, Any
+
+from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
+
+from models.alarm_names import ALARM_TEXT
+from models.errors import RotorwatchError
+from rotorwatch.records.alarms import Alarm, AlarmState, AlarmStates
+from rotorwatch.records.example import example
+from rotorwatch.records.operations import OperationDone, OperationKind, OperationOrder, ReasonedOrder, ShelveOrder
+from service.access.audit import AuditNote
+from service.access.guard import Guard
+from service.access.problems import responses
+from service.access.scopes import Caller
+from service.api.views import PLACE, AlarmName, MachineName, MachineView, ServiceView, SiteName, found_machine
+from service.monitor.alarm_conversion import alarm_entries
+from service.monitor.alarms.alarm import Alarm as AlarmRecord
+from service.monitor.alarms.operation import NotInTime, Operation, OperationConflict, OperationRefused, UnknownAlarm
+
+__all__ = ["add_operation_routes"]
+
+_IF_MATCH = r'^(\*|(W/)?"-?[0-9]{1,18}")$'
+_ETAG = {
+    "ETag": {
+        "description": "version of the alarm in quotation marks, for If-Match",
+        "schema": {"type": "string"},
+        "example": '"17"',
+    }
+}
+_STATUS: dict[type[RotorwatchError], int] = {
+    UnknownAlarm: 404,
+    OperationConflict: 409,
+    OperationRefused: 409,
+    NotInTime: 503,
+}
+_TEXTS: dict[OperationKind, str] = {
+    "acknowledge": "Say that an alarm has been seen.",
+    "reset": "Let a latched alarm go, once its condition has cleared.",
+    "shelve": "Silence an alarm for a time, at most as long as the machine file allows.",
+    "unshelve": "End the shelving of an alarm.",
+    "remove-from-service": "Take an alarm out of service, until it is returned.",
+    "return-to-service": "Return an alarm to service.",
+}
+
+_Alarm = Annotated[str, Path(description="name of the alarm", examples=["k_by"])]
+_IfMatch = Annotated[
+    str | None,
+    Header(
+        alias="If-Match",
+        pattern=_IF_MATCH,
+        description="ETag of the alarm as you saw it, or * for however it is; needed without `expected_state`",
+        examples=['"17"'],
+    ),
+]
+
+
+def add_operation_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    """Add the routes; those of the alarms' events must be there already, because ``events`` is no alarm."""
+    _add_reading_routes(app, service, guard)
+    for kind in _TEXTS:
+        _add_operation(app, service, guard, kind)
+
+
+def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    common: dict[str, Any] = {"tags": ["alarms"], "dependencies": [guard.read]}
+
+    @app.get(f"{PLACE}/alarms", responses=responses(AlarmStates, 404, 422), **common)
+    def alarms(
+        site: SiteName,
+        machine: MachineName,
+        state: Annotated[list[AlarmState], Query(description="only in this state; may be repeated")] = [],  # noqa: B006  # never changed
+        name: Annotated[list[AlarmName], Query(description="only this one; may be repeated")] = [],  # noqa: B006
+        raised: Annotated[bool, Query(description="only those that are raised")] = False,
+        all_: Annotated[bool, Query(alias="all", description="normal ones as well")] = False,
+    ) -> AlarmStates:
+        """Alarms that are not normal, or those that are asked for."""
+        states = found_machine(service, site, machine).alarms(include_normal=all_ or bool(state or name))
+        chosen = (
+            one
+            for one in states.alarms
+            if (not state or one.state in state) and (not name or one.name in name) and (one.raised or not raised)
+        )
+        return states.model_copy(update={"alarms": tuple(chosen)})
+
+    @app.get(f"{PLACE}/alarms/{{name}}", responses=responses(Alarm, 404, 422, headers=_ETAG), **common)
+    def alarm(site: SiteName, machine: MachineName, name: _Alarm, response: Response) -> Alarm:
+        """One alarm; the header ETag has its version."""
+        return _marked(_present(found_machine(service, site, machine), name), response)
+
+
+def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: OperationKind) -> None:
+    """Add the route of one operation."""
+    configures = kind in ("remove-from-service", "return-to-service")
+    scoped = guard.configure if configures else guard.operate
+
+    def operate(
+        request: Request,
+        response: Response,
+        site: SiteName,
+        machine: MachineName,
+        name: _Alarm,
+        caller: Caller,
+        order: OperationOrder | ReasonedOrder | ShelveOrder,
+        if_match: str | None,
+    ) -> OperationDone:
+        request.state.audit = AuditNote(kind, f"{site}/{machine}", name, order.reason)
+        view = found_machine(service, site, machine)
+        if if_match is None and order.expected_state is None:
+            raise HTTPException(
+                428, "say how you saw the alarm: header If-Match with its ETag, or expected_state in the body"
+            )
+        operation = Operation(
+            kind=kind,
+            alarm=name,
+            actor=caller.name,
+            reason=order.reason.strip(),
+            duration_s=order.duration_s if isinstance(order, ShelveOrder) else None,
+            one_shot=order.one_shot if isinstance(order, ShelveOrder) else False,
+            expected_state=None if order.expected_state is None else order.expected_state.value,
+            expected_version=_version(if_match),
+        )
+        try:
+            events = view.operate(operation)
+        except (UnknownAlarm, OperationConflict, OperationRefused, NotInTime) as error:
+            raise HTTPException(_STATUS[type(error)], str(error)) from error
+        return OperationDone(alarm=_marked(_present(view, name), response), events=events)
+
+    options: dict[str, Any] = {
+        "tags": ["alarms"],
+        "name": kind,
+        "operation_id": kind.replace("-", "_"),
+        "summary": kind.replace("-", " ").capitalize(),
+        "description": f"{_TEXTS[kind]} It is done only if the alarm still is as the caller saw it.",
+        "responses": responses(OperationDone, 400, 404, 409, 413, 415, 422, 428, headers=_ETAG),
+    }
+    path = f"{PLACE}/alarms/{{name}}/{kind}"
+    if kind == "shelve":
+
+        @app.post(path, **options)
+        def shelve(
+            request: Request,
+            response: Response,
+            site: SiteName,
+            machine: MachineName,
+            name: _Alarm,
+            caller: Annotated[Caller, scoped],
+            order: Annotated[ShelveOrder, Body(openapi_examples=_shown(ShelveOrder))],
+            if_match: _IfMatch = None,
+        ) -> OperationDone:
+            return operate(request, response, site, machine, name, caller, order, if_match)
+
+    elif kind == "remove-from-service":
+
+        @app.post(path, **options)
+        def remove(
+            request: Request,
+            response: Response,
+            site: SiteName,
+            machine: MachineName,
+            name: _Alarm,
+            caller: Annotated[Caller, scoped],
+            order: Annotated[ReasonedOrder, Body(openapi_examples=_shown(ReasonedOrder))],
+            if_match: _IfMatch = None,
+        ) -> OperationDone:
+            return operate(request, response, site, machine, name, caller, order, if_match)
+
+    else:
+
+        @app.post(path, **options)
+        def other(
+            request: Request,
+            response: Response,
+            site: SiteName,
+            machine: MachineName,
+            name: _Alarm,
+            caller: Annotated[Caller, scoped],
+            order: Annotated[OperationOrder, Body(openapi_examples=_shown(OperationOrder))],
+            if_match: _IfMatch = None,
+        ) -> OperationDone:
+            return operate(request, response, site, machine, name, caller, order, if_match)
+
+
+def _present(view: MachineView, name: str) -> Alarm:
+    """An alarm as it is now; one that nothing has been seen of yet is normal.
+
+    Raises
+    ------
+    HTTPException
+        404 if there is no such alarm.
+    """
+    if name not in ALARM_TEXT:
+        raise HTTPException(404, f"no alarm {name[:64]}; there are: {', '.join(ALARM_TEXT)}")
+    for one in view.alarms(include_normal=True).alarms:
+        if one.name == name:
+            return one
+    (normal,) = alarm_entries((AlarmRecord(name),), include_normal=True)
+    return normal
+
+
+def _marked(alarm: Alarm, response: Response) -> Alarm:
+    response.headers["ETag"] = f'"{alarm.version}"'
+    return alarm
+
+
+def _version(if_match: str | None) -> int | None:
+    """Version that an ETag stands for; a proxy that packs answers may have made it a weak one."""
+    found = re.search(r"-?[0-9]+", if_match or "")
+    return None if found is None else int(found[0])
+
+
+def _shown(model: type[OperationOrder] | type[ReasonedOrder] | type[ShelveOrder]) -> Any:
+    return {"example": {"summary": "as seen in the control room", "value": example(model)}}

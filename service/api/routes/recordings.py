@@ -1,0 +1,148 @@
+"""Recordings over HTTP: list, look at, download."""
+
+from pathlib import Path
+from typing import Annotated, Protocol
+
+from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi.responses import FileResponse
+from starlette.types import Message, Receive, Scope, Send
+
+from models.signals.recording import summarize_recording
+from rotorwatch.records.recordings import RecordingDetail, RecordingEntry, RecordingList
+from service.access.guard import Guard
+from service.access.problems import problem_answer, problem_responses, responses
+from service.recordings.catalogue import Recording
+from service.recordings.replay.source import RecordingSource
+
+__all__ = [
+    "RecordingIndex",
+    "add_recording_routes",
+    "found_recording",
+]
+
+_NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
+_NONE = "no recordings: the settings name no directory for them ([recording] directory)"
+
+
+class RecordingIndex(Protocol):
+    """What the API needs to know about recordings; `service.recordings.catalogue.Catalogue` is one."""
+
+    @property
+    def directory(self) -> Path:
+        """Where they are."""
+
+    def recordings(self, site: str | None = None, machine: str | None = None) -> tuple[Recording, ...]:
+        """List recordings, sorted by site, machine and time."""
+
+    def find(self, recording_id: str) -> Recording | None:
+        """One recording, or None; reaches no file outside the directory."""
+
+
+_Site = Annotated[str | None, Query(description="only of this site")]
+_Machine = Annotated[str | None, Query(description="only of this machine")]
+_SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this time, ns since 1970-01-01 UTC")]
+_UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
+
+
+def add_recording_routes(app: FastAPI, index: RecordingIndex | None, guard: Guard) -> None:
+    """Add the routes; without an index they answer with a problem that names the setting."""
+
+    @app.get(
+        "/api/v1/recordings",
+        tags=["recordings"],
+        dependencies=[guard.read],
+        responses=responses(RecordingList, 404, 422),
+    )
+    def recordings(
+        site: _Site = None, machine: _Machine = None, since_ns: _SinceNs = None, until_ns: _UntilNs = None
+    ) -> RecordingList:
+        """Recordings, by site, machine and time."""
+        listed = _present(index).recordings(site, machine)
+        kept = (
+            one
+            for one in listed
+            if (since_ns is None or one.end_ns >= since_ns) and (until_ns is None or one.start_ns < until_ns)
+        )
+        return RecordingList(recordings=tuple(RecordingEntry.model_validate(_fields(one)) for one in kept))
+
+    @app.get(
+        "/api/v1/recordings/{site}/{machine}/{name}",
+        tags=["recordings"],
+        dependencies=[guard.read],
+        responses=responses(RecordingDetail, 404, 422),
+    )
+    def recording(site: str, machine: str, name: str) -> RecordingDetail:
+        """One recording, with the keys in it."""
+        found = found_recording(index, f"{site}/{machine}/{name}")
+        readable = found.complete and not found.problem
+        keys = summarize_recording(found.path).messages if readable else {}
+        data = RecordingSource([found.path]).span() if keys else None
+        return RecordingDetail.model_validate(
+            {
+                **_fields(found),
+                "keys": keys,
+                "data_start_ns": None if data is None else data.start_ns,
+                "data_end_ns": None if data is None else data.end_ns,
+            }
+        )
+
+    @app.get(
+        "/api/v1/recordings/{site}/{machine}/{name}/download",
+        tags=["recordings"],
+        dependencies=[guard.read],
+        response_class=FileResponse,
+        responses={
+            200: {"content": {"application/octet-stream": {}}},
+            206: {"description": "The ranges asked for", "content": {"application/octet-stream": {}}},
+            **problem_responses(400, 404, 409, 416, 422),
+        },
+    )
+    def download_recording(site: str, machine: str, name: str) -> FileResponse:
+        """The file itself; ranges may be asked for."""
+        found = found_recording(index, f"{site}/{machine}/{name}")
+        if not found.complete:
+            raise HTTPException(409, f"{found.id} is incomplete: it is being written, or was left by a crash")
+        return _RecordingFile(found.path, media_type="application/octet-stream", filename=found.path.name)
+
+
+class _RecordingFile(FileResponse):
+    """A file, or a range of it; a range that cannot be had is a problem like any other."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        refused: int | None = None
+
+        async def watched(message: Message) -> None:
+            nonlocal refused
+            if message["type"] == "http.response.start" and message["status"] in _NO_RANGE:
+                refused = message["status"]
+            if refused is None:
+                await send(message)
+
+        await super().__call__(scope, receive, watched)
+        if refused is not None:
+            await problem_answer(Request(scope), refused, _NO_RANGE[refused])(scope, receive, send)
+
+
+def found_recording(index: RecordingIndex | None, recording_id: str) -> Recording:
+    """Find a recording.
+
+    Raises
+    ------
+    HTTPException
+        404 if there is none, or no directory of recordings is set.
+    """
+    found = _present(index).find(recording_id)
+    if found is None:
+        raise HTTPException(404, f"no recording {recording_id}")
+    return found
+
+
+def _present(index: RecordingIndex | None) -> RecordingIndex:
+    if index is None:
+        raise HTTPException(404, _NONE)
+    return index
+
+
+def _fields(recording: Recording) -> dict[str, object]:
+    return {name: getattr(recording, name) for name in RecordingEntry.model_fields}

@@ -1,0 +1,346 @@
+"""Replays over HTTP: start, watch, steer and stop them, and read what they found."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query
+from fastapi.responses import StreamingResponse
+from pydantic import BaseModel
+
+from models.signals.endpoint import is_loopback
+from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
+from rotorwatch.records.fields import JSON
+from rotorwatch.records.health import Report
+from rotorwatch.records.replays import (
+    ReplayAlarmList,
+    ReplayJob,
+    ReplayList,
+    ReplayReportList,
+    ReplayRequest,
+    ReplaySeek,
+)
+from service.access.guard import Guard
+from service.access.problems import problem_responses, responses
+from service.api.routes.recordings import RecordingIndex, found_recording
+from service.recordings.replay.choice import is_shipped_bundle, is_shipped_machine
+from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
+from service.settings.service import MachineEntry, ServiceSettings
+
+__all__ = ["ReplayDesk", "add_replay_routes"]
+
+_PLACE = "/api/v1/replays"
+_LOOK_S = 0.25
+_QUIET_S = 15.0
+_UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # what to connect to, nothing listens there
+
+
+class NoOrder(BaseModel):
+    """An empty object: that a request is sent as JSON shows that no page from elsewhere has sent it."""
+
+    model_config = JSON
+
+
+class ReplayDesk:
+    """Takes requests for replays and turns them into jobs.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        Machines that may be named, endpoints for paced replays, and whether replays may be started.
+    index : RecordingIndex or None
+        Recordings; None if no directory for them is set.
+    """
+
+    def __init__(self, settings: ServiceSettings, index: RecordingIndex | None) -> None:
+        self._settings = settings
+        self._index = index
+        self._entries: dict[str, MachineEntry] | None = None
+        self.jobs: ReplayJobs | None = None
+        if index is not None:
+            plan = settings.replay
+            self.jobs = ReplayJobs(index.directory / REPLAYS, limit=plan.jobs, nice=plan.nice, kept=plan.kept)
+
+    @property
+    def enabled(self) -> bool:
+        """Whether replays may be started."""
+        wish = self._settings.replay.enabled
+        return is_loopback(self._settings.http.host) if wish is None else wish
+
+    def start(self, request: ReplayRequest) -> ReplayJob:
+        """Start a replay.
+
+        Raises
+        ------
+        HTTPException
+            With what is wrong with the request.
+        """
+        jobs = self.jobs
+        recordings = [found_recording(self._index, name) for name in request.recordings]
+        if jobs is None:
+            raise HTTPException(404, "no directory of recordings is set")
+        for recording in recordings:
+            if not recording.complete or recording.problem:
+                raise HTTPException(
+                    409, f"{recording.id} cannot be replayed: {recording.problem or 'it is incomplete'}"
+                )
+        machines = sorted({f"{recording.site}/{recording.machine}" for recording in recordings})
+        if len(machines) != 1:
+            raise HTTPException(422, f"recordings: of several machines ({', '.join(machines)}), expected one")
+        offline = request.mode == "offline"
+        machine = self._machine(request, machines[0]) if offline else None
+        job = ReplayJob(
+            id=(job_id := jobs.new_id()),
+            state="running",
+            mode=request.mode,
+            recordings=request.recordings,
+            machine=machine,
+            from_ns=request.from_ns,
+            to_ns=request.to_ns,
+            pace=None if offline else request.pace,
+            prefix="" if offline else f"replay/{job_id}",
+            started_ns=now_ns(),
+            progress=None,
+            summary=None,
+            error="",
+        )
+        arguments = [str(recording.path.resolve()) for recording in recordings]
+        arguments += ["--key", machines[0]]
+        for option, time_ns in (("--from", request.from_ns), ("--to", request.to_ns)):
+            arguments += [] if time_ns is None else [option, f"{time_ns}ns"]
+        if offline:
+            arguments += ["--offline", *(["--machine", machine] if machine else [])]
+        else:
+            arguments += ["--pace", f"{request.pace:g}", "--prefix", job.prefix]
+            arguments += [part for end in _endpoints(self._settings.link) for part in ("--connect", end)]
+        try:
+            return jobs.start(JobPlan(job, tuple(arguments)))
+        except TooManyReplaysError as error:
+            raise HTTPException(429, str(error)) from error
+        except ReplayJobError as error:
+            raise HTTPException(503, str(error)) from error
+
+    def close(self) -> None:
+        """End every replay."""
+        if self.jobs is not None:
+            self.jobs.close()
+
+    def _machine(self, request: ReplayRequest, recorded: str) -> str | None:
+        """FILE or FILE@BUNDLE; None leaves the choice to the recorded name."""
+        monitored = self._monitored()
+        name, bundle = request.machine, request.bundle
+        if name is None:
+            if bundle is not None:
+                raise HTTPException(422, "bundle: needs machine beside it")
+            entry = monitored.get(recorded)
+            return None if entry is None else _spec(entry.file, entry.bundle)
+        if bundle is not None and not is_shipped_bundle(bundle):
+            raise HTTPException(422, f"bundle: {bundle!r} is not the name of shipped networks")
+        if is_shipped_machine(name):
+            return _spec(name, bundle)
+        if name in monitored:
+            return _spec(monitored[name].file, bundle or monitored[name].bundle)
+        raise HTTPException(
+            422, f"machine: {name!r} is neither shipped nor monitored; monitored are {', '.join(monitored)}"
+        )
+
+    def _monitored(self) -> dict[str, MachineEntry]:
+        if self._entries is None:
+            loaded = ((entry.load(), entry) for entry in self._settings.machines)
+            self._entries = {f"{machine.site}/{machine.name}": entry for machine, entry in loaded}
+        return self._entries
+
+
+def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
+    """Add the routes."""
+    router = APIRouter(prefix=_PLACE, tags=["replays"])
+    _add_reading_routes(router, desk, guard)
+    _add_changing_routes(router, desk, guard)
+    app.include_router(router)
+
+
+_NoOrder = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
+_Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldest")]
+_Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
+
+
+def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
+    @router.get("", dependencies=[guard.read], responses=responses(ReplayList))
+    def replays() -> ReplayList:
+        """Replays since the service started, the latest first."""
+        return ReplayList(replays=() if desk.jobs is None else desk.jobs.jobs())
+
+    @router.get("/{replay_id}", dependencies=[guard.read], responses=responses(ReplayJob, 404, 422))
+    def replay(replay_id: str) -> ReplayJob:
+        """How far a replay is, and in the end what it found."""
+        return _job(desk, replay_id)
+
+    @router.get("/{replay_id}/reports", dependencies=[guard.read], responses=responses(ReplayReportList, 404, 422))
+    def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayReportList:
+        """Window reports of an offline replay; the history of the live machine has none of them."""
+        found, following = _results(desk, replay_id, "/report", offset, limit)
+        return ReplayReportList(reports=tuple(Report.model_validate_json(one) for one in found), next_offset=following)
+
+    @router.get("/{replay_id}/alarms", dependencies=[guard.read], responses=responses(ReplayAlarmList, 404, 422))
+    def replay_alarms(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayAlarmList:
+        """Alarm events of an offline replay; nobody else hears of them."""
+        found, following = _results(desk, replay_id, "/alarm/event", offset, limit)
+        events = tuple(AlarmCloudEvent.model_validate_json(one) for one in found)
+        return ReplayAlarmList(events=events, next_offset=following)
+
+    @router.get(
+        "/{replay_id}/events",
+        dependencies=[guard.stream],
+        response_class=StreamingResponse,
+        responses={200: {"content": {"text/event-stream": {}}}, **problem_responses(404, 422)},
+    )
+    def replay_events(replay_id: str) -> StreamingResponse:
+        """Progress as server-sent events until the end: `progress`, then `end`, each with the replay as data."""
+        _job(desk, replay_id)
+        return StreamingResponse(
+            _events(lambda: _job(desk, replay_id)),
+            media_type="text/event-stream",
+            headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"},
+        )
+
+
+def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
+    guarded = [guard.operate, Depends(_switch(desk))]
+    problems = (400, 404, 413, 415, 422)
+
+    @router.post(
+        "",
+        status_code=201,
+        dependencies=guarded,
+        responses=responses(ReplayJob, *problems, 409, status_code=201),
+    )
+    def start_replay(
+        request: Annotated[ReplayRequest, Body(openapi_examples=_shown("an hour of yesterday", ReplayRequest))],
+    ) -> ReplayJob:
+        """Start a replay, in a process of its own."""
+        return desk.start(request)
+
+    @router.delete("/{replay_id}", dependencies=guarded, responses=responses(ReplayJob, 404, 422))
+    def stop_replay(replay_id: str) -> ReplayJob:
+        """Stop a replay; what it found so far stays."""
+        _job(desk, replay_id)
+        return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
+
+    @router.post("/{replay_id}/pause", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
+    def pause_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
+        """Pause a paced replay."""
+        _ = order
+        return _order(desk, replay_id, "pause")
+
+    @router.post("/{replay_id}/resume", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
+    def resume_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
+        """Let a paused replay go on."""
+        _ = order
+        return _order(desk, replay_id, "resume")
+
+    @router.post("/{replay_id}/seek", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
+    def seek_in_replay(
+        replay_id: str, place: Annotated[ReplaySeek, Body(openapi_examples=_shown("to a time", ReplaySeek))]
+    ) -> ReplayJob:
+        """Let a paced replay go on elsewhere; a monitor ignores what it has heard already."""
+        return _order(desk, replay_id, f"seek {place.to_ns if place.by_s is None else f'{place.by_s:+f}'}")
+
+
+def _shown(summary: str, model: type[BaseModel]) -> Any:
+    return {"example": {"summary": summary, "value": example(model)}}
+
+
+def _switch(desk: ReplayDesk) -> Callable[[], None]:
+    """Refuse everything if replays are switched off."""
+
+    def check() -> None:
+        if not desk.enabled:
+            raise HTTPException(403, "replays over HTTP are switched off in the settings ([replay] enabled)")
+
+    return check
+
+
+def _job(desk: ReplayDesk, replay_id: str) -> ReplayJob:
+    return _there(None if desk.jobs is None else desk.jobs.job(replay_id), replay_id)
+
+
+def _there(job: ReplayJob | None, replay_id: str) -> ReplayJob:
+    if job is None:
+        raise HTTPException(404, f"no replay {replay_id}; they are forgotten when the service stops")
+    return job
+
+
+def _order(desk: ReplayDesk, replay_id: str, order: str) -> ReplayJob:
+    job = _job(desk, replay_id)
+    if job.mode != "paced":
+        raise HTTPException(409, "an offline replay has no pace: only paced replays can be paused or moved")
+    if job.state not in ("running", "paused"):
+        raise HTTPException(409, f"the replay has ended: {job.state}")
+    return _there(None if desk.jobs is None else desk.jobs.order(replay_id, order), replay_id)
+
+
+def _results(desk: ReplayDesk, replay_id: str, topic: str, offset: int, limit: int) -> tuple[list[str], int | None]:
+    """Messages of one topic, and where those that follow begin."""
+    if _job(desk, replay_id).mode != "offline":
+        raise HTTPException(404, "a paced replay only publishes: ask the monitor in its namespace what it found")
+    path = None if desk.jobs is None else desk.jobs.results(replay_id)
+    found: list[str] = []
+    for number, message in enumerate(_messages(path, topic)):
+        if number >= offset + limit:
+            return found, offset + limit
+        if number >= offset:
+            found.append(message)
+    return found, None
+
+
+def _messages(path: Path | None, topic: str) -> Iterator[str]:
+    if path is None or not path.exists():
+        return
+    with path.open(encoding="utf-8") as lines:
+        for line in lines:
+            if not line.endswith("\n"):  # being written
+                return
+            entry: dict[str, Any] = json.loads(line)
+            if str(entry["topic"]).endswith(topic):
+                yield json.dumps(entry["message"])
+
+
+async def _events(look: Callable[[], ReplayJob]) -> AsyncIterator[str]:
+    said: ReplayJob | None = None
+    quiet_s = 0.0
+    while True:
+        try:
+            job = look()
+        except HTTPException:  # its results were removed to make room
+            return
+        ended = job.state not in ("running", "paused")
+        if job != said:
+            yield f"event: {'end' if ended else 'progress'}\ndata: {job.model_dump_json()}\n\n"
+            said, quiet_s = job, 0.0
+        elif quiet_s >= _QUIET_S:
+            yield ": still there\n\n"
+            quiet_s = 0.0
+        if ended:
+            return
+        await asyncio.sleep(_LOOK_S)
+        quiet_s += _LOOK_S
+
+
+def _spec(file: str, bundle: str | None) -> str:
+    """Words for ``--machine``; paths that hold for any folder."""
+    file = str(Path(file).resolve()) if file.endswith(".toml") else file
+    return file if bundle is None else f"{file}@{Path(bundle).resolve() if Path(bundle).is_dir() else bundle}"
+
+
+def _endpoints(link: LinkSettings) -> tuple[str, ...]:
+    """Where a client reaches the network of this service."""
+    found = []
+    for end in link.listen:
+        for unspecified, here in _UNSPECIFIED.items():
+            end = end.replace(f"/{unspecified}:", f"/{here}:")  # noqa: PLW2901  # the same endpoint, nearer
+        found.append(end)
+    return tuple(found[:1]) or link.connect

@@ -1,0 +1,79 @@
+"""What the monitor holds now, over HTTP: correlations and spectra beside theory, and orbits."""
+
+from typing import Annotated, Any
+
+from fastapi import FastAPI, HTTPException, Query
+
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
+from service.access.guard import Guard
+from service.access.problems import responses
+from service.analysis.snapshots.choice import SnapshotError
+from service.analysis.snapshots.path import MOST_REVOLUTIONS
+from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
+
+__all__ = ["add_snapshot_routes"]
+
+_NONE: list[str] = []
+
+_First = Annotated[list[str], Query(max_length=64, description="channel i of a pair, by name; may be repeated")]
+_Second = Annotated[
+    list[str],
+    Query(max_length=64, description="channel j of each pair, as many as of `first`; left out, each with itself"),
+]
+_Channels = Annotated[list[str], Query(alias="channel", max_length=64, description="by name; may be repeated")]
+_Units = Annotated[Units, Query(description="of the values: the channels' own, or SI")]
+_Revolutions = Annotated[
+    int, Query(ge=0, le=MOST_REVOLUTIONS, description="newest revolutions to show sample by sample as well")
+]
+
+
+def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+    """Add the routes."""
+    common: dict[str, Any] = {"tags": ["snapshots"], "dependencies": [guard.read]}
+
+    @app.get(f"{PLACE}/correlations", responses=responses(CorrelationSnapshot, 404, 422), **common)
+    def correlations(
+        site: SiteName,
+        machine: MachineName,
+        first: _First = _NONE,
+        second: _Second = _NONE,
+        units: _Units = "channel",
+    ) -> CorrelationSnapshot:
+        """Correlation functions of the latest window, measured and as theory predicts them; a few pairs by default."""
+        view = found_machine(service, site, machine)
+        try:
+            return view.snapshots.correlations(view.latest, first, second, units)
+        except SnapshotError as error:
+            raise HTTPException(422, str(error)) from error
+
+    @app.get(f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), **common)
+    def spectra(
+        site: SiteName,
+        machine: MachineName,
+        channel: _Channels = _NONE,
+        first: _First = _NONE,
+        second: _Second = _NONE,
+        from_hz: Annotated[float | None, Query(ge=0, le=1e6, description="only frequencies from here on")] = None,
+        to_hz: Annotated[float | None, Query(ge=0, le=1e6, description="only frequencies up to here")] = None,
+        units: _Units = "channel",
+    ) -> SpectrumSnapshot:
+        """Power spectral densities of the latest window, cross-spectra of the pairs asked for, and their theory."""
+        view = found_machine(service, site, machine)
+        band = None if from_hz is None and to_hz is None else (from_hz or 0.0, 1e6 if to_hz is None else to_hz)
+        if band is not None and not band[0] < band[1]:
+            raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
+        try:
+            return view.snapshots.spectra(view.latest, channel, first, second, band, units)
+        except SnapshotError as error:
+            raise HTTPException(422, str(error)) from error
+
+    @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), **common)
+    def orbits(
+        site: SiteName, machine: MachineName, revolutions: _Revolutions = 0, units: _Units = "channel"
+    ) -> OrbitSnapshot:
+        """Orbits of the latest window at running speed, and the newest revolutions as measured."""
+        view = found_machine(service, site, machine)
+        try:
+            return view.snapshots.orbits(view.latest, revolutions, units)
+        except SnapshotError as error:
+            raise HTTPException(422, str(error)) from error

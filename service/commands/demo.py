@@ -1,0 +1,444 @@
+"""The demo: a simulated machine breaks, the monitor says what broke; the machine is repaired, and breaks again.
+
+Simulator and monitor run as separate programs on loopback with nothing else running; this program only starts them,
+listens to the topics like any other client, asks the HTTP API, and stops them again::
+
+    rotorsim publish ──stream──> rotorwatch run ──report, alarm/event──> this program
+           └────────────truth──────────────────────────────────────────────┘
+
+One stream holds all of it, so that for the monitor the machine never stops; what is injected when is told to the
+simulator beforehand::
+
+    0 s        140 s          300 s          500 s          660 s
+    healthy    first fault    repaired       next fault     repaired    ...
+"""
+
+import os
+import queue
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import cycle, islice
+from pathlib import Path
+from types import FrameType
+from typing import IO
+
+import httpx
+from pydantic import BaseModel, ConfigDict
+from rich.console import Console
+
+from models.alarm_names import CLOCK, GAP, OVERLOADED, STREAM_LOST
+from models.errors import RotorwatchError
+from models.machine import Machine, load_machine
+from models.signals.link import LinkSettings
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Report
+from service.stream.transport import TopicMessage, follow
+from service.terminal.lines import alarm_event_line, report_heading, report_row, with_minus_signs
+
+__all__ = ["FAULTS", "DemoError", "DemoOptions", "Outcome", "run_demo"]
+
+FAULTS = {"k_by": -0.25, "c_by": -0.30, "k_bz": -0.25, "c_bz": -0.30, "e": 0.30}
+"""What can break, and the relative change; the simulator's scenarios of these names do the same."""
+
+_HEALTHY_S = 140.0
+_BROKEN_S = 160.0
+_REPAIRED_S = 200.0
+_ROUNDS = 200
+_START_S = 120.0
+_STOP_S = 10.0
+_WIDTH = 100
+_OF_A_BUSY_COMPUTER = (GAP, CLOCK, OVERLOADED, STREAM_LOST)
+_PORTS = (7447, 8080)
+_ENVIRONMENT = {
+    "PYTHONUNBUFFERED": "1",
+    # A demo leaves nothing behind, and who runs it is the only one to look at it.
+    "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
+    "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
+}
+# A program that ends when the other end of its standard input is gone: however the demo ends, killed or not.
+_TIED = """
+import os, runpy, signal, sys, threading, time
+def tied():
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(20)
+    os._exit(1)
+threading.Thread(target=tied, daemon=True).start()
+sys.argv = sys.argv[1:]
+runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
+"""
+
+
+class DemoError(RotorwatchError):
+    """A program of the demo did not start or died; the message holds the end of its output."""
+
+
+class Truth(BaseModel):
+    """The part of the simulator's truth record that the demo looks at."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    time_ns: int
+    data_s: float
+    relative_changes: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class DemoOptions:
+    """What to show.
+
+    Attributes
+    ----------
+    fault : str
+        What breaks first, one of `FAULTS`, or "none".
+    seed : int
+        Of the simulation; training used none of the small numbers.
+    pace : float
+        Data seconds per second.
+    once : bool
+        End after the first fault, or after as long without one.
+    http_port : int, optional
+        0 takes free ones, for Zenoh as well; if left out, the usual ones are taken where they are free.
+    """
+
+    fault: str
+    seed: int
+    pace: float
+    once: bool
+    http_port: int | None = None
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What was injected and what was said about it.
+
+    Attributes
+    ----------
+    injected : dict of str to float
+        True relative changes, from the truth topic.
+    raised : dict of str to float
+        Relative changes of the raised alarms, from the alarm topic.
+    over_http : set of str
+        Parameters whose alarm the HTTP API showed too.
+    windows : int
+        Reports on evaluated windows.
+    others : set of str
+        Other raised alarms.
+    of_the_data : set of str
+        Raised alarms on the stream, as a busy computer brings them about.
+    """
+
+    injected: dict[str, float] = field(default_factory=dict)
+    raised: dict[str, float] = field(default_factory=dict)
+    over_http: set[str] = field(default_factory=set)
+    windows: int = 0
+    others: set[str] = field(default_factory=set)
+    of_the_data: set[str] = field(default_factory=set)
+
+    def verdict(self) -> str:
+        """Why the demo failed; empty if exactly what was injected was raised, on the topic and over HTTP."""
+        if not self.windows:
+            return "no window was evaluated"
+        wrong = sorted(set(self.raised) - set(self.injected))
+        missed = sorted(set(self.injected) - set(self.raised))
+        if wrong:
+            return f"an alarm named {', '.join(wrong)}, which did not change"
+        if missed:
+            return f"no alarm named {', '.join(missed)}"
+        if self.others:
+            return f"{', '.join(sorted(self.others))} was raised, and nothing of it was injected"
+        for name, true in self.injected.items():
+            if abs(self.raised[name] - true) > 0.25 * abs(true):
+                return f"the alarm on {name} says {self.raised[name]:+.1%}, injected was {true:+.1%}"
+        unseen = sorted(set(self.injected) - self.over_http)
+        return f"the HTTP API did not show the alarm on {', '.join(unseen)}" if unseen else ""
+
+    def line(self) -> str:
+        """What was named against what was injected."""
+        sides = (
+            ", ".join(f"{name} {change:+.1%}" for name, change in changes.items()) or "nothing"
+            for changes in (self.injected, self.raised)
+        )
+        busy = f"{', '.join(sorted(self.of_the_data))} (is this computer too busy for the pace?)"
+        rest = f"of the data: {busy}" if self.of_the_data else "nothing else was raised"
+        return with_minus_signs("injected {}; named {}; {}".format(*sides, rest))
+
+
+def run_demo(options: DemoOptions) -> int:
+    """Run the demo until it was seen what is named (`once`) or until interrupted.
+
+    Returns
+    -------
+    int
+        Exit code: 0 if exactly the injected parameter was named, 1 otherwise. Interrupted: 130.
+
+    Raises
+    ------
+    DemoError
+        If a program does not start or dies.
+    """
+    console = Console(highlight=False)
+    console.width = min(console.width, _WIDTH) if console.is_terminal else _WIDTH
+    with ExitStack() as stack:
+        stack.enter_context(_interruptible())
+        try:
+            passed = _Show(options, console).run(stack)
+        except KeyboardInterrupt:
+            console.print("\nstopping simulator and monitor ...")
+            stack.close()
+            console.print("stopped")
+            return 130
+    return 0 if passed else 1
+
+
+class _Show:
+    """What is told of the two programs' messages."""
+
+    def __init__(self, options: DemoOptions, console: Console) -> None:
+        self._options, self._console = options, console
+        self._machine: Machine = load_machine("lab")
+        free = options.http_port == 0
+        zenoh_port, http_port = (_port(None if free else usual) for usual in _PORTS)
+        self._endpoint = f"tcp/127.0.0.1:{zenoh_port}"
+        self._url = f"http://127.0.0.1:{options.http_port or http_port}"
+        self._base = f"{self._url}/api/v1/machines/{self._machine.site}/{self._machine.name}"
+        names = list(FAULTS)
+        first = names.index(options.fault) if options.fault in FAULTS else 0
+        self._faults = islice(cycle(names[first:] + names[:first]), _ROUNDS)
+        self._rounds = [
+            (name if options.fault in FAULTS else None, _HEALTHY_S + number * (_BROKEN_S + _REPAIRED_S))
+            for number, name in enumerate(self._faults)
+        ]
+        self._round = 0
+        self._start_ns: int | None = None
+        self._due: deque[Truth] = deque()
+        self._outcome = Outcome()
+
+    def run(self, stack: ExitStack) -> bool:
+        """Start both programs and show what comes, to the end; whether exactly what was injected was named."""
+        monitor = stack.enter_context(
+            _program("monitor", "service.rotorwatch", "run", "--listen", self._endpoint,
+                     "--http-port", self._url.rpartition(":")[2])
+        )  # fmt: skip
+        _wait_until_ready(self._url, monitor)
+        link = LinkSettings(mode="client", connect=(self._endpoint,))
+        inbox: queue.SimpleQueue[TopicMessage] = queue.SimpleQueue()
+        place = f"{self._machine.site}/{self._machine.name}"
+        stack.enter_context(follow(link, place, ("report", "alarm_event", "truth"), inbox.put))
+        self._introduce()
+        simulator = stack.enter_context(
+            _program(
+                "simulator", "simulator.rotorsim", "publish", "healthy", "--connect", self._endpoint,
+                "--seed", str(self._options.seed), "--pace", f"{self._options.pace:g}",
+                "--duration", f"{self._rounds[-1][1] + _BROKEN_S + _REPAIRED_S:g}", *self._injections(),
+                "--wait-for-subscriber", f"{_START_S:g}", "--linger", "0",
+            )
+        )  # fmt: skip
+        while self._round < len(self._rounds):
+            try:
+                message = inbox.get(timeout=0.2)
+            except queue.Empty:
+                simulator.must_run()
+                monitor.must_run()
+                continue
+            if self._tell(message) and (reason := self._end_of_round()) is not None:
+                return not reason
+        self._console.print(f"{_ROUNDS} faults were shown: stopping")
+        return True
+
+    def _injections(self) -> list[str]:
+        changes = [(name, at_s) for name, at_s in self._rounds if name is not None]
+        return [
+            text
+            for name, at_s in changes
+            for text in ("--fault", f"{name}={FAULTS[name]:g}@{at_s:g}", "--fault", f"{name}=0@{at_s + _BROKEN_S:g}")
+        ]
+
+    def _introduce(self) -> None:
+        pace, window_s = self._options.pace, self._machine.window.length_s
+        what = (
+            f"After {_HEALTHY_S:g} s of data the simulator damages the rotor; the monitor is not told, "
+            "and has to find out what changed, and by how much."
+            if self._rounds[0][0]
+            else "Nothing breaks in this run, and nothing must be raised."
+        )
+        program = _command()
+        self._console.print(
+            f"[bold]rotorwatch demo[/]: a simulated rotor publishes its vibration {pace:g} times faster than real "
+            f"time (seed {self._options.seed}); a monitor listens. {what}\n\n"
+            f"  page   [bold]{self._url}[/]\n"
+            f"  API    {self._base}/health\n"
+            f"  Zenoh  {self._endpoint}\n\n"
+            f"In another terminal:\n"
+            f"  {program} watch --connect {self._endpoint}\n"
+            f"  {program} status --url {self._url}\n\n"
+            "Each line is one window: the change of each parameter in %, ± its 95 % interval. k_by, k_bz: stiffness "
+            "of the bearing, horizontal and vertical; c_by, c_bz: its damping; e: unbalance; EI: stiffness of the "
+            "shaft. Times are those of the data, UTC. "
+            f"Ctrl-C ends everything.\n\nThe first window fills: {window_s:g} s of data, {window_s / pace:g} s.\n"
+            f"[bold]{report_heading()}[/]"
+        )
+
+    def _tell(self, message: TopicMessage) -> bool:
+        """Show a message; whether the damage has been there for long enough."""
+        topic, console, outcome = message.key.rsplit("/", 1)[-1], self._console, self._outcome
+        if topic == "report":
+            report = Report.model_validate_json(message.text)
+            outcome.windows += bool(report.parameters)
+            while self._due and self._due[0].time_ns < report.end_ns:
+                self._tell_truth(self._due.popleft())
+            if report.parameters or report.reason:
+                style = {"alert": "yellow", "danger": "red", "healthy": "green"}.get(report.state, "dim")
+                console.print(report_row(report), style=style)
+            end_s = self._rounds[self._round][1] + _BROKEN_S
+            return self._start_ns is not None and report.end_ns >= self._start_ns + round(end_s * 1e9)
+        if topic == "truth":
+            truth = Truth.model_validate_json(message.text)
+            self._start_ns = truth.time_ns - round(truth.data_s * 1e9) if self._start_ns is None else self._start_ns
+            self._due.append(truth)
+            return False
+        event = AlarmCloudEvent.model_validate_json(message.text)
+        raised = event.data.kind == "raised"
+        console.print(alarm_event_line(event), style="bold white on red" if raised else "green", markup=False)
+        if raised and event.data.relative_change is None:
+            (outcome.of_the_data if event.data.name in _OF_A_BUSY_COMPUTER else outcome.others).add(event.data.name)
+        elif raised and event.data.relative_change is not None:
+            outcome.raised[event.data.name] = event.data.relative_change
+            answer = httpx.get(f"{self._base}/alarms", timeout=_STOP_S)
+            states = AlarmStates.model_validate_json(answer.content)
+            shown = {alarm.name for alarm in states.alarms if alarm.raised}
+            outcome.over_http |= shown
+            console.print(f"          over HTTP, {self._base}/alarms: {', '.join(sorted(shown)) or 'nothing'} raised")
+        return False
+
+    def _tell_truth(self, truth: Truth) -> None:
+        """Say what was injected, once the windows that hold it are shown."""
+        changes = {name: value for name, value in truth.relative_changes.items() if value}
+        self._outcome.injected |= changes
+        if changes:
+            text = with_minus_signs(", ".join(f"{name} by {value:+.0%}" for name, value in changes.items()))
+            self._console.print(f"          [bold]the simulator has just changed {text}[/] (the monitor is not told)")
+
+    def _end_of_round(self) -> str | None:
+        """Say what was named against what was injected; after the only round, what was wrong, empty if nothing."""
+        reason = self._outcome.verdict()
+        if reason:
+            self._console.print(f"[bold red]demo failed:[/] {with_minus_signs(reason)}")
+        else:
+            self._console.print(f"[bold green]demo passed:[/] {self._outcome.line()}")
+        if self._options.once:
+            return reason
+        self._outcome = Outcome()
+        self._round += 1
+        if self._round < len(self._rounds) and (name := self._rounds[self._round][0]) is not None:
+            self._console.print(
+                f"          [bold]the machine has been repaired[/]; in {_REPAIRED_S:g} s of data {name} changes"
+            )
+        return None
+
+
+@dataclass(slots=True)
+class _Program:
+    """One started program and where its output goes."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    output: IO[bytes]
+
+    def must_run(self) -> None:
+        """Raise if it ended."""
+        if (code := self.process.poll()) is not None:
+            how = f"was killed ({signal.Signals(-code).name})" if code < 0 else f"ended with exit code {code}"
+            self.output.seek(0)
+            tail = self.output.read().decode(errors="replace").splitlines()[-15:]
+            raise DemoError("\n".join([f"the {self.name} {how}", *tail]))
+
+
+@contextmanager
+def _program(name: str, module: str, *arguments: str) -> Iterator[_Program]:
+    """Run a program beside this one; it is gone when the block is left, however it is left."""
+    with tempfile.TemporaryFile() as output:  # has no name, so that it cannot be left behind
+        process = subprocess.Popen(  # noqa: S603  # our own modules, no shell
+            [sys.executable, "-c", _TIED, module, *arguments],
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.PIPE,
+            # A session of its own: Ctrl-C reaches this program alone, which then stops the others in order.
+            start_new_session=True,
+            env=os.environ | _ENVIRONMENT,
+        )
+        try:
+            yield _Program(name, process, output)
+        finally:
+            process.terminate()
+            try:
+                process.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+
+
+def _wait_until_ready(url: str, monitor: _Program) -> None:
+    deadline = time.monotonic() + _START_S
+    while time.monotonic() < deadline:
+        monitor.must_run()
+        try:
+            if httpx.get(f"{url}/readyz", timeout=1.0).status_code == httpx.codes.OK:
+                return
+        except httpx.TransportError:
+            pass
+        time.sleep(0.1)
+    raise DemoError(f"the monitor was not ready after {_START_S:g} s")
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """Treat a termination signal like Ctrl-C, so that the programs are stopped in order."""
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        del signum, frame
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _command() -> str:
+    """How this program is called from where the demo was started."""
+    if shutil.which("rotorwatch"):
+        return "rotorwatch"
+    script = Path(sys.executable).parent / "rotorwatch"
+    return os.path.relpath(script) if script.is_file() else f"{sys.executable} -m service.rotorwatch"
+
+
+def _port(usual: int | None) -> int:
+    """The usual port, or a free one below the range from which the system takes ports for outgoing connections."""
+    port = usual
+    while True:
+        if port is not None:
+            with socket.socket() as probe:
+                # As servers do; else a port of which a connection has just been closed would look taken.
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind(("127.0.0.1", port))
+                except OSError:
+                    pass
+                else:
+                    return port
+        port = 10_000 + int.from_bytes(os.urandom(2), "little") % 20_000

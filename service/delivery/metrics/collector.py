@@ -1,0 +1,173 @@
+"""All metrics, when somebody asks for them.
+
+Nothing is counted on the way of a block: what the monitor keeps anyhow is read at the moment of asking.
+"""
+
+import platform
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from typing import Protocol
+
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.process_collector import ProcessCollector
+
+from rotorwatch import __version__
+from rotorwatch.records.monitor import Readiness, WebhookList
+from service.delivery.metrics.machine import Observed, machine_families
+from service.delivery.metrics.requests import RequestCounts
+from service.history.errors import StoreError
+from service.recordings.recorder import RecorderStatus
+from service.stream.worker import MachineWorker
+
+__all__ = ["CONTENT_TYPE", "MeasuredService", "Metrics"]
+
+CONTENT_TYPE = CONTENT_TYPE_LATEST
+_PAGE = 1000
+_WEBHOOK_STATES = ("working", "failing", "disabled")
+
+
+class Webhooks(Protocol):
+    """Those who are told of alarm events."""
+
+    def statuses(self) -> WebhookList:
+        """How they stand."""
+
+
+class MeasuredService(Protocol):
+    """What metrics are read from; `service.runtime.Runtime` is one."""
+
+    def machines(self) -> Sequence[MachineWorker]:
+        """Every monitored machine."""
+
+    def recorder_status(self, worker: MachineWorker) -> RecorderStatus | None:
+        """How a machine's recorder stands; None without one."""
+
+    def readiness(self) -> Readiness:
+        """Whether the service can do its work."""
+
+    @property
+    def webhooks(self) -> Webhooks:
+        """Those who are told of alarm events."""
+
+
+class _EventCounts:
+    """Alarm events of one machine by kind, counted in its history from now on."""
+
+    def __init__(self, worker: MachineWorker) -> None:
+        self._history = worker.history
+        self._after = worker.history.last_sequence()
+        self._kinds: Counter[str] = Counter()
+
+    def read(self) -> Counter[str]:
+        """Count what has come since the last time; while the history cannot be read, nothing is added."""
+        with suppress(StoreError):
+            while self._after < self._history.last_sequence():
+                page = self._history.events(after=self._after, limit=_PAGE)
+                if not page:
+                    break
+                self._kinds.update(event.kind for event in page)
+                self._after = page[-1].sequence
+        return self._kinds
+
+
+class Metrics:
+    """The metrics of a service.
+
+    Parameters
+    ----------
+    service : MeasuredService
+    requests : RequestCounts
+        HTTP requests.
+    """
+
+    def __init__(self, service: MeasuredService, requests: RequestCounts) -> None:
+        self._service = service
+        self._requests = requests
+        self._events: dict[str, _EventCounts] = {}
+        self._one_at_a_time = threading.Lock()
+        self._registry = CollectorRegistry()
+        self._registry.register(self)
+        ProcessCollector(registry=self._registry)
+
+    def watch(self, worker: MachineWorker) -> None:
+        """Count the alarm events of a machine from now on."""
+        self._events[f"{worker.machine.site}/{worker.machine.name}"] = _EventCounts(worker)
+
+    def text(self) -> bytes:
+        """Everything in the text format of Prometheus; for any thread."""
+        with self._one_at_a_time:
+            return generate_latest(self._registry)
+
+    def collect(self) -> Iterator[Metric]:
+        """Every metric, as the library wants them."""
+        readiness = self._service.readiness()
+        busy = {(one.site, one.machine): one.worker_busy_s for one in readiness.machines}
+        observed = []
+        for worker in self._service.machines():
+            place = worker.machine.site, worker.machine.name
+            events = self._events.get("/".join(place))
+            observed.append(
+                Observed(
+                    worker,
+                    worker.health(),
+                    busy.get(place, 0.0),
+                    self._service.recorder_status(worker),
+                    Counter() if events is None else events.read(),
+                )
+            )
+        yield from machine_families(observed)
+        yield from _service_families(readiness)
+        yield from _webhook_families(self._service.webhooks.statuses())
+        yield from self._http_families()
+
+    def _http_families(self) -> Iterator[Metric]:
+        answered = CounterMetricFamily(
+            "rotorwatch_http_requests_total", "HTTP requests answered", labels=("method", "route", "status")
+        )
+        for labels, count in sorted(self._requests.answered().items()):
+            answered.add_metric(labels, count)
+        yield answered
+        refused = CounterMetricFamily(
+            "rotorwatch_http_refused_requests_total", "HTTP requests refused, by reason", labels=("reason",)
+        )
+        for reason, count in self._requests.refused().items():
+            refused.add_metric((reason,), count)
+        yield refused
+
+
+def _service_families(readiness: Readiness) -> Iterator[Metric]:
+    build = InfoMetricFamily("rotorwatch_build", "Version of the monitor")
+    build.add_metric((), {"version": __version__, "python": platform.python_version()})
+    yield build
+    yield GaugeMetricFamily("rotorwatch_ready", "1 if /readyz says so", value=readiness.ready)
+    yield GaugeMetricFamily("rotorwatch_session_open", "1 if the Zenoh session is open", value=readiness.session_open)
+    yield GaugeMetricFamily(
+        "rotorwatch_history_failing", "1 if the history cannot be written", value=bool(readiness.history_trouble)
+    )
+
+
+def _webhook_families(webhooks: WebhookList) -> Iterator[Metric]:
+    labels = ("webhook",)
+    state = GaugeMetricFamily(
+        "rotorwatch_webhook_state", "1 for the state the webhook is in, 0 for others", labels=("webhook", "state")
+    )
+    pending = GaugeMetricFamily(
+        "rotorwatch_webhook_pending_events", "Alarm events after the last one delivered", labels=labels
+    )
+    delivered = CounterMetricFamily("rotorwatch_webhook_delivered_events_total", "Events delivered", labels=labels)
+    failed = CounterMetricFamily("rotorwatch_webhook_failed_attempts_total", "Attempts that failed", labels=labels)
+    latest = GaugeMetricFamily(
+        "rotorwatch_webhook_delivery_timestamp_seconds", "When an event was last delivered", labels=labels
+    )
+    for webhook in webhooks.webhooks:
+        for each in _WEBHOOK_STATES:
+            state.add_metric((webhook.name, each), each == webhook.state)
+        pending.add_metric((webhook.name,), webhook.pending)
+        delivered.add_metric((webhook.name,), webhook.delivered)
+        failed.add_metric((webhook.name,), webhook.failed_attempts)
+        if webhook.last_delivered_ns is not None:
+            latest.add_metric((webhook.name,), webhook.last_delivered_ns / 1e9)
+    yield from (state, pending, delivered, failed, latest)

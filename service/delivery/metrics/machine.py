@@ -1,0 +1,179 @@
+"""Families of metrics of the machines."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from prometheus_client.core import (
+    CounterMetricFamily,
+    GaugeMetricFamily,
+    InfoMetricFamily,
+    Metric,
+    SummaryMetricFamily,
+)
+
+from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from rotorwatch.records.health import Health, HealthState
+from service.recordings.recorder import RecorderStatus
+from service.stream.worker import MachineWorker
+
+__all__ = ["Observed", "machine_families"]
+
+_PLACE = ("site", "machine")
+_RECORDER_STATES = ("off", "idle", "recording", "failing")
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """A machine at the moment of asking.
+
+    Attributes
+    ----------
+    worker : MachineWorker
+    health : Health
+    busy_s : float
+        How long its thread has been at work on the same block.
+    recorder : RecorderStatus or None
+        None if it is not recorded.
+    events : mapping of str to int
+        Alarm events since the start, by kind.
+    """
+
+    worker: MachineWorker
+    health: Health
+    busy_s: float
+    recorder: RecorderStatus | None
+    events: Mapping[str, int]
+
+    @property
+    def place(self) -> tuple[str, str]:
+        """Values of the labels ``site`` and ``machine``."""
+        return self.worker.machine.site, self.worker.machine.name
+
+
+_Values = Iterable[tuple[tuple[str, ...], float]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Family:
+    """One metric of every machine; `values` gives labels beyond the place, and numbers."""
+
+    kind: Literal["gauge", "counter"]
+    name: str
+    text: str
+    values: Callable[[Observed], _Values]
+    labels: tuple[str, ...] = ()
+
+    def metric(self, machines: Sequence[Observed]) -> Metric:
+        labels = (*_PLACE, *self.labels)
+        build = GaugeMetricFamily if self.kind == "gauge" else CounterMetricFamily
+        family = build(f"rotorwatch_{self.name}", self.text, labels=labels)
+        for machine in machines:
+            for more, value in self.values(machine):
+                family.add_metric((*machine.place, *more), value)
+        return family
+
+
+def _one(number: Callable[[Observed], float | None]) -> Callable[[Observed], _Values]:
+    """A single number, or none."""
+
+    def values(machine: Observed) -> _Values:
+        value = number(machine)
+        return () if value is None else (((), value),)
+
+    return values
+
+
+def _recorded(number: Callable[[RecorderStatus], float]) -> Callable[[Observed], _Values]:
+    return _one(lambda machine: None if machine.recorder is None else number(machine.recorder))
+
+
+def _state(machine: Observed) -> _Values:
+    return (((state.value,), float(machine.health.state is state)) for state in HealthState)
+
+
+def _recorder_state(machine: Observed) -> _Values:
+    now = "off" if machine.recorder is None else machine.recorder.state
+    return (((state,), float(state == now)) for state in _RECORDER_STATES)
+
+
+def _alarms(machine: Observed) -> _Values:
+    there = [(alarm.state, alarm.severity) for alarm in machine.health.alarms]
+    return (
+        ((state.value, severity.value), float(there.count((state, severity))))
+        for state in AlarmState
+        if state is not AlarmState.NORMAL
+        for severity in Severity
+    )
+
+
+_FAMILIES = (
+    _Family("gauge", "machine_state", "1 for the state of health the machine is in, 0 for others", _state, ("state",)),
+    _Family("gauge", "publisher_alive", "1 if a publisher of the stream is there",
+            _one(lambda machine: machine.health.stream.publisher_alive)),
+    _Family("gauge", "stream_silent", "1 if no usable block has come for longer than a silence may last",
+            _one(lambda machine: machine.health.stream.silent)),
+    _Family("gauge", "data_age_seconds", "Time since the last accepted block was processed; missing before the first",
+            _one(lambda machine: machine.health.stream.data_age_s)),
+    _Family("counter", "blocks_accepted_total", "Blocks accepted",
+            _one(lambda machine: machine.health.quality.accepted_blocks)),
+    _Family("counter", "blocks_refused_total", "Blocks refused, by reason",
+            lambda machine: (((why,), n) for why, n in machine.health.quality.refused_blocks.items()), ("reason",)),
+    _Family("counter", "data_seconds_total", "Length of the data accepted",
+            _one(lambda machine: machine.worker.tally.data_s)),
+    _Family("counter", "gaps_total", "Interruptions of the stream", _one(lambda machine: machine.health.quality.gaps)),
+    _Family("counter", "missing_seconds_total", "Length of the data that the gaps cost",
+            _one(lambda machine: machine.health.quality.missing_s)),
+    _Family("gauge", "queue_blocks", "Blocks that have arrived and wait for evaluation",
+            _one(lambda machine: len(machine.worker.inbox))),
+    _Family("counter", "queue_dropped_blocks_total", "Blocks dropped because the monitor could not keep up",
+            _one(lambda machine: machine.health.quality.queue_dropped_blocks)),
+    _Family("counter", "link_missed_blocks_total", "Blocks lost on the way, as far as the link knows",
+            _one(lambda machine: machine.health.quality.link_missed_blocks)),
+    _Family("gauge", "window_filled_ratio", "Fraction of a full window that is there",
+            _one(lambda machine: machine.health.filled)),
+    _Family("counter", "windows_total", "Windows evaluated", _one(lambda machine: machine.worker.tally.windows)),
+    _Family("counter", "commit_seconds_total", "Time spent waiting for the history",
+            _one(lambda machine: machine.worker.tally.commit_s)),
+    _Family("gauge", "history_waiting_steps", "Steps that are not in the history yet",
+            _one(lambda machine: machine.worker.history.waiting)),
+    _Family("gauge", "worker_alive", "1 if the thread that evaluates the blocks runs",
+            _one(lambda machine: machine.worker.alive)),
+    _Family("gauge", "worker_busy_seconds", "How long that thread has been at work on the same block",
+            _one(lambda machine: machine.busy_s)),
+    _Family("counter", "worker_errors_total", "Blocks lost to an error inside the monitor",
+            _one(lambda machine: machine.worker.errors)),
+    _Family("gauge", "restored_at_start", "1 if the monitor went on from where it stood before its latest start",
+            _one(lambda machine: machine.worker.restart.startswith("went on"))),
+    _Family("gauge", "alarms", "Alarms that are not normal", _alarms, ("state", "severity")),
+    _Family("counter", "alarm_events_total", "Alarm events in the history since the start, by kind",
+            lambda machine: (((kind.value,), machine.events.get(kind.value, 0)) for kind in EventKind), ("kind",)),
+    _Family("gauge", "alarm_sequence", "Number of the latest alarm event, -1 before the first; goes on across restarts",
+            _one(lambda machine: machine.worker.history.last_sequence())),
+    _Family("gauge", "recorder_state", "1 for the state the recorder is in, 0 for others", _recorder_state,
+            ("state",)),
+    _Family("counter", "recorder_received_messages_total", "Messages that arrived at the recorder",
+            _recorded(lambda recorder: recorder.received)),
+    _Family("counter", "recorder_dropped_messages_total", "Messages the recorder threw away: its queue was full",
+            _recorded(lambda recorder: recorder.dropped)),
+    _Family("counter", "recorder_lost_messages_total", "Messages that could not be written, or vanished",
+            _recorded(lambda recorder: recorder.lost)),
+    _Family("counter", "recorder_failures_total", "Attempts at writing a recording that failed",
+            _recorded(lambda recorder: recorder.failures)),
+)  # fmt: skip
+
+
+def machine_families(machines: Sequence[Observed]) -> Iterator[Metric]:
+    """All metrics of machines."""
+    info = InfoMetricFamily("rotorwatch_machine", "What the monitor of the machine runs on", labels=_PLACE)
+    steps = SummaryMetricFamily(
+        "rotorwatch_step_seconds", "Time spent evaluating blocks: how many, and how long altogether", labels=_PLACE
+    )
+    for machine in machines:
+        identity, tally = machine.worker.identity, machine.worker.tally
+        info.add_metric(machine.place, {"bundle": identity.bundle or "", "machine_hash": identity.machine_hash})
+        steps.add_metric(machine.place, tally.blocks, tally.step_s)
+    yield info
+    yield steps
+    for family in _FAMILIES:
+        yield family.metric(machines)

@@ -1,0 +1,103 @@
+"""All webhooks of the monitor."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+
+from models.errors import RotorwatchError
+from rotorwatch.records.monitor import WebhookList
+from service.delivery.event_feed import AlarmLog
+from service.delivery.webhooks.answer import Meaning
+from service.delivery.webhooks.dispatcher import Cursors, Dispatcher
+from service.delivery.webhooks.receiver import Receiver
+from service.monitor.alarm_conversion import rfc3339
+from service.settings.webhooks import WebhookSettings
+
+__all__ = ["NotDeliveredError", "WebhookDesk", "send_test"]
+
+
+class NotDeliveredError(RotorwatchError):
+    """A test event was not taken; the message says why."""
+
+
+class WebhookDesk:
+    """Starts and stops webhooks and says how they stand.
+
+    Parameters
+    ----------
+    webhooks : sequence of WebhookSettings
+
+    Raises
+    ------
+    MachineFileError
+        If a secret or certificate cannot be used.
+    """
+
+    def __init__(self, webhooks: Sequence[WebhookSettings]) -> None:
+        self._receivers = [(settings, Receiver(settings)) for settings in webhooks]
+        self._dispatchers: tuple[Dispatcher, ...] = ()
+
+    def start(self, logs: Mapping[str, AlarmLog], cursors: Cursors) -> None:
+        """Begin to send.
+
+        Parameters
+        ----------
+        logs : mapping of str to AlarmLog
+            Of all machines, by ``site/machine``; webhooks that are new get what comes after this moment.
+        cursors : Cursors
+            How far the others have been served.
+        """
+        self._dispatchers = tuple(
+            Dispatcher(settings, receiver, logs, cursors) for settings, receiver in self._receivers
+        )
+        for dispatcher in self._dispatchers:
+            dispatcher.start()
+
+    def wake(self) -> None:
+        """Say that alarm events were committed; for any thread."""
+        for dispatcher in self._dispatchers:
+            dispatcher.wake()
+
+    def statuses(self) -> WebhookList:
+        """How they stand."""
+        return WebhookList(webhooks=tuple(dispatcher.status() for dispatcher in self._dispatchers))
+
+    def failing(self) -> tuple[str, ...]:
+        """Those that do not work, each with what is wrong."""
+        return tuple(
+            f"{status.name}: {status.last_error}" for status in self.statuses().webhooks if status.state != "working"
+        )
+
+    def close(self) -> None:
+        """Give up what is under way; it is sent after the next start."""
+        for dispatcher in self._dispatchers:
+            dispatcher.stop()
+
+
+def send_test(settings: WebhookSettings) -> float:
+    """Send an event that is no alarm (type ``org.rotorwatch.webhook.test``) and return how long it took, in seconds.
+
+    Raises
+    ------
+    MachineFileError
+        If the secret or certificate cannot be used.
+    NotDeliveredError
+        If the receiver did not take it.
+    """
+    now_ns = time.time_ns()
+    event = {
+        "specversion": "1.0",
+        "id": f"test/{now_ns}",
+        "source": "/rotorwatch",
+        "type": "org.rotorwatch.webhook.test",
+        "time": rfc3339(now_ns),
+        "datacontenttype": "application/json",
+        "data": {"webhook": settings.name, "text": "This is a test: no machine has raised an alarm."},
+    }
+    begin_s = time.monotonic()
+    with closing(Receiver(settings)) as receiver:
+        answer = receiver.post(f"test/{now_ns}", json.dumps(event).encode())
+    if answer.meaning is not Meaning.DELIVERED:
+        raise NotDeliveredError(f"{settings.name}: {settings.target} did not take the test event: {answer.text}")
+    return time.monotonic() - begin_s

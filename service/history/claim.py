@@ -1,0 +1,209 @@
+"""The right to write one machine, and its steps on their way into the database.
+
+::
+
+    commit --> waiting (all steps since, as one) --> attempt (numbered, as it is, until the database has it)
+
+While the database fails, what waits is bounded: the oldest reports and readings are let go first, of checkpoints only
+the newest state is needed, and alarm events are never dropped.
+"""
+
+import math
+from collections import deque
+from collections.abc import Iterable
+from concurrent.futures import Future
+from dataclasses import dataclass, field, fields
+from typing import NamedTuple
+
+import zstandard
+
+from service.history.errors import StoreError
+from service.history.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport
+
+__all__ = ["Bundle", "Claim", "PackedReport", "pack", "unpack"]
+
+_LARGEST = 2**63
+_READINGS_PER_REPORT = 20
+
+
+class PackedReport(NamedTuple):
+    """A report, when it was recorded, and its text compressed."""
+
+    recorded_ns: int
+    report: StoredReport
+    text: bytes
+
+
+@dataclass(slots=True)
+class Bundle:
+    """Steps of one machine as one step: in order, written whole or not at all."""
+
+    reports: deque[PackedReport] = field(default_factory=deque)
+    readings: deque[tuple[int, StoredReading]] = field(default_factory=deque)
+    events: list[StoredEvent] = field(default_factory=list)
+    head: CheckpointHead | None = None
+    new_hops: dict[int, bytes] = field(default_factory=dict)
+    keep: frozenset[int] = frozenset()
+    steps: int = 0
+    heard: list[Future[bool]] = field(default_factory=list)
+
+    def settle(self, error: StoreError | None, written: bool) -> None:
+        """Tell those who wait what became of it."""
+        for future in self.heard:
+            if error is None:
+                future.set_result(written)
+            else:
+                future.set_exception(error)
+        self.heard.clear()
+
+
+@dataclass(slots=True, eq=False)
+class Claim:
+    """The right to write one machine, and what it has to write.
+
+    What waits, the attempt included, is changed only by whoever holds the writer's lock.
+
+    Attributes
+    ----------
+    most_reports : int
+        Reports that wait while the database fails; of readings, twenty times as many.
+    machine_id : int
+        Number in the database.
+    owner : str
+        Mark of this monitor in the database.
+    written : int
+        Number of the latest attempt that is known to be in the database.
+    locked : bool
+        Whether the lock in PostgreSQL is held, as far as is known.
+    lost : StoreError or None
+        Why this monitor must not write the machine any more.
+    trouble : str
+        Why the database, which works, does not take what waits; empty if it does.
+    retry_s : float
+        When that is tried again, by the monotonic clock.
+    generation : int
+        Goes up when the history goes on in another file, which may lack what was written before.
+    """
+
+    site: str
+    name: str
+    most_reports: int
+    machine_id: int = 0
+    owner: str = ""
+    written: int = 0
+    locked: bool = True
+    lost: StoreError | None = None
+    trouble: str = ""
+    retry_s: float = 0.0
+    generation: int = 0
+    waiting: Bundle = field(default_factory=Bundle)
+    attempt: Bundle | None = None
+    dropped_reports: int = 0
+    dropped_readings: int = 0
+
+    @property
+    def title(self) -> str:
+        """``site/name``."""
+        return f"{self.site}/{self.name}"
+
+    @property
+    def steps(self) -> int:
+        """Steps that are not in the database yet."""
+        return sum(bundle.steps for bundle in (self.attempt, self.waiting) if bundle is not None)
+
+    def contents(self) -> str:
+        """What is not in the database, in words; with what was dropped to make room."""
+        bundles = [bundle for bundle in (self.attempt, self.waiting) if bundle is not None]
+        numbers = [event.sequence for bundle in bundles for event in bundle.events]
+        n_reports = sum(len(bundle.reports) for bundle in bundles) + self.dropped_reports
+        n_readings = sum(len(bundle.readings) for bundle in bundles) + self.dropped_readings
+        events = f"alarm events {min(numbers)} to {max(numbers)}" if numbers else "alarm events: none"
+        return f"the state to go on from, reports: {n_reports}, readings: {n_readings}, {events}"
+
+    def add(self, step: Step, recorded_ns: int, reports: Iterable[PackedReport]) -> None:
+        """Append a step to what waits."""
+        waiting = self.waiting
+        waiting.steps += 1
+        waiting.events.extend(step.events)
+        waiting.reports.extend(reports)
+        waiting.readings.extend((recorded_ns, reading) for reading in step.readings)
+        if step.checkpoint is not None:
+            new_hops = dict(step.checkpoint.new_hops)
+            waiting.head = step.checkpoint.head
+            waiting.keep = frozenset(step.checkpoint.keep) | new_hops.keys()
+            waiting.new_hops = {end: hop for end, hop in waiting.new_hops.items() if end in waiting.keep} | new_hops
+        while len(waiting.reports) > self.most_reports:
+            waiting.reports.popleft()
+            self.dropped_reports += 1
+        while len(waiting.readings) > self.most_reports * _READINGS_PER_REPORT:
+            waiting.readings.popleft()
+            self.dropped_readings += 1
+
+    def take(self) -> Bundle | None:
+        """What is to be written next: what was tried before, unchanged, or else everything that waits."""
+        if self.attempt is None and self.waiting.steps:
+            self.attempt, self.waiting = self.waiting, Bundle()
+        return self.attempt
+
+    def put_off(self) -> None:
+        """Let nobody wait for what is not written yet."""
+        for bundle in (self.attempt, self.waiting):
+            if bundle is not None:
+                bundle.settle(None, written=False)
+
+
+def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]:
+    """Check that both databases can take the step as it is, and compress its reports.
+
+    Raises
+    ------
+    StoreError
+        Naming the machine, the field and the value, if they cannot.
+    """
+    for report in step.reports:
+        _check(machine, "report", report)
+    for reading in step.readings:
+        _check(machine, f"reading of {reading.quantity} {reading.name}", reading)
+    for event in step.events:
+        _check(machine, f"alarm event {event.sequence}", event)
+    if step.checkpoint is not None:
+        _check(machine, "checkpoint", step.checkpoint.head)
+        for end_ns, _ in step.checkpoint.new_hops:
+            _check_number(machine, "hop of the checkpoint", "end_ns", end_ns)
+    compressor = zstandard.ZstdCompressor()
+    return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
+
+
+def unpack(text: bytes) -> str:
+    """Undo the compression of a report's text.
+
+    Raises
+    ------
+    StoreError
+        If the bytes are damaged.
+    """
+    try:
+        return zstandard.ZstdDecompressor().decompress(text).decode()
+    except (zstandard.ZstdError, UnicodeDecodeError) as error:
+        raise StoreError(f"history: the text of a report is damaged: {error}") from error
+
+
+def _check(machine: str, of: str, record: StoredReport | StoredReading | StoredEvent | CheckpointHead) -> None:
+    for each in fields(record):
+        value = getattr(record, each.name)
+        if isinstance(value, int | float):
+            _check_number(machine, of, each.name, value)
+        elif isinstance(value, str):
+            try:
+                value.encode()
+            except UnicodeEncodeError as error:
+                raise StoreError(f"{machine}: {of}: {value!r} is no valid text: {error.reason}") from error
+            if "\0" in value:
+                raise StoreError(f"{machine}: {of}: {value!r} holds a NUL character, which no text may")
+
+
+def _check_number(machine: str, of: str, name: str, value: float) -> None:
+    if isinstance(value, int) and not 0 <= value < _LARGEST:
+        raise StoreError(f"{machine}: {of}: {name} is {value}, expected 0 or more and less than 2^63")
+    if math.isnan(value):
+        raise StoreError(f"{machine}: {of}: {name} is nan, expected a number")

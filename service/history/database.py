@@ -1,0 +1,431 @@
+"""The database behind the history: its address, its connections, and what is done when one does not answer.
+
+Whoever asks uses a connection from the pool in a thread of its own, in `Database.reading` and `Database.writing`. One
+thread looks after them all: it breaks off what takes too long.
+"""
+
+import importlib
+import os
+import select
+import socket
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from sqlalchemy import URL, Connection, Engine, Row, Select, create_engine, event, inspect, make_url, text
+from sqlalchemy.exc import ArgumentError, DBAPIError, DisconnectionError, SQLAlchemyError
+from sqlalchemy.pool import StaticPool
+
+from service.history.errors import DamagedError, StoreError
+from service.history.file import HistoryFile, is_damage
+from service.history.tables import REVISION
+
+if TYPE_CHECKING:
+    from sqlalchemy.dialects import postgresql, sqlite
+    from sqlalchemy.sql.schema import Table
+
+__all__ = ["Database"]
+
+_ANSWER_S = 60.0  # at least; a query over a long time may take a while
+_FINISH_S = 2.0  # for what others have asked for when the history is closed
+_JOIN_S = 10.0
+_WATCH_S = 0.5
+_IMMEDIATE = "rotorwatch_immediate"
+_NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_hops", "series", "tokens", "webhook_cursors")
+"""Tables without which a monitor cannot go on; to look through the others would take minutes."""
+_POSTGRESQL = {"application_name": "rotorwatch", "tcp_user_timeout": 25_000} | {
+    "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3
+}  # fmt: skip
+_FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://user:password@host/database"
+
+
+@dataclass(slots=True, eq=False)
+class _Use:
+    """Somebody who uses a connection: until when, and why it was broken off."""
+
+    until_s: float
+    driver: Any = None
+    broken_off: str = ""
+
+
+class Database:
+    """Connections to one database; for any thread.
+
+    Parameters
+    ----------
+    url : str
+        ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
+    timeout_s : float
+        How long to wait for a connection, or for a lock that another program holds, in seconds.
+
+    Attributes
+    ----------
+    file : HistoryFile or None
+        None if it is no file.
+    shown : str
+        The address without the password.
+    generation : int
+        Goes up each time the history is gone on with in another file than before.
+    news : str
+        What happened to the file then.
+    lost : str
+        The same, where something of the history is not in the present file; empty if all of it is.
+
+    Raises
+    ------
+    StoreError
+        If the address is of no known form.
+    """
+
+    def __init__(self, url: str, timeout_s: float) -> None:
+        self.timeout_s = timeout_s
+        self._url = _checked(url)
+        self.is_sqlite = self._url.get_backend_name() == "sqlite"
+        self.in_memory = self.is_sqlite and self._url.database in {None, "", ":memory:"}
+        self.file = HistoryFile(Path(self._url.database or "")) if self.is_sqlite and not self.in_memory else None
+        self.shown = self._url.render_as_string(hide_password=True)
+        self.answer_s = max(_ANSWER_S, 10.0 * timeout_s)
+        self.generation = 0
+        self.news = self.lost = ""
+        self._engine: Engine | None = None
+        self._uses: set[_Use] = set()
+        self._changed = threading.Condition()
+        # SQLite has one writer at a time. In memory there is one connection in all, which readers share.
+        self._one_writer = threading.Lock()
+
+    def start(self, set_aside: bool = False, *, read_only: bool = False) -> None:
+        """Connect, and bring the tables up to date.
+
+        Parameters
+        ----------
+        set_aside : bool
+            Whether a file that is damaged is renamed and a new one begun; otherwise it is an error.
+        read_only : bool
+            Neither make the file nor touch the tables, to look into a history that another program writes.
+
+        Raises
+        ------
+        StoreError
+            If that fails; nothing is left running then.
+        """
+        if self._engine is not None:
+            raise StoreError(f"{self.shown}: the history is open already")
+        with self.plainly():
+            self._engine = self._new_engine() if read_only else self._connect(set_aside)
+        threading.Thread(target=self._watch, name="history-watch", daemon=True).start()
+
+    def stop(self) -> None:
+        """Answer everybody who has asked, breaking off what takes too long, and disconnect; twice is once."""
+        with self._changed:
+            engine, self._engine = self._engine, None
+            if engine is None:
+                return
+            end_s = time.monotonic() + _FINISH_S
+            for use in self._uses:
+                use.until_s = min(use.until_s, end_s)
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: not self._uses, _FINISH_S + _JOIN_S)
+        engine.dispose()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it can be asked."""
+        return self._engine is not None
+
+    @property
+    def engine(self) -> Engine:
+        """The engine, while the history is open."""
+        if self._engine is None:
+            raise StoreError(f"{self.shown}: the history is closed")
+        return self._engine
+
+    def rows(self, query: Select[*tuple[Any, ...]]) -> Sequence[Row[*tuple[Any, ...]]]:
+        """Everything that a query finds.
+
+        Raises
+        ------
+        StoreError
+            If the history is closed, or the database fails or does not answer.
+        """
+        with self.reading() as connection:
+            return connection.execute(query).all()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """A connection to read with, all of it at one point in time in SQLite; raises as `rows` does."""
+        with self.plainly(), self.alone() if self.in_memory else nullcontext(), self.using(self.answer_s) as connection:
+            yield connection
+
+    @contextmanager
+    def writing(self, limit_s: float | None = None, *, repeatable: bool = False) -> Iterator[Connection]:
+        """A connection within a transaction, committed at the end; raises as `rows` does.
+
+        Parameters
+        ----------
+        limit_s : float, optional
+            How long the lock, and then the transaction, may take, if not as long as usual.
+        repeatable : bool
+            Whether all statements must see the same, which they do in SQLite anyhow.
+        """
+        with self.plainly(), self.alone(limit_s), self.using(limit_s or self.answer_s) as connection:
+            self.to_write(connection)
+            if repeatable and not self.is_sqlite:
+                connection.execution_options(isolation_level="REPEATABLE READ")
+            with connection.begin():
+                yield connection
+
+    @contextmanager
+    def using(self, limit_s: float, connection: Connection | None = None) -> Iterator[Connection]:
+        """A connection that is watched: what takes longer than the limit is broken off, and so is it at the end.
+
+        Parameters
+        ----------
+        limit_s : float
+            In seconds.
+        connection : Connection, optional
+            Otherwise one from the pool.
+
+        Raises
+        ------
+        StoreError
+            If the history is closed.
+        SQLAlchemyError, OSError
+            If the database fails; TimeoutError if it was broken off.
+        """
+        use = _Use(time.monotonic() + limit_s)
+        with self._changed:
+            engine = self.engine
+            self._uses.add(use)
+        try:
+            with engine.connect() if connection is None else nullcontext(connection) as used:
+                use.driver = used.connection.driver_connection
+                try:
+                    yield used
+                finally:
+                    with self._changed:
+                        use.driver = None  # not to be interrupted when somebody else has it
+        except (SQLAlchemyError, OSError) as error:
+            if use.broken_off:
+                raise TimeoutError(use.broken_off) from error
+            raise
+        finally:
+            with self._changed:
+                self._uses.discard(use)
+                if self._engine is None:
+                    self._changed.notify_all()
+
+    @contextmanager
+    def alone(self, limit_s: float | None = None) -> Iterator[None]:
+        """Keep others of this process from writing to SQLite at the same time; nothing in PostgreSQL."""
+        if self.is_sqlite and not self._one_writer.acquire(timeout=limit_s or 2 * self.timeout_s):
+            raise TimeoutError
+        try:
+            yield
+        finally:
+            if self.is_sqlite:
+                self._one_writer.release()
+
+    @contextmanager
+    def plainly(self) -> Iterator[None]:
+        """Raise what goes wrong with the database as `StoreError`."""
+        try:
+            yield
+        except (SQLAlchemyError, OSError) as error:
+            raise self.failure(error) from error
+
+    def failure(self, error: BaseException) -> StoreError:
+        """Put an error of the database into plain words."""
+        if isinstance(error, StoreError):
+            return error
+        cause = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+        reason = " ".join(str(cause).split()) or type(cause).__name__
+        if isinstance(error, TimeoutError):
+            reason = str(error) or "no answer in time"
+        password = self._url.password
+        if password:
+            reason = reason.replace(str(password), "***")
+        return StoreError(f"{self.shown}: {reason}")
+
+    def to_write(self, connection: Connection) -> None:
+        """Let transactions of a connection wait for their turn at the beginning, in SQLite."""
+        connection.execution_options(**{_IMMEDIATE: True})
+
+    def insert(self, table: "Table") -> "sqlite.Insert | postgresql.Insert":
+        """Begin an INSERT that knows ON CONFLICT."""
+        dialect = importlib.import_module(f"sqlalchemy.dialects.{'sqlite' if self.is_sqlite else 'postgresql'}")
+        made: sqlite.Insert | postgresql.Insert = dialect.insert(table)
+        return made
+
+    def astray(self) -> str:
+        """Why what is written would not be found at the address any more; empty if it would."""
+        why = "" if self.file is None else self.file.astray()
+        return f"{self.shown}: {why}" if why else ""
+
+    def found_damaged(self, error: Exception) -> bool:
+        """Whether an error means that the file is damaged, and take note of it if so."""
+        if self.file is None or not is_damage(error):
+            return False
+        self.file.damage = str(error.orig if isinstance(error, DBAPIError) else error)
+        return True
+
+    def begin_anew(self, why: str, source: Connection | None) -> None:
+        """Go on in the file that is at the path now, or in a new one; `lost` says what is not in it.
+
+        Parameters
+        ----------
+        why : str
+            From `astray`.
+        source : Connection or None
+            To the former file, of which all is saved if it was deleted.
+
+        Raises
+        ------
+        StoreError, SQLAlchemyError, OSError
+            If that fails; readers have the former file still.
+        """
+        former, generation = self.engine, self.generation
+        rescued = self.file is not None and self.file.rescue(source)
+        if self.file is not None and not rescued and not self.file.damage:
+            self.file.set_aside("deleted", only_opened=True)
+        self._engine = self._connect(set_aside=True)
+        former.dispose()
+        if self.generation == generation:  # not set aside
+            self.generation += 1
+            self.news = f"{why} while it was in use; " + (
+                "all that it held is in a new one" if rescued else "what was recorded before is not in it"
+            )
+            self.lost = "" if rescued else self.news
+
+    def _connect(self, set_aside: bool) -> Engine:
+        try:
+            if self.file is not None and self.file.damage and set_aside:
+                raise DamagedError(f"{self.shown}: the file is damaged: {self.file.damage}")
+            return self._opened()
+        except (DamagedError, DBAPIError) as error:
+            if not set_aside or self.file is None or not is_damage(error):
+                raise
+            kept = self.file.set_aside("damaged")
+            self.news = self.lost = f"{self.failure(error)}: it is kept as {kept}, and the history begins anew"
+            self.generation += 1
+            return self._opened()
+
+    def _opened(self) -> Engine:
+        if self.file is not None:
+            self.file.make()
+        engine = self._new_engine()
+        try:
+            # Without a limit: bringing the tables of a large history up to date may take minutes.
+            with engine.connect() as connection:
+                self.to_write(connection)
+                with connection.begin():
+                    self._bring_up_to_date(connection)
+            if self.file is not None:
+                self.file.opened()
+        except BaseException:
+            engine.dispose()
+            raise
+        return engine
+
+    def _bring_up_to_date(self, connection: Connection) -> None:
+        there = inspect(connection).has_table("alembic_version")
+        if not there or connection.scalars(text("SELECT version_num FROM alembic_version")).all() != [REVISION]:
+            from service.history.schema import migrate  # noqa: PLC0415  # Alembic takes long to import
+
+            try:
+                migrate(connection)
+            except StoreError as error:
+                raise StoreError(f"{self.shown}: {error}") from error
+        for table in _NEEDED if self.file is not None else ():
+            found = connection.scalars(text(f"PRAGMA quick_check({table})")).all()
+            if found != ["ok"]:
+                raise DamagedError(f"{self.shown}: the file is damaged: table {table}: {found[0]}")
+
+    def _new_engine(self) -> Engine:
+        if not self.is_sqlite:
+            return self._new_postgresql()
+        url = self._url
+        if self.file is not None:
+            # A file that was deleted must not come back empty with the next reader.
+            url = url.set(database=f"file:{quote(str(self.file.path))}", query={"mode": "rw", "uri": "true"})
+        pool: dict[str, Any] = {"poolclass": StaticPool} if self.in_memory else {"pool_timeout": self.timeout_s}
+        engine = create_engine(url, connect_args={"timeout": self.timeout_s, "check_same_thread": False}, **pool)
+        event.listen(engine, "connect", _prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
+
+    def _new_postgresql(self) -> Engine:
+        try:
+            engine = create_engine(
+                self._url.set(drivername="postgresql+psycopg"),
+                pool_timeout=self.timeout_s,
+                connect_args=_POSTGRESQL | {"connect_timeout": max(2, round(self.timeout_s))},
+            )
+        except ImportError as error:
+            raise StoreError(f"{self.shown}: PostgreSQL needs psycopg: pip install 'rotorwatch[postgres]'") from error
+
+        @event.listens_for(engine, "connect")
+        def limit(connection: Any, record: object) -> None:
+            _ = record
+            # The server ends by itself what `_break_off` has turned away from.
+            connection.execute(f"SET statement_timeout = {round(1000 * self.answer_s)}")
+            connection.commit()
+
+        @event.listens_for(engine, "checkout")
+        def still_there(connection: Any, record: object, proxy: object) -> None:
+            _ = record, proxy
+            # Not a ping, which waits for a server that hangs: one that has closed the connection has sent its end.
+            line = select.poll()
+            line.register(connection.fileno(), select.POLLIN)
+            if line.poll(0):
+                raise DisconnectionError
+
+        return engine
+
+    def _watch(self) -> None:
+        with self._changed:
+            while self._engine is not None or self._uses:
+                for use in self._uses:
+                    if use.driver is not None and use.until_s < time.monotonic():
+                        use.broken_off = "the history was closed" if self._engine is None else "no answer in time"
+                        with suppress(Exception):  # it has come to an end by itself
+                            self._break_off(use.driver)
+                self._changed.wait(_WATCH_S)
+
+    def _break_off(self, driver: Any) -> None:
+        if self.is_sqlite:
+            driver.interrupt()
+            return
+        # Not an order to cancel, to which a server that hangs does not listen.
+        with socket.socket(fileno=os.dup(driver.fileno())) as line:
+            line.shutdown(socket.SHUT_RDWR)
+
+
+def _checked(url: str) -> URL:
+    try:
+        made = make_url(url)
+    except (ArgumentError, ValueError):
+        # The text may hold a password, and so may the error: neither is shown.
+        raise StoreError(f"history: the URL cannot be read; {_FORMS}") from None
+    if made.drivername not in {"sqlite", "postgresql"}:
+        raise StoreError(f"history: the URL begins with {made.drivername}; {_FORMS}")
+    if made.drivername == "postgresql" and not made.database:
+        raise StoreError(f"history: the URL {made.render_as_string(hide_password=True)} names no database; {_FORMS}")
+    return made
+
+
+def _prepare_sqlite(connection: Any, record: object) -> None:
+    _ = record
+    connection.isolation_level = None  # the transactions below, not those that the driver would begin
+    # A compressed report is somewhat longer than half of SQLite's usual page, of which the rest would stay empty.
+    for setting in ("page_size = 8192", "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+        connection.execute(f"PRAGMA {setting}")
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    immediate = connection.get_execution_options().get(_IMMEDIATE, False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")

@@ -1,0 +1,289 @@
+"""What one machine writes into the history and reads from it."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sqlalchemy import Connection, func, select
+from sqlalchemy.sql.base import ReadOnlyColumnCollection
+from sqlalchemy.sql.elements import ColumnElement
+
+from service.history.alarm_log import EVENT
+from service.history.claim import Claim, pack, unpack
+from service.history.database import Database
+from service.history.errors import StoreError
+from service.history.records import (
+    Bucket,
+    Checkpoint,
+    CheckpointHead,
+    Step,
+    StoredEvent,
+    StoredReading,
+    StoredReport,
+)
+from service.history.tables import alarm_events, checkpoint_hops, checkpoints, evaluations, readings, reports, series
+from service.history.trend import trend
+from service.history.writer import Writer
+
+__all__ = ["MachineStore"]
+
+_HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
+
+
+class MachineStore:
+    """The history of one machine, with the sole right to write it; from `Store.machine`.
+
+    `commit` is for the machine's own thread, everything else for any. All that read raise `StoreError` if the database
+    fails; they see what is committed.
+    """
+
+    def __init__(self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int]) -> None:
+        self._database = database
+        self._writer = writer
+        self._claim = claim
+        self._now_ns = now_ns
+        log = alarm_events.c
+        latest = select(func.max(log.sequence)).where(log.machine_id == claim.machine_id)
+        self._last_sequence: int = next((last for (last,) in database.rows(latest) if last is not None), -1)
+
+    @property
+    def title(self) -> str:
+        """``site/name``."""
+        return self._claim.title
+
+    @property
+    def waiting(self) -> int:
+        """Steps that are not in the database yet."""
+        return self._claim.steps
+
+    @property
+    def trouble(self) -> str:
+        """Why the database, which works, does not take what waits; empty if it does."""
+        return self._claim.trouble
+
+    @property
+    def generation(self) -> int:
+        """Goes up when the history goes on in another file, which may lack what was written before."""
+        return self._claim.generation
+
+    @property
+    def news(self) -> str:
+        """What happened to the file then."""
+        return self._database.news
+
+    def go_on_from(self, sequence: int) -> None:
+        """Number the next alarm event after this one, where the log of a file that was begun anew has fewer."""
+        self._last_sequence = max(self._last_sequence, sequence)
+
+    def last_sequence(self) -> int:
+        """Sequence of the latest alarm event that was committed, or waits to be; -1 if there is none."""
+        return self._last_sequence
+
+    def commit(self, step: Step) -> bool:
+        """Write what one block brought, whole or not at all, in order.
+
+        Parameters
+        ----------
+        step : Step
+            Alarm events go on from `last_sequence` without a gap. One whose sequence is there already is left out if
+            its id is the same.
+
+        Returns
+        -------
+        bool
+            True if it is in the database, for good. False if the database fails: the step waits in memory and is
+            written before all later ones, which is tried every second. Meanwhile `Store.trouble` says why. What waits
+            is bounded: the oldest reports and readings are dropped first; alarm events are never dropped.
+
+        Raises
+        ------
+        StoreError
+            If the step is refused, and thus not written at all: a value that no database takes, a gap in the sequence,
+            an alarm event whose sequence or id is in the history with another id or sequence, or another monitor that
+            has taken over the machine.
+        """
+        before = self._last_sequence
+        last = self._follow(step.events)
+        recorded_ns = self._now_ns()
+        packed = pack(self.title, step, recorded_ns)
+        self._last_sequence = last
+        try:
+            return self._writer.submit(self._claim, step, packed, recorded_ns)
+        except StoreError:
+            self._last_sequence = before
+            raise
+
+    def restore(self) -> Checkpoint | None:
+        """State of the monitor after the last committed step, or None if there is none."""
+        hops, machine_id = checkpoint_hops.c, self._claim.machine_id
+        with self._database.reading() as connection:
+            head = connection.execute(select(*_HEAD).where(checkpoints.c.machine_id == machine_id)).one_or_none()
+            if head is None:
+                return None
+            query = select(hops.end_ns, hops.moments).where(hops.machine_id == machine_id).order_by(hops.end_ns)
+            rows = connection.execute(query).all()
+        return Checkpoint(CheckpointHead(*head), tuple((row.end_ns, row.moments) for row in rows))
+
+    def events(
+        self,
+        *,
+        after: int | None = None,
+        before: int | None = None,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        alarm: str | None = None,
+        kind: str | None = None,
+        severity: str | None = None,
+        limit: int = 100,
+        newest_first: bool = False,
+    ) -> tuple[StoredEvent, ...]:
+        """Alarm events in the order of their sequence.
+
+        Parameters
+        ----------
+        after, before : int, optional
+            Only those with a sequence greater than `after`, less than `before`.
+        since_ns, until_ns : int, optional
+            Only those with since_ns ≤ time_ns < until_ns.
+        alarm, kind, severity : str, optional
+            Only those.
+        limit, newest_first : int, bool
+            At most so many, in this order.
+        """
+        log = alarm_events.c
+        query = select(*EVENT).where(
+            log.machine_id == self._claim.machine_id,
+            *_between(log.time_ns, since_ns, until_ns),
+            *(
+                column == value
+                for column, value in ((log.alarm, alarm), (log.kind, kind), (log.severity, severity))
+                if value is not None
+            ),
+            *_past(log.sequence, after, before),
+        )
+        query = query.order_by(log.sequence.desc() if newest_first else log.sequence).limit(_checked(limit))
+        return tuple(StoredEvent(*row) for row in self._database.rows(query))
+
+    def reports(
+        self,
+        *,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        before: int | None = None,
+        limit: int = 100,
+    ) -> tuple[tuple[int, StoredReport], ...]:
+        """Reports in the order of arrival, newest first, each with its number.
+
+        Parameters
+        ----------
+        since_ns, until_ns : int, optional
+            Only windows with since_ns ≤ end_ns < until_ns.
+        before, limit : int
+            At most so many reports with a smaller number: the last number of the page before.
+        """
+        report = reports.c
+        query = select(report.number, report.start_ns, report.end_ns, report.state, report.filled, report.text)
+        with self._database.reading() as connection:
+            chosen = self._windows(connection, report, since_ns, until_ns)
+            query = query.where(*chosen, *_past(report.number, None, before)).order_by(report.number.desc())
+            rows = connection.execute(query.limit(_checked(limit))).all()
+        return tuple((row.number, StoredReport(*row[1:-1], unpack(row.text))) for row in rows)
+
+    def readings(
+        self,
+        *,
+        quantity: str,
+        name: str,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        after: int | None = None,
+        limit: int = 1000,
+    ) -> tuple[tuple[int, StoredReading], ...]:
+        """Single readings in the order of arrival, oldest first, each with the number of its window.
+
+        Parameters
+        ----------
+        since_ns, until_ns : int, optional
+            Only windows with since_ns ≤ end_ns < until_ns.
+        after, limit : int
+            At most so many windows with a greater number: the last number of the page before.
+        """
+        window, reading, of = evaluations.c, readings.c, series.c
+        same = (reading.machine_id == window.machine_id) & (reading.number == window.number)
+        series_id = select(of.series_id).where(
+            of.machine_id == self._claim.machine_id, of.quantity == quantity, of.name == name
+        )
+        query = select(window.number, window.end_ns, reading.value, reading.standard_error)
+        query = query.join_from(evaluations, readings, same & (reading.series_id == series_id.scalar_subquery()))
+        with self._database.reading() as connection:
+            chosen = self._windows(connection, window, since_ns, until_ns)
+            query = query.where(*chosen, *_past(window.number, after, None)).order_by(window.number)
+            rows = connection.execute(query.limit(_checked(limit))).all()
+        return tuple((row[0], StoredReading(row[1], quantity, name, *row[2:])) for row in rows)
+
+    def downsampled(
+        self,
+        *,
+        quantity: str,
+        names: Sequence[str] | None = None,
+        since_ns: int | None = None,
+        until_ns: int | None = None,
+        points: int = 300,
+    ) -> tuple[Bucket, ...]:
+        """Readings reduced to at most so many buckets of equal length for each name, by name and time.
+
+        Parameters
+        ----------
+        names : sequence of str, optional
+            Which; all if left out.
+        since_ns, until_ns : int, optional
+            Windows with since_ns ≤ end_ns < until_ns; all if left out. Over more than 20 000 windows, or where readings
+            have been dropped, stored buckets are taken; those returned are multiples of them in length then and begin
+            at multiples of that, so the first may begin before `since_ns`. Only where readings have been dropped, a
+            stored bucket counts as a whole, if its beginning is within.
+        points : int
+            At most this many buckets for each name; those without a reading are left out.
+        """
+        with self._database.reading() as connection:
+            return trend(connection, self._claim.machine_id, quantity, names, since_ns, until_ns, _checked(points))
+
+    def _follow(self, events: Sequence[StoredEvent]) -> int:
+        """The last sequence after these events."""
+        last = self._last_sequence
+        for event in events:
+            if event.sequence > last + 1:
+                raise StoreError(f"{self.title}: alarm event {event.sequence} comes after {last}, expected {last + 1}")
+            last = max(last, event.sequence)
+        identifiers = [event.id for event in events]
+        if len(set(identifiers)) < len(identifiers):
+            raise StoreError(f"{self.title}: two alarm events of one step have the same id: {identifiers}")
+        return last
+
+    def _windows(
+        self,
+        connection: Connection,
+        column: ReadOnlyColumnCollection[str, Any],
+        since_ns: int | None,
+        until_ns: int | None,
+    ) -> list[ColumnElement[bool]]:
+        """Conditions on windows; if time is asked for, on their numbers too, along which pages are read."""
+        chosen = [column.machine_id == self._claim.machine_id, *_between(column.end_ns, since_ns, until_ns)]
+        if since_ns is None and until_ns is None:
+            return chosen
+        bounds = connection.execute(select(func.min(column.number), func.max(column.number)).where(*chosen)).one()
+        return [*chosen, column.number.between(*bounds)]
+
+
+def _between(column: ColumnElement[int], since_ns: int | None, until_ns: int | None) -> list[ColumnElement[bool]]:
+    since = [] if since_ns is None else [column >= since_ns]
+    return since if until_ns is None else [*since, column < until_ns]
+
+
+def _past(column: ColumnElement[int], after: int | None, before: int | None) -> list[ColumnElement[bool]]:
+    greater = [] if after is None else [column > after]
+    return greater if before is None else [*greater, column < before]
+
+
+def _checked(limit: int) -> int:
+    if limit < 1:
+        raise StoreError(f"history: {limit} entries were asked for, expected 1 or more")
+    return limit

@@ -1,0 +1,106 @@
+"""Drops what has been kept long enough."""
+
+import threading
+from collections.abc import Callable
+
+import structlog
+from sqlalchemy import Connection, Table, bindparam, delete, func, select, text, update
+
+from service.history.database import Database
+from service.history.errors import StoreError
+from service.history.records import Dropped
+from service.history.retention import Retention
+from service.history.tables import buckets, evaluations, readings, reports, series
+
+__all__ = ["Reduction"]
+
+_DAY_NS = 86_400 * 10**9
+_EVERY_S = 300.0
+_BATCH = 500  # rows or windows in one transaction: others write between two of them
+_LOCK = (0x726F746F, -1)  # PostgreSQL: two monitors on one database take turns
+_log = structlog.get_logger("rotorwatch", part="history")
+
+
+class Reduction:
+    """Keeps the history as long as `Retention` says, by the computer's time `now_ns`."""
+
+    def __init__(self, database: Database, retention: Retention, now_ns: Callable[[], int]) -> None:
+        self._database = database
+        self._retention = retention
+        self._now_ns = now_ns
+        self._turn = threading.Lock()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="history-reduction", daemon=True)
+
+    def start(self) -> None:
+        """Begin to look every few minutes."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop looking, after the batch that is under way."""
+        self._stopping.set()
+        self._thread.join(self._database.answer_s)
+
+    def run(self, now_ns: int) -> Dropped:
+        """Drop everything that is too old at a time of the computer.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        kept = self._retention
+        with self._turn:
+            return Dropped(
+                reports=self._repeat(reports, now_ns - round(kept.reports_days * _DAY_NS)),
+                windows=self._repeat(evaluations, now_ns - round(kept.readings_days * _DAY_NS)),
+                buckets=self._repeat(buckets, now_ns - round(max(kept.buckets_days, kept.readings_days) * _DAY_NS)),
+            )
+
+    def _run(self) -> None:
+        while not self._stopping.wait(_EVERY_S):
+            try:
+                dropped = self.run(self._now_ns())
+            except StoreError as error:
+                _log.warning("the history could not be tidied", why=str(error))
+                continue
+            if dropped != Dropped():
+                _log.debug("tidied", reports=dropped.reports, windows=dropped.windows, buckets=dropped.buckets)
+
+    def _repeat(self, table: Table, until_ns: int) -> int:
+        """Drop what a table holds from before a time, batch by batch, and count it."""
+        total = 0
+        while not self._stopping.is_set() and (dropped := self._batch(table, until_ns)):
+            total += dropped
+        return total
+
+    def _batch(self, table: Table, until_ns: int) -> int:
+        with self._database.writing(repeatable=True) as connection:
+            if not self._database.is_sqlite:
+                lock = text("SELECT pg_try_advisory_xact_lock(:high, :low)")
+                if not connection.scalar(lock, {"high": _LOCK[0], "low": _LOCK[1]}):
+                    return 0  # another monitor is at it
+            oldest = select(table.c.recorded_ns).where(table.c.recorded_ns < until_ns)
+            oldest = oldest.order_by(table.c.recorded_ns).limit(_BATCH)
+            boundary_ns = connection.scalar(select(func.max(oldest.subquery().c.recorded_ns)))
+            if boundary_ns is None:
+                return 0
+            if table is evaluations:
+                _drop_readings(connection, boundary_ns)
+            return connection.execute(delete(table).where(table.c.recorded_ns <= boundary_ns)).rowcount
+
+
+def _drop_readings(connection: Connection, boundary_ns: int) -> None:
+    """Drop the readings of old windows, which are in buckets since they came, and note how far that reaches."""
+    window, reading, of = evaluations.c, readings.c, series.c
+    latest = select(window.machine_id, func.max(window.end_ns)).where(window.recorded_ns <= boundary_ns)
+    for machine_id, end_ns in connection.execute(latest.group_by(window.machine_id)).all():
+        behind = (of.machine_id == machine_id, of.dropped_ns < end_ns)
+        connection.execute(update(series).where(*behind).values(dropped_ns=end_ns))
+    chosen = select(window.machine_id, window.number).where(window.recorded_ns <= boundary_ns)
+    gone = [{"of_machine": row.machine_id, "of_window": row.number} for row in connection.execute(chosen)]
+    # One by one along the key: a condition on all of them would make a database look through the whole table.
+    by_key = delete(readings).where(
+        reading.machine_id == bindparam("of_machine"), reading.number == bindparam("of_window")
+    )
+    connection.execute(by_key, gone)

@@ -1,0 +1,165 @@
+"""The history of all machines of one monitor, in one database.
+
+::
+
+    machines' threads --steps--> what waits, for each machine
+                                    |  the Writer's thread: all that waits in one transaction
+                                    v
+    whoever asks, in its own thread --> SQLite or PostgreSQL <-- the Reduction's thread drops what is old
+
+The way of a step: `MachineStore.commit` checks and packs it, `Writer.submit` adds it to what waits in the machine's
+`Claim`, the Writer's thread takes what there is of all machines, `write_group` makes rows of it, and
+whoever waits is told.
+"""
+
+import time
+from collections.abc import Callable
+
+from sqlalchemy import text
+
+from service.history.alarm_log import AlarmLog
+from service.history.audit import AuditLog
+from service.history.database import Database
+from service.history.errors import StoreError
+from service.history.machine import MachineStore
+from service.history.records import Dropped
+from service.history.reduction import Reduction
+from service.history.retention import Retention
+from service.history.tokens import TokenStore
+from service.history.webhooks import WebhookCursors
+from service.history.writer import Writer
+
+__all__ = ["Store"]
+
+_PROBE_S = 3.0
+
+
+class Store:
+    """Alarms, reports, readings, checkpoints, tokens and audit log.
+
+    Parameters
+    ----------
+    url : str
+        ``sqlite:////folder/file``, ``sqlite:///:memory:`` or ``postgresql://user:password@host/database``.
+    timeout_s : float
+        How long to wait for a connection, or for a lock of another program, in seconds; a transaction may take twice
+        as long. Then steps wait in memory.
+    retry_s : float
+        Time between attempts while the database fails, in seconds.
+    waiting_reports : int
+        Reports of one machine that wait in memory meanwhile; of readings, twenty times as many.
+    now_ns : callable
+        The computer's time, nanoseconds since 1970 UTC.
+
+    Raises
+    ------
+    StoreError
+        If the URL is of no known form.
+
+    Examples
+    --------
+    >>> store = Store("sqlite:///:memory:", Retention())
+    >>> store.open()
+    >>> lab = store.machine("demo", "lab")
+    >>> lab.last_sequence(), lab.restore()
+    (-1, None)
+    >>> store.close()
+    """
+
+    def __init__(
+        self,
+        url: str,
+        retention: Retention,
+        *,
+        timeout_s: float = 5.0,
+        retry_s: float = 1.0,
+        waiting_reports: int = 2000,
+        now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self._database = Database(url, timeout_s)
+        self._writer = Writer(self._database, retry_s, waiting_reports, retention.bucket_s * 10**9)
+        self._reduction = Reduction(self._database, retention, now_ns)
+        self._now_ns = now_ns
+        self.alarms = AlarmLog(self._database)
+        self.tokens = TokenStore(self._database)
+        self.audit = AuditLog(self._database)
+        self.webhooks = WebhookCursors(self._database)
+
+    @property
+    def shown(self) -> str:
+        """The database's URL without its password."""
+        return self._database.shown
+
+    @property
+    def trouble(self) -> str:
+        """Why the latest write failed; empty if it did not."""
+        return self._writer.trouble
+
+    @property
+    def lost(self) -> str:
+        """Why something of the history is not in the present file; empty if all of it is."""
+        return self._database.lost
+
+    def unreachable(self) -> str:
+        """Why the database takes no transaction now; empty if it does, also while nothing has to be written."""
+        if astray := self._database.astray():
+            return astray
+        try:
+            with self._database.writing(_PROBE_S) as connection:
+                connection.execute(text("SELECT 1"))
+        except StoreError as error:
+            return str(error)
+        return ""
+
+    def open(self, *, set_aside: bool = False) -> None:
+        """Connect, and bring the tables up to date; a store is opened once.
+
+        Parameters
+        ----------
+        set_aside : bool
+            Whether an SQLite file that is damaged is renamed and a new one begun; `lost` says so.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be reached or used.
+        """
+        self._database.start(set_aside)
+        self._writer.start()
+        self._reduction.start()
+
+    def close(self) -> None:
+        """Write what waits, if the database takes it, let go of all machines and disconnect.
+
+        Raises
+        ------
+        StoreError
+            Saying what is lost, if the database does not take it; everything is let go of all the same.
+        """
+        if not self._database.is_open:
+            return
+        try:
+            self._reduction.stop()
+            self._writer.stop()
+        finally:
+            self._database.stop()
+
+    def machine(self, site: str, name: str) -> MachineStore:
+        """The history of a machine, which nobody else writes until this store is closed or its process ends.
+
+        Raises
+        ------
+        StoreError
+            If another monitor writes it, or the database fails.
+        """
+        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns)
+
+    def retain(self, now_ns: int) -> Dropped:
+        """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        return self._reduction.run(now_ns)

@@ -1,1 +1,0 @@
-"""The HTTP API: one module for each group of routes, put together in `service.http.app`."""

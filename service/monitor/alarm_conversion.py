@@ -1,0 +1,158 @@
+"""Turns alarms and what happened to them into the records of `rotorwatch`."""
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from models.alarm_names import alarm_text
+from models.diagnosis.readings import interval_95
+from rotorwatch import __version__
+from rotorwatch.records.alarms import Alarm as AlarmJson
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
+from rotorwatch.records.alarms import Evidence as EvidenceJson
+from rotorwatch.records.alarms import Shelf as ShelfJson
+from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence
+
+__all__ = [
+    "Identity",
+    "alarm_cloud_event",
+    "alarm_entries",
+    "alarm_log_page",
+    "alarm_states",
+    "finite",
+    "rfc3339",
+]
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who speaks: the machine and the exact files its monitor runs on."""
+
+    site: str
+    machine: str
+    bundle: str | None
+    machine_hash: str
+
+
+def alarm_entries(alarms: Iterable[Alarm], *, include_normal: bool = False) -> tuple[AlarmJson, ...]:
+    """Alarms as they are now; those where nothing is to be seen only if asked for."""
+    return tuple(_alarm(alarm) for alarm in alarms if include_normal or alarm.open)
+
+
+def alarm_states(
+    identity: Identity, alarms: Iterable[Alarm], sequence: int, *, include_normal: bool = False
+) -> AlarmStates:
+    """Convert the alarms of a machine; `sequence` is that of its latest event."""
+    return AlarmStates(
+        site=identity.site,
+        machine=identity.machine,
+        alarms=alarm_entries(alarms, include_normal=include_normal),
+        sequence=sequence,
+        bundle=identity.bundle,
+        machine_hash=identity.machine_hash,
+    )
+
+
+def alarm_log_page(identity: Identity, texts: Sequence[str], latest: int) -> str:
+    """Join events, each the exact JSON text that was published, into the JSON of an `AlarmLogPage`."""
+    begin = json.dumps({"site": identity.site, "machine": identity.machine})
+    return f'{begin[:-1]}, "events": [{",".join(texts)}], "latest": {latest}}}'
+
+
+def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
+    """Convert an alarm event."""
+    alarm = event.alarm
+    place = f"{identity.site}/{identity.machine}"
+    data = AlarmEventData(
+        site=identity.site,
+        machine=identity.machine,
+        name=alarm.name,
+        text=event.text,
+        kind=event.kind,
+        before=event.before,
+        state=alarm.state,
+        annunciated=alarm.state.annunciated,
+        severity=alarm.severity,
+        time_ns=event.time_ns,
+        raised_ns=alarm.raised_ns,
+        occurrence=alarm.occurrence,
+        sequence=event.sequence,
+        relative_change=finite(alarm.change),
+        standard_error=finite(alarm.standard_error),
+        interval_95=_interval(alarm),
+        low_confidence=alarm.low_confidence,
+        note=alarm.note,
+        evidence=_evidence(alarm.evidence),
+        actor=event.actor,
+        reason=event.reason,
+        bundle=identity.bundle,
+        machine_hash=identity.machine_hash,
+        program_version=__version__,
+    )
+    return AlarmCloudEvent(
+        specversion="1.0",
+        id=f"{place}/{event.sequence}/{alarm.name}/{event.kind}",
+        source=f"/rotorwatch/{place}",
+        type=f"org.rotorwatch.alarm.{event.kind}",
+        subject=alarm.name,
+        time=rfc3339(event.time_ns),
+        datacontenttype="application/json",
+        sequence=f"{event.sequence:020d}",
+        data=data,
+    )
+
+
+def _alarm(alarm: Alarm) -> AlarmJson:
+    shelf = alarm.shelf
+    return AlarmJson(
+        name=alarm.name,
+        text=alarm_text(alarm.name),
+        state=alarm.state,
+        pending=alarm.beyond_ns is not None,
+        clearing=alarm.small_ns is not None,
+        present=alarm.present,
+        raised=alarm.raised,
+        severity=alarm.severity,
+        since_ns=alarm.since_ns,
+        raised_ns=alarm.raised_ns,
+        occurrence=alarm.occurrence,
+        relative_change=finite(alarm.change),
+        standard_error=finite(alarm.standard_error),
+        interval_95=_interval(alarm),
+        low_confidence=alarm.low_confidence,
+        note=alarm.note,
+        evidence=_evidence(alarm.evidence),
+        shelf=None
+        if shelf is None
+        else ShelfJson(until_ns=shelf.until_ns, one_shot=shelf.one_shot, by=shelf.by, reason=shelf.reason),
+        suppressed_by=alarm.suppressed_by,
+        out_of_service_by=alarm.out_of_service_by,
+        out_of_service_reason=alarm.out_of_service_reason,
+        version=alarm.version,
+    )
+
+
+def _interval(alarm: Alarm) -> tuple[float, float] | None:
+    change, error = finite(alarm.change), finite(alarm.standard_error)
+    return None if change is None or error is None else interval_95(change, error, least=-1.0)
+
+
+def _evidence(evidence: Evidence | None) -> EvidenceJson | None:
+    if evidence is None:
+        return None
+    return EvidenceJson(start_ns=evidence.start_ns, end_ns=evidence.end_ns, confidence=finite(evidence.confidence))
+
+
+def finite(value: float | None) -> float | None:
+    """Neither JSON nor the history has infinity and NaN: both become null."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+def rfc3339(time_ns: int) -> str:
+    """A time in text, UTC, microseconds."""
+    moment = _EPOCH + timedelta(microseconds=time_ns // 1000)
+    return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -1,0 +1,438 @@
+"""All alarms of one machine: from readings to conditions, from conditions and operators to events.
+
+A reading asks for an alarm's condition (*beyond* its limit) or for its end (*small* again). Between the two limits, the
+dead band, and where nothing was read, neither is asked for: missing data neither raises nor clears. What has been asked
+for long enough (on-delay, off-delay, in data time) happens, and `service.monitor.alarms.life_cycle` says what becomes
+of the alarm.
+
+Beyond the limit is a parameter that the sequential test names as changed, by more than its limit.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+from pydantic import TypeAdapter
+
+from models.alarm_names import ALARM_TEXT, MODEL, of_the_machine
+from models.diagnosis.verdict.sequential import SequentialVerdict
+from models.errors import CheckpointError
+from models.machine import AlarmSettings, SuppressRule
+from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence, Shelf
+from service.monitor.alarms.life_cycle import Happening, follow, owed_after
+from service.monitor.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
+
+__all__ = ["NO_ALARMS", "AlarmBook"]
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """What survives a restart."""
+
+    alarms: tuple[Alarm, ...]
+    next_sequence: int
+
+
+_PAGE = TypeAdapter(_Page)
+
+NO_ALARMS = _PAGE.dump_json(_Page((), 0)).decode()
+"""What `AlarmBook.checkpoint` gives where nothing has happened yet."""
+
+
+class AlarmBook:
+    """The alarms of one machine.
+
+    Parameters
+    ----------
+    settings : AlarmSettings
+        Limits, delays, latching, suppression.
+    """
+
+    def __init__(self, settings: AlarmSettings) -> None:
+        self._settings = settings
+        self._alarms: dict[str, Alarm] = {}
+        self._next_sequence = 0
+        self._untold: list[AlarmEvent] = []
+
+    @property
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Every alarm seen so far, normal ones included."""
+        return tuple(self._alarms.values())
+
+    @property
+    def next_sequence(self) -> int:
+        """Number the next event will have."""
+        return self._next_sequence
+
+    @property
+    def severity(self) -> Severity | None:
+        """Highest severity of what is raised on the machine; what is wrong with the data is none of the machine."""
+        raised = [alarm.severity for alarm in self._alarms.values() if alarm.raised and of_the_machine(alarm.name)]
+        if not raised:
+            return None
+        return Severity.DANGER if Severity.DANGER in raised else Severity.ALERT
+
+    def present(self, name: str) -> bool:
+        """Whether the condition of an alarm is there."""
+        return name in self._alarms and self._alarms[name].present
+
+    def take(self) -> tuple[AlarmEvent, ...]:
+        """Hand over, in order and once, everything that has happened.
+
+        An event has its number as soon as it has happened. If whoever made it happen comes to grief before passing it
+        on, the next one does: otherwise the number would be missing from the log for ever.
+        """
+        told, self._untold = tuple(self._untold), []
+        return told
+
+    # What the data say
+
+    def found(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> None:
+        """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
+
+        Parameters
+        ----------
+        verdict : SequentialVerdict
+        suspect : str
+            What explains data outside the model best; empty if nothing does.
+        end_ns : int
+            End of the hop.
+        """
+        named = {finding.name for finding in verdict.findings}
+        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.isolation.confidence)
+        for reading in verdict.current:
+            if reading.change is not None and reading.standard_error is not None:
+                self.update(
+                    reading.name,
+                    reading.change,
+                    reading.standard_error,
+                    end_ns,
+                    named=reading.name in named,
+                    low_confidence=verdict.isolation.outside,
+                    evidence=evidence,
+                    note="" if reading.vector is None else reading.vector.sentence,
+                )
+        if verdict.current or verdict.unexplained:
+            note = verdict.unexplained or (f"best explained by: {suspect}" if suspect else "")
+            outside = verdict.isolation.outside
+            self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
+
+    def update(
+        self,
+        parameter: str,
+        change: float,
+        standard_error: float,
+        time_ns: int,
+        *,
+        named: bool,
+        low_confidence: bool = False,
+        evidence: Evidence | None = None,
+        note: str = "",
+    ) -> tuple[AlarmEvent, ...]:
+        """Judge one evaluated parameter at the end of a hop.
+
+        Parameters
+        ----------
+        parameter : str
+            Which one.
+        change, standard_error : float
+            Relative change and standard error.
+        time_ns : int
+            Data time of the end of the hop.
+        named : bool
+            Whether the parameter is among those found to have changed.
+        low_confidence : bool
+            Whether the data are outside the model.
+        evidence : Evidence, optional
+            The data that decided.
+        note : str
+            The change in words, where a number does not say all.
+
+        Returns
+        -------
+        tuple of AlarmEvent
+            None, or what happened.
+        """
+        if not (math.isfinite(change) and 0 < standard_error < math.inf):
+            return ()
+        limits, size = self._settings.for_parameter(parameter), abs(change)
+        alarm = replace(
+            self._known(parameter, time_ns),
+            change=change,
+            standard_error=standard_error,
+            low_confidence=low_confidence,
+            evidence=evidence,
+            note=note,
+        )
+        beyond, small = named and size > limits.raise_above, size < limits.clear_below
+        danger = beyond and size > limits.danger_above
+        return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
+
+    def update_state(
+        self,
+        name: str,
+        present: bool,
+        time_ns: int,
+        note: str = "",
+        *,
+        evidence: Evidence | None = None,
+        at_once: bool = False,
+    ) -> tuple[AlarmEvent, ...]:
+        """Judge what is no parameter.
+
+        Parameters
+        ----------
+        name : str
+            Which alarm.
+        present : bool
+            Whether it is so now.
+        time_ns : int
+            Data time.
+        note : str
+            What is known of it, in a sentence.
+        evidence : Evidence, optional
+            The data that decided.
+        at_once : bool
+            Without a delay: it is a fact rather than an estimate.
+        """
+        if not present and name not in self._alarms:
+            return ()
+        known = self._known(name, time_ns)
+        evidence = evidence or known.evidence
+        alarm = replace(known, note=note if present else known.note, evidence=evidence)
+        return self._judge(alarm, time_ns, beyond=present, small=not present, danger=False, at_once=at_once)
+
+    def suppress(self, speed_rpm: float | None, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Follow the rules of suppression; where the speed is unknown, what depends on it stays as it is.
+
+        An alarm that no rule is about any more, because the machine file has changed, comes back.
+
+        Parameters
+        ----------
+        speed_rpm : float or None
+            Present speed.
+        time_ns : int
+            Data time.
+        """
+        events: list[AlarmEvent] = []
+        ruled = [name for rule in self._settings.suppress for name in rule.alarms]
+        left = [alarm.name for alarm in self.alarms if alarm.rules]
+        for name in dict.fromkeys((*ruled, *left)):
+            alarm = self._known(name, time_ns)
+            holding = [
+                rule
+                for rule in self._settings.suppress
+                if name in rule.alarms and self._applies(rule, alarm, speed_rpm)
+            ]
+            rules = tuple(rule.identity for rule in holding)
+            if rules == alarm.rules:
+                continue
+            because = "; ".join(dict.fromkeys(rule.because for rule in holding))
+            alarm = replace(alarm, rules=rules, suppressed_by=because)
+            if rules and alarm.state is not AlarmState.SUPPRESSED:
+                events += self._happen(alarm, Happening.SUPPRESS, EventKind.SUPPRESSED, time_ns, reason=because)
+            elif not rules:
+                events += self._happen(alarm, Happening.UNSUPPRESS, EventKind.UNSUPPRESSED, time_ns)
+            else:
+                self._alarms[name] = alarm
+        return tuple(events)
+
+    # What time and operators do
+
+    def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """End the shelving of alarms whose time is over."""
+        events: list[AlarmEvent] = []
+        for alarm in self.alarms:
+            if alarm.shelf is not None and time_ns >= alarm.shelf.until_ns:
+                events += self._unshelve(alarm, alarm.shelf.until_ns, "its time is over")
+        return tuple(events)
+
+    def clock_stepped(self, time_ns: int, step_ns: int) -> None:
+        """Restart all running delays, and keep shelving as long as it was meant to be: the data's clock was set."""
+        for name, alarm in self._alarms.items():
+            shelf = alarm.shelf
+            self._alarms[name] = replace(
+                alarm,
+                beyond_ns=None if alarm.beyond_ns is None else time_ns,
+                small_ns=None if alarm.small_ns is None else time_ns,
+                shelf=None if shelf is None else replace(shelf, until_ns=shelf.until_ns + step_ns),
+            )
+
+    def operate(self, operation: Operation, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Do what an operator asks for.
+
+        Parameters
+        ----------
+        operation : Operation
+        time_ns : int
+            Data time that has been reached.
+
+        Raises
+        ------
+        UnknownAlarm
+            If there is no such alarm.
+        OperationConflict
+            If the alarm is no longer as the operator saw it.
+        OperationRefused
+            If it is in a state in which this cannot be done, a reason is missing, or the time is too long.
+        """
+        if operation.alarm not in ALARM_TEXT:
+            raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARM_TEXT)}")
+        alarm = self._known(operation.alarm, time_ns)
+        self._must_be_as_seen(alarm, operation)
+        happening, kind = HAPPENINGS[operation.kind]
+        if follow(alarm.state, happening, present=alarm.present, latching=self._latches(alarm)) is None:
+            hint = " (acknowledge needs an alarm that has been raised)" if happening is Happening.ACKNOWLEDGE else ""
+            raise OperationRefused(f"{alarm.name} is {alarm.state.value}: {operation.kind} is not possible{hint}")
+        if happening in {Happening.SHELVE, Happening.REMOVE_FROM_SERVICE} and not operation.reason.strip():
+            raise OperationRefused(f"{operation.kind} of {alarm.name}: reason is empty, expected why")
+        if happening is Happening.SHELVE:
+            alarm = replace(alarm, shelf=self._shelf(operation, time_ns))
+        elif happening is Happening.UNSHELVE:
+            return self._unshelve(alarm, time_ns, operation.reason, operation.actor)
+        elif happening is Happening.REMOVE_FROM_SERVICE:
+            alarm = replace(
+                alarm, shelf=None, out_of_service_by=operation.actor, out_of_service_reason=operation.reason
+            )
+        elif happening is Happening.RETURN_TO_SERVICE:
+            alarm = replace(alarm, out_of_service_by="", out_of_service_reason="")
+        events = self._happen(alarm, happening, kind, time_ns, actor=operation.actor, reason=operation.reason)
+        return events + self._suppressed_again(alarm.name, time_ns)
+
+    # Surviving a restart
+
+    def checkpoint(self) -> str:
+        """Everything as JSON."""
+        return _PAGE.dump_json(_Page(self.alarms, self._next_sequence)).decode()
+
+    def restore(self, text: str, next_sequence: int | None = None) -> None:
+        """Go on from what `checkpoint` gave.
+
+        Parameters
+        ----------
+        text : str
+            JSON.
+        next_sequence : int, optional
+            Number of the next event by the log. It may be ahead of what was remembered; it is behind only where
+            the log was begun anew.
+
+        Raises
+        ------
+        CheckpointError
+            If the text is not of this form.
+        """
+        try:
+            page = _PAGE.validate_json(text)
+        except ValueError as error:
+            raise CheckpointError(f"alarms cannot be restored: {error}") from error
+        # Another version of the program may have known others.
+        self._alarms = {alarm.name: alarm for alarm in page.alarms if alarm.name in ALARM_TEXT}
+        self._next_sequence = max(page.next_sequence, next_sequence or 0)
+        self._untold = []
+
+    # Inside
+
+    def _known(self, name: str, time_ns: int) -> Alarm:
+        return self._alarms.get(name) or Alarm(name, since_ns=time_ns)
+
+    def _latches(self, alarm: Alarm) -> bool:
+        return alarm.name in self._settings.latching
+
+    def _applies(self, rule: SuppressRule, alarm: Alarm, speed_rpm: float | None) -> bool:
+        if rule.while_alarm is not None:
+            return self.present(rule.while_alarm)
+        if speed_rpm is None:
+            return rule.identity in alarm.rules
+        if rule.below_rpm is not None:
+            return speed_rpm < rule.below_rpm
+        return rule.above_rpm is not None and speed_rpm > rule.above_rpm
+
+    def _must_be_as_seen(self, alarm: Alarm, operation: Operation) -> None:
+        state, version = operation.expected_state, operation.expected_version
+        if (state is not None and state != alarm.state) or (version is not None and version != alarm.version):
+            seen = f"state {state}" if state is not None else f"version {version}"
+            raise OperationConflict(
+                f"{alarm.name} is {alarm.state.value} (version {alarm.version}), not as it was seen ({seen}): "
+                "look again"
+            )
+
+    def _shelf(self, operation: Operation, time_ns: int) -> Shelf:
+        longest_s = self._settings.longest_shelf_s
+        duration_s = longest_s if operation.duration_s is None else operation.duration_s
+        if not 0 < duration_s <= longest_s:
+            raise OperationRefused(
+                f"shelve of {operation.alarm}: duration_s is {duration_s:g}, expected more than 0 and at most "
+                f"{longest_s:g}"
+            )
+        until_ns = time_ns + round(duration_s * 1e9)
+        return Shelf(until_ns, operation.one_shot, operation.actor, operation.reason)
+
+    def _judge(
+        self, alarm: Alarm, time_ns: int, *, beyond: bool, small: bool, danger: bool, at_once: bool = False
+    ) -> tuple[AlarmEvent, ...]:
+        """Let the delays run, and make happen what was asked for long enough."""
+        settings = self._settings
+        beyond_ns = _since(alarm.beyond_ns, time_ns) if beyond and not alarm.present else None
+        small_ns = _since(alarm.small_ns, time_ns) if small and alarm.present else None
+        alarm = replace(alarm, beyond_ns=beyond_ns, small_ns=small_ns)
+        if beyond_ns is not None and (at_once or (time_ns - beyond_ns) / 1e9 >= settings.on_delay_s):
+            alarm = replace(
+                alarm,
+                present=True,
+                severity=Severity.DANGER if danger else Severity.ALERT,
+                raised_ns=time_ns,
+                occurrence=alarm.occurrence + 1,
+                beyond_ns=None,
+            )
+            return self._happen(alarm, Happening.CONDITION, EventKind.RAISED, time_ns)
+        if small_ns is not None and (at_once or (time_ns - small_ns) / 1e9 >= settings.off_delay_s):
+            alarm = replace(alarm, present=False, raised_ns=None, small_ns=None)
+            events = self._happen(alarm, Happening.CLEAR, EventKind.CLEARED, time_ns)
+            if alarm.shelf is not None and alarm.shelf.one_shot:
+                events += self._unshelve(self._alarms[alarm.name], time_ns, "the condition has cleared")
+            return events
+        if alarm.present and danger and alarm.severity is Severity.ALERT:
+            alarm = replace(alarm, severity=Severity.DANGER)
+            return self._happen(alarm, Happening.ESCALATE, EventKind.ESCALATED, time_ns)
+        self._alarms[alarm.name] = alarm
+        return ()
+
+    def _unshelve(self, alarm: Alarm, time_ns: int, reason: str, actor: str = "") -> tuple[AlarmEvent, ...]:
+        events = self._happen(
+            replace(alarm, shelf=None), Happening.UNSHELVE, EventKind.UNSHELVED, time_ns, actor=actor, reason=reason
+        )
+        return events + self._suppressed_again(alarm.name, time_ns)
+
+    def _suppressed_again(self, name: str, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """An alarm that comes back among the others is suppressed if a rule still says so."""
+        alarm = self._alarms[name]
+        if not alarm.rules or not alarm.state.annunciated:
+            return ()
+        return self._happen(alarm, Happening.SUPPRESS, EventKind.SUPPRESSED, time_ns, reason=alarm.suppressed_by)
+
+    def _happen(
+        self, alarm: Alarm, happening: Happening, kind: EventKind, time_ns: int, *, actor: str = "", reason: str = ""
+    ) -> tuple[AlarmEvent, ...]:
+        """Follow the life cycle and write the event down."""
+        before, latching = alarm.state, self._latches(alarm)
+        state = follow(before, happening, present=alarm.present, latching=latching, owed=alarm.owed)
+        if state is None:
+            raise OperationRefused(f"{alarm.name} is {before.value}: {happening.value} is not possible")
+        if state is before and happening in {Happening.SUPPRESS, Happening.UNSUPPRESS}:
+            self._alarms[alarm.name] = alarm  # the rule is noted; the operator's own silence outranks it
+            return ()
+        since_ns = alarm.since_ns if state is before else time_ns
+        owed = alarm.owed if state is before else AlarmState.NORMAL
+        if happening is Happening.SUPPRESS:
+            owed = owed_after(before, latching=latching)
+        alarm = replace(alarm, state=state, since_ns=since_ns, owed=owed, version=self._next_sequence)
+        event = AlarmEvent(kind, time_ns, self._next_sequence, alarm, before, actor, reason)
+        self._next_sequence += 1
+        self._alarms[alarm.name] = alarm
+        self._untold.append(event)
+        return (event,)
+
+
+def _since(since_ns: int | None, time_ns: int) -> int:
+    """When a delay began: now, unless it runs already."""
+    return time_ns if since_ns is None else since_ns

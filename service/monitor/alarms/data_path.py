@@ -1,0 +1,108 @@
+"""Alarms that say nothing of the machine: on the stream, its clock, the sensors, and the monitor itself."""
+
+from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
+from models.diagnosis.sensors.finding import FAULT_KINDS, SensorFinding
+from models.diagnosis.window import WindowStatistics
+from models.ingest import Verdict
+from models.machine import MachineFile
+from service.monitor.alarms.alarm import Evidence
+from service.monitor.alarms.book import AlarmBook
+
+__all__ = ["DataPathAlarms"]
+
+
+class DataPathAlarms:
+    """Judges what happens to the data on their way from the sensors through the monitor.
+
+    Parameters
+    ----------
+    book : AlarmBook
+        Where the alarms are.
+    machine : MachineFile
+    """
+
+    def __init__(self, book: AlarmBook, machine: MachineFile) -> None:
+        self._book = book
+        self._gap_s = machine.alarms.gap_s
+        self._silence_s = machine.ingest.no_data_after_s
+        self._silence_ns = round(self._silence_s * 1e9)
+        self._unseen_blocks, self._unseen_s = 0, 0.0
+
+    def accepted(self, verdict: Verdict, start_ns: int, dropped: int) -> None:
+        """A block was accepted.
+
+        Parameters
+        ----------
+        verdict : Verdict
+            Of the gate.
+        start_ns : int
+            Its beginning.
+        dropped : int
+            Blocks before it that the monitor itself threw away.
+        """
+        book, before_ns = self._book, start_ns - round(verdict.gap_s * 1e9)
+        missing, overloaded = Evidence(before_ns, start_ns), dropped > 0 and verdict.gap_s > 0
+        if verdict.gap_s >= self._silence_s and not overloaded:
+            self._lost(before_ns)
+        book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
+        if overloaded:
+            note = self._unseen(dropped, verdict.gap_s)
+            book.update_state(OVERLOADED, True, start_ns, note, evidence=missing, at_once=True)
+        elif verdict.gap_s > 0 and verdict.gap_s >= self._gap_s:
+            book.update_state(GAP, True, start_ns, verdict.text, evidence=missing, at_once=True)
+        if verdict.clock_step_s and not verdict.new_run:
+            book.update_state(CLOCK, True, start_ns, verdict.text, at_once=True)
+        book.suppress(None, start_ns)
+
+    def passed(self, time_ns: int, end_ns: int | None) -> None:
+        """Time has passed since the end of the newest data."""
+        if end_ns is not None and time_ns - end_ns >= self._silence_ns:
+            self._lost(end_ns)
+
+    def conflict(self, text: str, time_ns: int, *, at_once: bool = False) -> None:
+        """Publishers contradict each other, or do not; `text` says which."""
+        self._book.update_state(CONFLICT, bool(text), time_ns, text, at_once=at_once)
+
+    def hop(self, end_ns: int) -> None:
+        """A hop is complete, without a gap: what could have spoiled it is over, unless it is found again."""
+        for name in (GAP, CLOCK, FAULT, OVERLOADED):
+            self._book.update_state(name, False, end_ns)
+
+    def sensors(self, findings: tuple[SensorFinding, ...], statistics: WindowStatistics) -> None:
+        """One alarm for each kind of fault, with a sentence for each channel it is found in."""
+        said: dict[str, list[str]] = {}
+        for found in findings:
+            # Whatever is wrong with the shaft's angle costs the phase reference.
+            name = PHASE_REFERENCE if found.states == ("theta",) else data_alarm(found.kind)
+            said.setdefault(name, []).append(found.text)
+        evidence = Evidence(statistics.start_ns, statistics.end_ns)
+        for name in (PHASE_REFERENCE, *map(data_alarm, FAULT_KINDS)):
+            note = "; ".join(said.get(name, ()))
+            self._book.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
+
+    def fault(self, what: str, time_ns: int) -> None:
+        """The monitor itself is at fault; that is over once a hop has been evaluated for the off-delay."""
+        self._book.update_state(FAULT, True, time_ns, what, at_once=True)
+
+    def _unseen(self, blocks: int, gap_s: float) -> str:
+        """What has not been evaluated since the alarm on it was raised, with what was dropped just now."""
+        if not self._book.present(OVERLOADED):
+            self._unseen_blocks, self._unseen_s = 0, 0.0
+        self._unseen_blocks += blocks
+        self._unseen_s += gap_s
+        return (
+            f"this computer cannot keep up; not evaluated: {self._unseen_blocks} blocks, {self._unseen_s:.6g} s of data"
+        )
+
+    def _lost(self, end_ns: int) -> None:
+        """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
+        note = f"no usable data for {self._silence_s:g} s; what was raised stays raised"
+        due_ns = end_ns + self._silence_ns
+        self._book.update_state(STREAM_LOST, True, due_ns, note, evidence=Evidence(end_ns, due_ns), at_once=True)
+        self._book.suppress(None, due_ns)
+
+    def _found_again_ns(self, start_ns: int) -> int:
+        """When the silence ended; data that came late, but without a gap, are older than the alarm on them."""
+        raised_ns = next((one.raised_ns for one in self._book.alarms if one.name == STREAM_LOST), None)
+        late = raised_ns is not None and 0 <= raised_ns - start_ns <= self._silence_ns
+        return raised_ns if raised_ns is not None and late else start_ns

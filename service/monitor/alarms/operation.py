@@ -1,0 +1,75 @@
+"""What operators do to alarms."""
+
+from dataclasses import dataclass
+
+from models.errors import RotorwatchError
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.operations import OperationKind
+from service.monitor.alarms.life_cycle import Happening
+
+__all__ = [
+    "HAPPENINGS",
+    "NotInTime",
+    "Operation",
+    "OperationConflict",
+    "OperationRefused",
+    "UnknownAlarm",
+]
+
+HAPPENINGS: dict[OperationKind, tuple[Happening, EventKind]] = {
+    "acknowledge": (Happening.ACKNOWLEDGE, EventKind.ACKNOWLEDGED),
+    "reset": (Happening.RESET, EventKind.RESET),
+    "shelve": (Happening.SHELVE, EventKind.SHELVED),
+    "unshelve": (Happening.UNSHELVE, EventKind.UNSHELVED),
+    "remove-from-service": (Happening.REMOVE_FROM_SERVICE, EventKind.REMOVED_FROM_SERVICE),
+    "return-to-service": (Happening.RETURN_TO_SERVICE, EventKind.RETURNED_TO_SERVICE),
+}
+"""What each operation is in the life cycle, and in the log."""
+
+
+class UnknownAlarm(RotorwatchError):  # noqa: N818  # said to an operator, by its name
+    """There is no alarm of this name; the message lists those there are."""
+
+
+class OperationRefused(RotorwatchError):  # noqa: N818
+    """The alarm is in a state in which this cannot be done; the message says which."""
+
+
+class OperationConflict(RotorwatchError):  # noqa: N818
+    """The alarm is no longer as the operator saw it; the message says how it is."""
+
+
+class NotInTime(RotorwatchError):  # noqa: N818
+    """The machine's thread did not get round to what was asked; whether it will be done is not known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Operation:
+    """Something an operator wants done to an alarm.
+
+    Attributes
+    ----------
+    kind : OperationKind
+        What.
+    alarm : str
+        To which alarm, by name.
+    actor, reason : str
+        Who, and why; a reason is needed for shelving and for taking out of service.
+    duration_s : float or None
+        For how long to shelve; None: as long as the machine file allows.
+    one_shot : bool
+        Shelve only until the condition clears.
+    expected_state : str or None
+        State in which the operator saw it.
+    expected_version : int or None
+        Its `version` when the operator saw it.
+    """
+
+    kind: OperationKind
+    alarm: str
+    actor: str
+    reason: str = ""
+    duration_s: float | None = None
+    one_shot: bool = False
+    expected_state: str | None = None
+    expected_version: int | None = None

@@ -1,0 +1,492 @@
+"""The data path of one machine: block in, report out. Read this first.
+
+::
+
+    payload -> Arrivals -> Gate -> SlidingWindow -> WindowEvaluator -> SequentialTest -> AlarmBook -> MonitorReport
+               (order)   (ingest)  (correlations)     (residuals)     (what changed)     (alarms)
+
+`MachineMonitor` knows no network, clock or thread: all times are the data's own. Live running and replay are two ways
+of feeding it, and the same blocks give the same reports. What it remembers can be taken out between two blocks and put
+into another one, which goes on as if nothing had happened.
+"""
+
+from collections import deque
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from models.alarm_names import SHAPE
+from models.arrivals import Arrivals, Arrived
+from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
+from models.commissioning.installed import Installed
+from models.diagnosis.moments import HopMoments, plan_for
+from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.verdict.detectable import detectable_changes
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
+from models.diagnosis.verdict.stretch import Stretch, stretch_of
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.errors import CheckpointError, EstimationError, WireError
+from models.ingest import Gate, Reason, Verdict
+from models.senders import Senders
+from models.signals.block import NewestBlocks, SampleBlock
+from models.signals.wire import decode_block
+from rotorwatch.records.alarms import Severity
+from rotorwatch.records.health import HealthState
+from service.monitor.alarms.alarm import AlarmEvent, Evidence
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.alarms.data_path import DataPathAlarms
+from service.monitor.alarms.operation import Operation
+from service.monitor.evaluation import Evaluation, evaluator_for
+from service.monitor.reports import DataQuality, MachineHealth, MonitorReport, MonitorState, WindowReport
+
+__all__ = ["MachineMonitor"]
+
+_RPM = 30 / np.pi
+_NEWEST_SAMPLES = 20_000
+
+
+class MachineMonitor:
+    """Monitors one machine.
+
+    Parameters
+    ----------
+    installed : Installed
+        The machine file, and what was trained and commissioned for the machine.
+
+    Attributes
+    ----------
+    used : bool
+        Whether the latest message was itself used at once, and not one that waited for it.
+    """
+
+    def __init__(self, installed: Installed) -> None:
+        self.machine = machine = installed.machine
+        self._evaluator = evaluator_for(installed)
+        self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
+        self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
+        self._senders = Senders()
+        self._arrivals = Arrivals(machine.ingest.reorder_blocks)
+        self._due: deque[Arrived] = deque()
+        self._done: list[MonitorReport] = []
+        self._gate = Gate(machine)
+        self._window = SlidingWindow(self._plan)
+        settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
+        self._test = SequentialTest(settings, by=self._evaluator.by)
+        self._alarms = AlarmBook(machine.alarms)
+        self._data_path = DataPathAlarms(self._alarms, machine)
+        self._quality = DataQuality()
+        self._latest: WindowReport | None = None
+        self._calm = HealthState.WARMING
+        self._end_ns: int | None = None
+        self._reached_ns: int | None = None
+        self._kept_is_valid = True
+        self._drops: dict[tuple[int, int], int] = {}
+        self._dropped = 0
+        self._fault = ""
+        self._defect: Exception | None = None
+        self._statistics: WindowStatistics | None = None
+        self._newest = NewestBlocks(_NEWEST_SAMPLES)
+        self._used: SampleBlock | None = None
+        self.used = False
+        self.could_use = self._gate.could_use
+
+    def step_payload(
+        self, payload: bytes, attachment: bytes, encoding: str, dropped_before: int = 0
+    ) -> tuple[MonitorReport, ...]:
+        """Decode a message of the stream and take what is in order now as `step` does.
+
+        Parameters
+        ----------
+        payload, attachment, encoding : bytes, bytes, str
+            See `models.signals.wire`.
+        dropped_before : int
+            Messages before this one that this computer could not keep up with.
+
+        Returns
+        -------
+        tuple of MonitorReport
+            One per block that was taken: none while a block waits for an earlier one, several when that has come.
+            Undecodable bytes are a refusal like any other.
+        """
+        self._dropped += dropped_before
+        self.used = False
+        try:
+            block, schema_hash = decode_block(payload, attachment, encoding)
+        except WireError as error:
+            name = f"{self.machine.site}/{self.machine.name}"
+            return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
+        misshapen = self._gate.form(block, schema_hash)
+        if misshapen is not None:  # before anything is made of its run and number
+            return (MonitorReport(self._count(misshapen)),)
+        if self._disputed(block):
+            text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
+            verdict = Verdict(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
+            return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
+        if self._dropped:
+            self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
+        self._due.extend(self._arrivals.take(block, schema_hash))
+        done = self._step_due()
+        self.used = self._used is block
+        return done
+
+    def flush(self) -> tuple[MonitorReport, ...]:
+        """Take the blocks that wait for earlier ones: those will not come any more."""
+        self._due.extend(self._arrivals.flush())
+        return self._step_due()
+
+    def _disputed(self, block: SampleBlock) -> bool:
+        """Whether a block contradicts one that has come; what is known of publishers is brought to the alarm."""
+        disputed = self._senders.take(block)
+        if disputed and not self._arrivals.withdraw(block.run, block.sequence):
+            self._window.gap()  # the other version may be in the unfinished hop
+        conflict = self._senders.conflict
+        if conflict:
+            self._data_path.conflict(conflict, block.end_ns if self._end_ns is None else self._end_ns, at_once=True)
+        return disputed
+
+    def _step_due(self) -> tuple[MonitorReport, ...]:
+        """Take what is due; a defect that one block brings to light leaves the others for the next time."""
+        while self._due:
+            one = self._due.popleft()
+            self._done.append(self.step(one.block, one.schema_hash))
+        done, self._done = tuple(self._done), []
+        return done
+
+    def step(self, block: SampleBlock, schema_hash: str = "") -> MonitorReport:
+        """Take one block: gate, window, evaluation, alarms.
+
+        Parameters
+        ----------
+        block : SampleBlock
+            The next block of the stream.
+        schema_hash : str
+            Hash of the channel descriptor the sender named, empty if none.
+
+        Returns
+        -------
+        MonitorReport
+            Immutable; refused blocks, gaps and defects of the monitor are stated in it, never raised.
+        """
+        dropped = self._drops.pop((block.run, block.sequence), 0)
+        verdict = self._judged(block, schema_hash, dropped)
+        if not verdict.accepted:
+            self._dropped += dropped
+            return MonitorReport(verdict)
+        self._used = block
+        windows: list[WindowReport] = []
+        try:
+            for end_ns in self._hops(block, verdict, dropped):
+                windows.append(self._evaluate(end_ns))
+        except Exception as error:  # whatever it is, the machine must not look healthy on account of it
+            self._window.gap()
+            self._failed(error, block.end_ns)
+        fault, self._defect = self._defect, None
+        length_s = float(block.samples.shape[0] / block.rate_hz)
+        return MonitorReport(verdict, tuple(windows), self._alarms.take(), length_s, fault)
+
+    def _hops(self, block: SampleBlock, verdict: Verdict, dropped: int) -> Iterable[int]:
+        """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
+        if not verdict.continuous:
+            self._window.gap()
+        self._newest.add(block, continuous=verdict.continuous and not verdict.clock_step_s)
+        if verdict.clock_step_s:
+            self._window.clear()
+            self._kept_is_valid = False  # hops may end at the same times as before
+            self._test.clear()
+            self._alarms.clock_stepped(block.start_ns, round(verdict.clock_step_s * 1e9))
+        elif self._end_ns is None and self._reached_ns is not None:
+            # Until now the time of day was all there was; shelving goes on by the time of the data.
+            self._alarms.clock_stepped(block.start_ns, block.start_ns - self._reached_ns)
+        self._alarms.passed(block.start_ns)
+        self._data_path.accepted(verdict, block.start_ns, dropped)
+        self._end_ns = block.end_ns
+        return self._window.feed(self._plan.to_si(block.samples), block.start_ns)
+
+    def fault(self, what: str, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Raise the alarm on the monitor itself; it clears once windows are evaluated again.
+
+        Parameters
+        ----------
+        what : str
+            What is wrong.
+        time_ns : int
+            Data time that has been reached.
+        """
+        self._data_path.fault(what, time_ns)
+        return self._alarms.take()
+
+    def _failed(self, error: Exception, time_ns: int) -> None:
+        """A defect: nothing can be said of the machine until a window is evaluated again."""
+        self._defect = error
+        self._fault = f"a defect in the monitor, not in the machine: {type(error).__name__}: {error}"
+        self._data_path.fault(self._fault, time_ns)
+
+    def passed(self, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Take note of time that has passed, with data or without.
+
+        Parameters
+        ----------
+        time_ns : int
+            Data time that has been reached by now, as far as anybody knows.
+        """
+        self._reached_ns = time_ns
+        self._alarms.passed(time_ns)
+        self._data_path.passed(time_ns, self._end_ns)
+        return self._alarms.take()
+
+    @property
+    def end_ns(self) -> int | None:
+        """End of the newest data; None before the first."""
+        return self._end_ns
+
+    @property
+    def hops(self) -> tuple[int, ...]:
+        """Ends of the hops in the window."""
+        return tuple(hop.end_ns for hop in self._window.hops)
+
+    @property
+    def window(self) -> WindowStatistics | None:
+        """The window of the latest report; None if it was not full."""
+        return self._statistics
+
+    @property
+    def blocks(self) -> tuple[SampleBlock, ...]:
+        """The newest blocks, without a gap, about 20 000 samples at most."""
+        return self._newest.blocks
+
+    @property
+    def next_sequence(self) -> int:
+        """Number the next alarm event will have."""
+        return self._alarms.next_sequence
+
+    def operate(self, operation: Operation, time_ns: int) -> tuple[AlarmEvent, ...]:
+        """Do what an operator asks for, see `AlarmBook.operate`."""
+        self._reached_ns = time_ns
+        self._alarms.operate(operation, time_ns)
+        return self._alarms.take()
+
+    def take_events(self) -> tuple[AlarmEvent, ...]:
+        """What has happened and was never handed over, because a defect came in between."""
+        return self._alarms.take()
+
+    def state(self, kept: Collection[int] = ()) -> MonitorState:
+        """Everything that is remembered, to be put into another monitor.
+
+        Parameters
+        ----------
+        kept : collection of int
+            Ends of the hops that are stored already and need not be handed over again.
+        """
+        hops = self._window.hops
+        known = kept if self._kept_is_valid else ()
+        self._kept_is_valid = True
+        return MonitorState(
+            alarms=self._alarms.checkpoint(),
+            state=to_bytes(
+                {
+                    **prefixed("gate", self._gate.checkpoint()),
+                    **prefixed("window", self._window.checkpoint()),
+                    **prefixed("test", self._test.state.checkpoint()),
+                    **prefixed("evaluator", self._evaluator.checkpoint()),
+                    "calm": np.array([self._calm.value]),
+                    "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
+                }
+            ),
+            new_hops=tuple((hop.end_ns, to_bytes(hop.checkpoint())) for hop in hops if hop.end_ns not in known),
+            hops=self.hops,
+            end_ns=self._end_ns,
+        )
+
+    def restore(self, state: bytes, hops: Collection[bytes]) -> None:
+        """Go on where another monitor of the same machine, files and version stood; alarms are restored by themselves.
+
+        Raises
+        ------
+        CheckpointError
+            If the bytes are damaged or of another form; this monitor is of no use then.
+        """
+        arrays = from_bytes(state)
+        moments = tuple(HopMoments.restored(from_bytes(hop)) for hop in hops)
+        test = SequentialState.restored(unprefixed("test", arrays))
+        calm = texts(arrays, "calm")
+        if calm not in {(state.value,) for state in HealthState}:
+            raise CheckpointError(f"calm is {calm}, expected one of {', '.join(HealthState)}")
+        end_ns = next(iter(checked(arrays, "end_ns", np.int64, (None,)).tolist()), None)
+        self._gate.restore(unprefixed("gate", arrays))
+        self._window.restore(unprefixed("window", arrays), moments)
+        self._evaluator.restore(unprefixed("evaluator", arrays))
+        self._test.state = test
+        self._end_ns, self._calm = end_ns, HealthState(*calm)
+        self._arrivals.resume(self._gate.courses)
+
+    def restore_alarms(self, alarms: str, next_sequence: int | None = None, end_ns: int | None = None) -> None:
+        """Go on with the alarms of another monitor, see `AlarmBook.restore`.
+
+        Parameters
+        ----------
+        alarms : str
+        next_sequence : int, optional
+        end_ns : int, optional
+            End of the newest data of the other monitor, where nothing else of it was restored: the times of the alarms
+            are of the same clock.
+        """
+        self._alarms.restore(alarms, next_sequence)
+        self._end_ns = end_ns if self._end_ns is None else self._end_ns
+
+    def health(self) -> MachineHealth:
+        """Where the machine stands now."""
+        # What operators did since the latest window counts at once.
+        state = self._state(HealthState.NOT_EVALUABLE if self._fault else self._calm)
+        return MachineHealth(
+            state,
+            self._window.filled,
+            self._latest,
+            self._alarms.alarms,
+            self._quality,
+            self._alarms.next_sequence - 1,
+            self._fault or ("" if self._latest is None else self._latest.reason),
+            self._end_ns,
+        )
+
+    def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Verdict:
+        """What the gate says; of the data that another monitor had before this one it knows nothing."""
+        anew = not self._gate.courses
+        verdict = self._gate.judge(block, schema_hash)
+        if anew and verdict.accepted and self._end_ns is not None:
+            name, ingest = f"{self.machine.site}/{self.machine.name}", self.machine.ingest
+            late_s = (block.start_ns - self._end_ns) / 1e9
+            if abs(late_s) > ingest.max_jump_s:
+                text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
+                verdict = Verdict(text=text, clock_step_s=late_s, new_run=block.sequence == 0)
+            elif late_s > ingest.time_tolerance_s:
+                text = f"{name}: {late_s:.6g} s of data are missing over the restart"
+                verdict = Verdict(text=text, gap_s=late_s)
+        if dropped and verdict.gap_s > 0:
+            text = (
+                f"{self.machine.site}/{self.machine.name}: {dropped} blocks ({verdict.gap_s:.6g} s of data) were "
+                "not evaluated: the monitor cannot keep up"
+            )
+            verdict = replace(verdict, text=text)
+        return self._count(verdict)
+
+    def _count(self, verdict: Verdict) -> Verdict:
+        self._quality = self._quality.counted(verdict)
+        return verdict
+
+    def _evaluate(self, end_ns: int) -> WindowReport:
+        """Evaluate the window as it is after a completed hop; a defect is a reason why it cannot be."""
+        self._fault = ""
+        try:
+            report = self._evaluated(end_ns)
+        except Exception as error:
+            self._failed(error, end_ns)
+            state = self._state(HealthState.NOT_EVALUABLE)
+            report = WindowReport(end_ns, end_ns, state, self._window.filled, reason=self._fault)
+        self._latest = report
+        self._alarms.suppress(None, end_ns)
+        return report
+
+    def _evaluated(self, end_ns: int) -> WindowReport:
+        filled = self._window.filled
+        self._data_path.hop(end_ns)
+        self._data_path.conflict(self._senders.conflict, end_ns)
+        statistics = self._statistics = self._window.statistics()
+        if statistics is None:
+            return WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
+        speed_rad_s = statistics.speed_rad_s
+        self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
+        findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
+        self._data_path.sensors(findings, statistics)
+        if findings:
+            return WindowReport(
+                statistics.start_ns,
+                end_ns,
+                self._state(HealthState.DATA_HEALTH),
+                filled,
+                sensors=findings,
+                reason="; ".join(each.text for each in findings),
+            )
+        short = {hops: self._window.statistics(hops) for hops in self._test.wanted()}
+        present = {hops: latest for hops, latest in short.items() if latest is not None}
+        try:
+            evaluation = self._evaluator.evaluate(statistics, present)
+        except EstimationError as error:
+            return WindowReport(
+                statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
+            )
+        evaluation = evaluation.named(self.machine.sensors)
+        looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
+        whole = self._test.settings.window_hops
+        looks[whole] = _stretch(evaluation.deciding, statistics)
+        verdict = self._test.update(looks)
+        changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
+        self._alarms.found(verdict, evaluation.deciding.suspect, end_ns)
+        parameters = tuple(
+            ParameterReading(one.name, one.by, reason=one.vector.foreign) if one.vector and one.vector.foreign else one
+            for one in evaluation.deciding.parameters
+        )
+        unexplained = evaluation.deciding.unexplained
+        if unexplained:
+            parameters = tuple(ParameterReading(one.name, one.by, reason=unexplained) for one in parameters)
+        # Where the window straddles a change, what is explained is in the verdict's current readings.
+        reason = "" if verdict.current else unexplained
+        if not unexplained and not evaluation.deciding.evaluable:
+            reason = _why_nothing(evaluation.deciding)
+        if evaluation.shapes:
+            evidence = Evidence(statistics.start_ns, end_ns)
+            self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
+        outside = verdict.isolation.outside
+        return WindowReport(
+            start_ns=statistics.start_ns,
+            end_ns=end_ns,
+            state=self._state(_calm_state(evaluation, outside=outside)),
+            filled=filled,
+            speed_rad_s=evaluation.speed_rad_s,
+            parameters=parameters,
+            equations=evaluation.equations,
+            opinions=evaluation.opinions,
+            misfit_z=evaluation.deciding.misfit_z,
+            suspect=evaluation.deciding.suspect if outside and not unexplained else "",
+            verdict=verdict,
+            detectable=()
+            if unexplained
+            else detectable_changes(
+                looks[whole].complete(), self._test.thresholds(whole), self.machine.window.length_s
+            ),
+            reason=reason,
+            shapes=evaluation.shapes,
+        )
+
+    def _state(self, otherwise: HealthState) -> HealthState:
+        """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
+        self._calm = otherwise
+        match self._alarms.severity:
+            case Severity.DANGER:
+                return HealthState.DANGER
+            case Severity.ALERT:
+                return HealthState.ALERT
+            case None:
+                return otherwise
+
+
+def _calm_state(evaluation: Evaluation, *, outside: bool) -> HealthState:
+    """What a machine without raised alarms is: healthy only if something was read that could have said otherwise."""
+    if outside:
+        return HealthState.OUTSIDE_MODEL
+    if evaluation.deciding.evaluable:
+        return HealthState.HEALTHY
+    states = {shape.state for shape in evaluation.shapes}
+    if "not changed" in states and "changed" not in states:
+        return HealthState.UNCHANGED
+    return HealthState.NOT_EVALUABLE
+
+
+def _why_nothing(diagnosis: Diagnosis) -> str:
+    """Why no parameter could be read, every reason once."""
+    return "; ".join(dict.fromkeys(reading.reason for reading in diagnosis.parameters if reading.reason))
+
+
+def _stretch(diagnosis: Diagnosis, window: WindowStatistics) -> Stretch:
+    return stretch_of(diagnosis, window.start_ns, window.end_ns)

@@ -1,0 +1,279 @@
+"""Replays in processes of their own, so that they do not share the interpreter with the live monitors.
+
+A job's process gets its orders on standard input and says on standard output how far it is. When the service ends,
+however it ends, the input ends, and so does the replay. Results go to a folder of the job and nowhere else.
+"""
+
+import re
+import secrets
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from models.errors import RotorwatchError
+from rotorwatch.records.replays import ReplayJob, ReplayLine
+from service.terminal.logs import logger
+
+__all__ = ["REPLAYS", "JobPlan", "ReplayJobError", "ReplayJobs", "TooManyReplaysError"]
+
+REPLAYS = ".replays"
+_RESULTS = "results.jsonl"
+_MESSAGES = "messages.txt"
+_STOP_S = 5.0
+_ERROR_CHARACTERS = 2000
+_FOLDER = re.compile(r"[0-9a-f]{12}")
+_log = logger(part="replay")
+
+
+class ReplayJobError(RotorwatchError):
+    """A replay cannot be started; the message says why."""
+
+
+class TooManyReplaysError(ReplayJobError):
+    """As many replays as allowed are running."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobPlan:
+    """A job as it is to be started.
+
+    Attributes
+    ----------
+    job : ReplayJob
+        What the API says of it; id, state, times and results are filled in.
+    arguments : tuple of str
+        Of ``rotorwatch replay``: files and options other than those for the output.
+    """
+
+    job: ReplayJob
+    arguments: tuple[str, ...]
+
+
+class ReplayJobs:
+    """Starts, watches and ends the processes.
+
+    Parameters
+    ----------
+    folder : Path
+        Where results go, a folder per job.
+    limit : int
+        Most jobs that run at once.
+    nice : int
+        How far they give way to others.
+    kept : int
+        Most folders that are kept; the oldest are removed.
+    """
+
+    def __init__(self, folder: Path, *, limit: int, nice: int, kept: int) -> None:
+        self._folder = folder
+        self._limit = limit
+        self._nice = nice
+        self._kept = max(kept, limit)
+        self._lock = threading.Lock()
+        self._jobs: dict[str, _Job] = {}
+        self._closed = False
+
+    @staticmethod
+    def new_id() -> str:
+        """Return a name for a job."""
+        return secrets.token_hex(6)
+
+    def start(self, plan: JobPlan) -> ReplayJob:
+        """Start a job.
+
+        Raises
+        ------
+        TooManyReplaysError
+            If as many as allowed are running.
+        ReplayJobError
+            If its folder cannot be written or its process not be started.
+        """
+        with self._lock:
+            if self._closed:
+                raise ReplayJobError("the service is stopping")
+            running = [job.view.id for job in self._jobs.values() if job.running]
+            if len(running) >= self._limit:
+                raise TooManyReplaysError(
+                    f"{len(running)} of at most {self._limit} replays run ({', '.join(running)}): wait or stop one"
+                )
+            folder = self._folder / plan.job.id
+            try:
+                folder.mkdir(parents=True)
+                self._make_room()
+                job = self._jobs[plan.job.id] = _Job(plan, folder, self._nice)
+            except OSError as error:
+                raise ReplayJobError(f"{folder}: no replay can be started ({error.strerror or error})") from error
+        _log.info("replay started", id=plan.job.id, recordings=len(plan.job.recordings), mode=plan.job.mode)
+        return job.view
+
+    def jobs(self) -> tuple[ReplayJob, ...]:
+        """Every job since the service started whose results are kept, the latest first."""
+        with self._lock:
+            return tuple(job.view for job in reversed(self._jobs.values()))
+
+    def job(self, job_id: str) -> ReplayJob | None:
+        """One job, or None if there is none of this id."""
+        with self._lock:
+            found = self._jobs.get(job_id)
+        return None if found is None else found.view
+
+    def results(self, job_id: str) -> Path | None:
+        """File with the result lines of a job; it may not be there yet."""
+        with self._lock:
+            found = self._jobs.get(job_id)
+        return None if found is None else found.folder / _RESULTS
+
+    def order(self, job_id: str, *orders: str) -> ReplayJob | None:
+        """Hand orders to a job's process, see `service.recordings.replay.console`; one that has ended hears none."""
+        with self._lock:
+            found = self._jobs.get(job_id)
+        if found is None:
+            return None
+        for order in orders:
+            found.order(order)
+        return found.view
+
+    def stop(self, job_id: str) -> ReplayJob | None:
+        """End a job and wait until it has ended."""
+        with self._lock:
+            found = self._jobs.get(job_id)
+        if found is None:
+            return None
+        found.end()
+        return found.view
+
+    def close(self) -> None:
+        """End every job."""
+        with self._lock:
+            self._closed = True
+            jobs = list(self._jobs.values())
+        for job in jobs:
+            job.ask_to_end()
+        for job in jobs:
+            job.end()
+
+    def _make_room(self) -> None:
+        """Remove the oldest folders beyond the number that is kept, also those of an earlier service."""
+        folders = [
+            entry for entry in self._folder.iterdir() if _FOLDER.fullmatch(entry.name) and not entry.is_symlink()
+        ]
+        busy = {job.view.id for job in self._jobs.values() if job.running}
+        for folder in sorted(folders, key=lambda entry: entry.stat().st_mtime_ns, reverse=True)[self._kept :]:
+            if folder.name not in busy:
+                self._jobs.pop(folder.name, None)
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+class _Job:
+    """One process and the thread that listens to it."""
+
+    def __init__(self, plan: JobPlan, folder: Path, nice: int) -> None:
+        self.folder = folder
+        self._lock = threading.Lock()
+        self._stop_asked = False
+        self._view = plan.job
+        with (folder / _MESSAGES).open("wb") as messages:
+            self._process = subprocess.Popen(  # noqa: S603  # our own program; every argument is checked by the caller
+                self._command(plan, nice),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=messages,
+                start_new_session=True,  # Ctrl-C is for the service, which ends its jobs itself
+            )
+        self._thread = threading.Thread(target=self._listen, name=f"replay {plan.job.id}", daemon=True)
+        self._thread.start()
+
+    @property
+    def view(self) -> ReplayJob:
+        """What the API says of the job."""
+        return self._view
+
+    @property
+    def running(self) -> bool:
+        """Whether the process is there."""
+        return self._view.state in ("running", "paused")
+
+    def order(self, order: str) -> None:
+        """Hand an order to the process."""
+        with self._lock:
+            if not self.running or self._process.stdin is None:
+                return
+            with suppress(OSError, ValueError):  # it may just have ended
+                self._process.stdin.write(order.encode() + b"\n")
+                self._process.stdin.flush()
+            if order in ("pause", "resume"):
+                state = "paused" if order == "pause" else "running"
+                self._view = self._view.model_copy(update={"state": state})
+
+    def ask_to_end(self) -> None:
+        """Ask the process to end."""
+        with self._lock:
+            self._stop_asked = True
+            if self._process.stdin is not None:
+                with suppress(OSError, ValueError):
+                    self._process.stdin.close()
+
+    def end(self) -> None:
+        """Ask the process to end, and after a while make it."""
+        self.ask_to_end()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_STOP_S)
+        if self._process.poll() is None:
+            self._process.kill()
+        self._thread.join()
+
+    def _command(self, plan: JobPlan, nice: int) -> Sequence[str]:
+        command = [sys.executable, "-m", "service.rotorwatch", "replay", *plan.arguments]
+        command += ["--progress", "json", "--control", "--nice", str(nice)]
+        return command + (["--out", str(self.folder / _RESULTS)] if plan.job.mode == "offline" else [])
+
+    def _listen(self) -> None:
+        if self._process.stdout is not None:
+            with self._process.stdout as lines:
+                for text in lines:
+                    self._take(text)
+        code = self._process.wait()
+        with self._lock:
+            state = "stopped" if self._stop_asked else "finished" if code == 0 else "failed"
+            update: dict[str, object] = {"state": state}
+            if state == "failed":
+                update["error"] = self._last_words() or f"the process ended with code {code}"
+            self._view = self._view.model_copy(update=update)
+            if self._process.stdin is not None:
+                with suppress(OSError):
+                    self._process.stdin.close()
+        _log.info("replay ended", id=self._view.id, state=state, why=self._view.error)
+
+    def _take(self, text: bytes) -> None:
+        try:
+            line = ReplayLine.model_validate_json(text)
+        except ValidationError:
+            _log.warning("a replay says what is not understood", id=self._view.id, line=text[:200])
+            return
+        update = {name: value for name in ("progress", "summary") if (value := getattr(line, name)) is not None}
+        with self._lock:
+            self._view = self._view.model_copy(update=update)
+
+    def _last_words(self) -> str:
+        """End of what the process said on standard error; nothing of the inside."""
+        try:
+            text = (self.folder / _MESSAGES).read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return ""
+        if "Traceback (most recent call last)" in text:
+            _log.error("a replay ended with a defect", id=self._view.id, messages=text[-_ERROR_CHARACTERS:])
+            return "an error inside the replay; the service's log says more"
+        return text.strip()[-_ERROR_CHARACTERS:].replace(f"{self.folder}/", "")
+
+
+def now_ns() -> int:
+    """Time of this computer."""
+    return time.time_ns()

@@ -1,0 +1,187 @@
+"""Recordings straight through the monitor's data path, at full speed, without network or clock.
+
+The blocks meet the same `MachineMonitor` as they would live, so the reports are the same to the last bit.
+"""
+
+import hashlib
+import json
+import time
+from collections.abc import Callable
+
+from models.commissioning.installed import Installed
+from models.signals.keys import MachineKeys
+from models.signals.recording import RecordedMessage
+from rotorwatch.records.replays import OfflineSummary, ReplayProgress
+from service.monitor import conversion
+from service.monitor.alarm_conversion import Identity, alarm_cloud_event
+from service.monitor.descriptor import descriptor_mismatch
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import MonitorReport
+from service.recordings.replay.control import Control
+from service.recordings.replay.source import RecordingSource
+
+__all__ = ["OfflineReplay", "result_lines"]
+
+
+def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -> list[str]:
+    """JSON lines of what one block brought: topic and message, in the order of their data time, report before alarm."""
+    timed = [
+        (window.end_ns, 0, keys.report, conversion.report(identity, window).model_dump_json())
+        for window in report.windows
+    ]
+    timed += [
+        (event.time_ns, 1, keys.alarm_event, alarm_cloud_event(identity, event).model_dump_json())
+        for event in report.events
+    ]
+    ordered = sorted(timed, key=lambda entry: entry[:2])  # stable: several events of one window keep their order
+    return [f'{{"topic": {json.dumps(topic)}, "message": {text}}}' for _, _, topic, text in ordered]
+
+
+class OfflineReplay:
+    """One run of recordings through a monitor.
+
+    Parameters
+    ----------
+    source : RecordingSource
+    keys : MachineKeys
+        The recorded machine whose stream is replayed.
+    installed : Installed
+        The machine file to evaluate it with, and what was trained and commissioned for it.
+    write : callable
+        Takes each result line, without its line end.
+    from_ns, to_ns : int, optional
+        Only blocks from `from_ns` up to, and without, `to_ns`, in the time of the data.
+    """
+
+    def __init__(
+        self,
+        source: RecordingSource,
+        keys: MachineKeys,
+        installed: Installed,
+        write: Callable[[str], None],
+        *,
+        from_ns: int | None = None,
+        to_ns: int | None = None,
+    ) -> None:
+        self._source = source
+        self._keys = keys
+        self._machine = machine = installed.machine
+        self._write = write
+        span = source.span(keys)
+        self._from_ns = span.start_ns if from_ns is None else from_ns
+        self._to_ns = span.end_ns + 1 if to_ns is None else to_ns
+        self._monitor = MachineMonitor(installed)
+        self.identity = Identity(
+            site=machine.site,
+            machine=machine.name,
+            bundle=installed.identity,
+            machine_hash=conversion.machine_hash(machine),
+        )
+        self._digest = hashlib.sha256()
+        self._windows = self._alarms = self._messages = 0
+        self._data_s = 0.0
+        self._differences: tuple[str, ...] = ()
+        self._other_name = (machine.site, machine.name) != (keys.site, keys.machine)
+        descriptor = source.descriptor(keys, self._from_ns)
+        if descriptor is not None:
+            self._describe(descriptor)
+
+    @property
+    def descriptor_differences(self) -> tuple[str, ...]:
+        """How the recorded channel descriptor differs from the machine file, one sentence per field."""
+        return self._differences
+
+    def run(
+        self,
+        control: Control | None = None,
+        on_progress: Callable[[ReplayProgress], None] | None = None,
+    ) -> OfflineSummary:
+        """Replay, until the end or until `control` says stop.
+
+        Raises
+        ------
+        RecordingError
+            Where a recording is damaged.
+        """
+        control = Control() if control is None else control
+        begin_s = time.perf_counter()
+        keys = {self._keys.stream, self._keys.descriptor}
+        for time_ns, message in self._source.timed(keys, from_ns=self._from_ns, to_ns=self._to_ns):
+            if control.stopped:
+                break
+            self._messages += 1
+            if message.key == self._keys.descriptor:
+                self._describe(message)
+                continue
+            self._take(message)
+            if on_progress is not None:
+                on_progress(self._progress(time_ns))
+        if not control.stopped:
+            for report in self._monitor.flush():
+                self._note(report)
+            if on_progress is not None:
+                on_progress(self._progress(self._to_ns - 1))
+        return self._summary(time.perf_counter() - begin_s, stopped=control.stopped)
+
+    def _describe(self, message: RecordedMessage) -> None:
+        found = descriptor_mismatch(message.payload, self._machine)
+        self._differences = tuple(dict.fromkeys((*self._differences, *found)))
+
+    def _take(self, message: RecordedMessage) -> None:
+        for report in self._monitor.step_payload(message.payload, message.attachment, self._encoding(message.encoding)):
+            self._note(report)
+
+    def _note(self, report: MonitorReport) -> None:
+        self._data_s += report.data_s
+        self._windows += len(report.windows)
+        self._alarms += len(report.events)
+        for line in result_lines(self.identity, self._machine.keys, report):
+            self._digest.update(line.encode() + b"\n")
+            self._write(line)
+
+    def _encoding(self, encoding: str) -> str:
+        """Leave out the schema hash where it differs only because the machine has another name.
+
+        The hash covers site and name; with another machine's file the number of channels is checked, and every other
+        difference of the descriptors is stated.
+        """
+        return encoding.partition(";")[0] if self._other_name and self._only_the_name_differs() else encoding
+
+    def _only_the_name_differs(self) -> bool:
+        return all(text.startswith(("site is ", "machine is ")) for text in self._differences)
+
+    def _progress(self, at_ns: int) -> ReplayProgress:
+        length_ns = max(1, self._to_ns - 1 - self._from_ns)
+        return ReplayProgress(
+            fraction=min(1.0, max(0.0, (at_ns - self._from_ns) / length_ns)),
+            position_ns=at_ns,
+            messages=self._messages,
+            windows=self._windows,
+            alarms=self._alarms,
+            pass_number=1,
+            paused=False,
+        )
+
+    def _summary(self, elapsed_s: float, *, stopped: bool) -> OfflineSummary:
+        health = self._monitor.health()
+        quality = health.quality
+        return OfflineSummary(
+            site=self.identity.site,
+            machine=self.identity.machine,
+            bundle=self.identity.bundle,
+            machine_hash=self.identity.machine_hash,
+            windows=self._windows,
+            alarms=self._alarms,
+            raised=tuple(alarm.name for alarm in health.alarms if alarm.raised),
+            blocks=quality.accepted,
+            refused_blocks=dict(quality.refused),
+            last_refusal=quality.last_refusal,
+            gaps=quality.gaps,
+            missing_s=quality.missing_s,
+            data_s=round(self._data_s, 6),
+            elapsed_s=round(elapsed_s, 3),
+            times_real_time=round(self._data_s / max(elapsed_s, 1e-9), 1),
+            descriptor_differences=self._differences,
+            stopped=stopped,
+            sha256=self._digest.hexdigest(),
+        )

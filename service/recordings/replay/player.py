@@ -1,0 +1,129 @@
+"""Recorded messages handed out at their recorded pace; who takes them is somebody else's business."""
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from typing import Protocol
+
+from models.signals.recording import RecordedMessage
+from rotorwatch.records.replays import ReplayProgress
+from service.recordings.replay.control import Control
+from service.recordings.replay.data_time import place_of
+from service.recordings.replay.source import RecordingSource
+
+__all__ = ["PlayPlan", "Sink", "play"]
+
+_LONGEST_PAUSE_NS = 3600 * 10**9
+_BELIEVED = 10
+
+
+class Sink(Protocol):
+    """Where replayed messages go; `service.stream.replay_link.ReplayLink` is one."""
+
+    def put(self, message: RecordedMessage) -> None:
+        """Publish a message as it was."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlayPlan:
+    """What is replayed, and how fast.
+
+    Attributes
+    ----------
+    keys : collection of str or None
+        Only these keys; None is everything.
+    pace : float or None
+        Seconds of data per second; None is as fast as the sink takes it.
+    from_ns, to_ns : int
+        Times of the data: from `from_ns` up to, and without, `to_ns`.
+    pass_number : int
+        Which repetition this is, from 1.
+    """
+
+    keys: Collection[str] | None
+    pace: float | None
+    from_ns: int
+    to_ns: int
+    pass_number: int = 1
+
+
+def play(
+    source: RecordingSource,
+    sink: Sink,
+    plan: PlayPlan,
+    control: Control,
+    on_progress: Callable[[ReplayProgress], None] | None = None,
+) -> int:
+    """Hand out the messages of one pass, byte for byte, until its end or until `control` says stop.
+
+    Messages go out at the distances in time at which their data were taken, divided by the pace. After a seek, a pause
+    of more than an hour, or where data are earlier than what went before, the replay goes on at once.
+
+    Returns
+    -------
+    int
+        Number of messages handed out.
+
+    Raises
+    ------
+    RecordingError
+        Where a recording is damaged.
+    """
+    count = 0
+    begin_ns: int | None = plan.from_ns
+    control.at(plan.from_ns)
+    while begin_ns is not None:
+        timetables: dict[str, _Timetable] = {}
+        for time_ns, message in source.timed(plan.keys, from_ns=begin_ns, to_ns=plan.to_ns):
+            due_s: float | None = None
+            if plan.pace is not None:
+                machine = timetables.setdefault(place_of(message.key), _Timetable(plan.pace, time_ns, control.now_s()))
+                due_s = machine.due_s(time_ns)
+            if not control.wait_until(due_s):
+                break
+            control.at(time_ns)
+            sink.put(message)
+            count += 1
+            if on_progress is not None:
+                on_progress(_progress(plan, control, time_ns, count))
+        if control.stopped:
+            break
+        seek_ns = control.take_seek()
+        begin_ns = None if seek_ns is None else min(max(seek_ns, plan.from_ns), plan.to_ns)
+        if begin_ns is not None:
+            control.at(begin_ns)
+    if on_progress is not None and not control.stopped:
+        on_progress(_progress(plan, control, plan.to_ns - 1, count))
+    return count
+
+
+class _Timetable:
+    """When the messages of one machine are due."""
+
+    def __init__(self, pace: float, start_ns: int, start_s: float) -> None:
+        self._pace = pace
+        self._front_ns, self._due_s = start_ns, start_s
+        self._behind = 0
+
+    def due_s(self, time_ns: int) -> float:
+        """When a message with this time of the data is due, as `Control.now_s` counts."""
+        ahead_ns = time_ns - self._front_ns
+        # One block that comes again, or late, is no other time; a dozen in a row are.
+        self._behind = self._behind + 1 if ahead_ns < 0 else 0
+        if 0 < ahead_ns <= _LONGEST_PAUSE_NS:
+            self._due_s += ahead_ns / 1e9 / self._pace
+        if ahead_ns > 0 or self._behind > _BELIEVED:
+            self._front_ns = time_ns
+        return self._due_s
+
+
+def _progress(plan: PlayPlan, control: Control, at_ns: int, count: int) -> ReplayProgress:
+    done = (at_ns - plan.from_ns) / max(1, plan.to_ns - 1 - plan.from_ns)
+    return ReplayProgress(
+        fraction=min(1.0, max(0.0, done)),
+        position_ns=at_ns,
+        messages=count,
+        windows=0,
+        alarms=0,
+        pass_number=plan.pass_number,
+        paused=control.paused,
+    )

@@ -1,0 +1,341 @@
+"""Settings of the monitor: a TOML file, and environment variables over it.
+
+A field is overridden by an environment variable named after its place, with two underscores between the levels:
+``ROTORWATCH_HTTP__PORT=9090`` is ``port`` in ``[http]``. Lists and tables are written as JSON:
+``ROTORWATCH_MACHINES='[{"file": "lab", "bundle": "lab"}]'``.
+"""
+
+import os
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
+
+from models.errors import MachineFileError
+from models.machine import MachineFile, load_machine_file
+from models.mistakes import mistakes, read_toml
+from models.signals.link import LinkSettings
+from service.history.retention import Retention
+from service.settings.access import AccessSettings, check_access
+from service.settings.webhooks import WebhookSettings, repeated_name
+
+__all__ = [
+    "DEFAULT_LISTEN",
+    "HistorySettings",
+    "HttpSettings",
+    "LogSettings",
+    "MachineEntry",
+    "QueueSettings",
+    "RecordingSettings",
+    "ReplaySettings",
+    "ServiceSettings",
+    "check_distinct",
+    "load_settings",
+]
+
+DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
+
+_STRICT = ConfigDict(extra="forbid", frozen=True)
+_ENV_PREFIX = "ROTORWATCH_"
+
+
+class HttpSettings(BaseModel):
+    """Where the HTTP API is served, to how many at once, and how long it waits for them."""
+
+    model_config = _STRICT
+
+    host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on")
+    port: int = Field(default=8080, ge=0, le=65535, description="TCP port; 0 takes a free one, which is printed")
+    connections: int = Field(
+        default=300,
+        ge=1,
+        le=100_000,
+        description="most connections at once; never more than a third of the files that the process may open",
+    )
+    connections_per_address: int = Field(
+        default=100, ge=1, le=100_000, description="most connections of one address, proxies of [access] excepted"
+    )
+    head_timeout_s: float = Field(
+        default=10.0, ge=0.1, le=3600.0, description="longest time until the head of a request is there, in seconds"
+    )
+    body_timeout_s: float = Field(
+        default=60.0, ge=0.1, le=86_400.0, description="longest time until its body is there, in seconds"
+    )
+    send_timeout_s: float = Field(
+        default=60.0, ge=0.1, le=86_400.0, description="longest time in which nothing of an answer is taken, in seconds"
+    )
+
+
+class MachineEntry(BaseModel):
+    """One monitored machine."""
+
+    model_config = _STRICT
+
+    file: str = Field(min_length=1, description="shipped machine by name, or path relative to the settings file")
+    bundle: str | None = Field(
+        default=None,
+        min_length=1,
+        description="trained networks or what was commissioned: shipped bundle by name, or folder relative to the "
+        "settings file; a machine whose parameters are not known needs one, others are monitored without networks",
+    )
+
+    def load(self) -> MachineFile:
+        """Load the machine file.
+
+        Raises
+        ------
+        MachineFileError
+            Naming the file, the field and the value found.
+        """
+        return load_machine_file(self.file)
+
+
+class QueueSettings(BaseModel):
+    """Blocks of one machine that have arrived and are not evaluated yet.
+
+    With ``when_full = "drop"`` a monitor that cannot keep up loses blocks and counts them; the source is never slowed
+    down. With ``"wait"`` it slows the source down instead: right for batch runs, where a publisher sends recorded or
+    simulated data as fast as it can, wrong for a live machine, because everything else on the same link waits too.
+    """
+
+    model_config = _STRICT
+
+    blocks: int = Field(default=600, ge=1, le=1_000_000, description="most blocks that wait, per machine")
+    mb: float = Field(default=64.0, gt=0, le=100_000, description="most megabytes that wait, per machine")
+    when_full: Literal["drop", "wait"] = Field(default="drop", description="what happens to a block beyond that")
+
+
+class HistorySettings(BaseModel):
+    """Where reports, alarms and what a restart needs are kept, and for how long."""
+
+    model_config = _STRICT
+
+    url: str | None = Field(
+        default=None,
+        min_length=1,
+        description="database: sqlite:///FILE, relative to the settings file, or postgresql://USER:PASSWORD@HOST/NAME; "
+        "sqlite:///:memory: keeps nothing beyond the end of the program. Left out: history.sqlite in the user's state "
+        "folder",
+    )
+    retention: Retention = Field(default=Retention(), description="how long what is kept; alarms are kept for ever")
+
+    @property
+    def database(self) -> str:
+        """The URL, or the one that holds if it is left out."""
+        if self.url is not None:
+            return self.url
+        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "rotorwatch"
+        return f"sqlite:///{folder.absolute() / 'history.sqlite'}"
+
+    @property
+    def in_memory(self) -> bool:
+        """Whether no other program finds what is kept."""
+        return self.database.endswith(":memory:")
+
+
+class RecordingSettings(BaseModel):
+    """Where everything under the machines' keys is recorded, and what is kept; per machine, as far as sizes go.
+
+    Whole files are kept or dropped. A file that reaches into the time around an alarm falls under the limits for alarms
+    instead of the ordinary ones.
+    """
+
+    model_config = _STRICT
+
+    directory: str | None = Field(
+        default=None, min_length=1, description="where recordings go, relative to the settings file; off without it"
+    )
+    rotate_s: float = Field(default=300.0, ge=1.0, le=86_400.0, description="longest time in one file, in seconds")
+    rotate_mb: float = Field(default=256.0, ge=0.1, le=65_536.0, description="size at which a file is closed, in MB")
+    keep_gb: float = Field(default=20.0, gt=0.0, le=1e6, description="most that is kept without an alarm, in GB")
+    keep_days: float = Field(default=7.0, gt=0.0, le=36_500.0, description="how long it is kept, in days")
+    alarm_before_s: float = Field(
+        default=600.0, ge=0.0, le=86_400.0, description="time before an alarm event that is kept with it, in seconds"
+    )
+    alarm_after_s: float = Field(default=600.0, ge=0.0, le=86_400.0, description="time after it, in seconds")
+    alarm_keep_gb: float = Field(default=40.0, gt=0.0, le=1e6, description="most that is kept for alarms, in GB")
+    alarm_keep_days: float = Field(default=365.0, gt=0.0, le=36_500.0, description="how long it is kept, in days")
+    queue_mb: float = Field(
+        default=64.0, ge=0.1, le=16_384.0, description="most that waits in memory for the disk, in MB"
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.alarm_before_s > self.keep_days * 86_400.0:
+            raise ValueError(
+                f"alarm_before_s is {self.alarm_before_s:g}, longer than keep_days ({self.keep_days:g}): what came "
+                "before an alarm would be gone when it is raised"
+            )
+        if self.rotate_mb > 1000.0 * min(self.keep_gb, self.alarm_keep_gb):
+            raise ValueError(
+                f"rotate_mb is {self.rotate_mb:g}, more than keep_gb ({self.keep_gb:g}) or alarm_keep_gb "
+                f"({self.alarm_keep_gb:g}) allow in all: a file would be dropped as soon as it is closed"
+            )
+        return self
+
+
+class ReplaySettings(BaseModel):
+    """Replays of recordings that are started over HTTP; results are kept below the directory of the recordings."""
+
+    model_config = _STRICT
+
+    enabled: bool | None = Field(
+        default=None, description="whether they may be started; if left out, only if the HTTP API stays on loopback"
+    )
+    jobs: int = Field(default=1, ge=1, le=64, description="most that run at once")
+    nice: int = Field(default=10, ge=0, le=19, description="how far they give way to the monitor, 19 is most")
+    kept: int = Field(default=20, ge=1, le=10_000, description="latest replays whose results are kept")
+
+
+class LogSettings(BaseModel):
+    """What is logged to standard error, and how."""
+
+    model_config = _STRICT
+
+    level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="least serious level shown")
+    format: Literal["console", "json"] = Field(default="console", description="for people, or one JSON object a line")
+
+
+class ServiceSettings(BaseSettings):
+    """Everything the monitor can be told; without a file it watches the shipped machine ``lab``."""
+
+    model_config = SettingsConfigDict(
+        extra="forbid", frozen=True, env_prefix=_ENV_PREFIX, env_nested_delimiter="__", validate_default=True
+    )
+
+    link: LinkSettings = Field(
+        default=LinkSettings(listen=(DEFAULT_LISTEN,)),
+        description="Zenoh: role and endpoints; loopback only if left out",
+    )
+    http: HttpSettings = Field(default=HttpSettings(), description="HTTP API")
+    access: AccessSettings = Field(
+        default=AccessSettings(), description="who may use the HTTP API: holders of tokens, if left out"
+    )
+    machines: tuple[MachineEntry, ...] = Field(
+        default=(MachineEntry(file="lab", bundle="lab"),), min_length=1, description="machines to monitor"
+    )
+    queue: QueueSettings = Field(default=QueueSettings(), description="blocks that wait for evaluation")
+    history: HistorySettings = Field(default=HistorySettings(), description="reports, alarms, restarts")
+    recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
+    replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
+    webhooks: tuple[WebhookSettings, ...] = Field(default=(), description="who is told of alarm events")
+    log: LogSettings = Field(default=LogSettings(), description="log")
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Self:
+        if not self.link.listen and not self.link.connect:
+            raise ValueError("link has neither listen nor connect: no stream could reach the monitor")
+        if (name := repeated_name(self.webhooks)) is not None:
+            raise ValueError(f"webhooks: two are called {name}, expected different names")
+        return self
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Environment over file; the file's fields arrive as arguments of the constructor."""
+        _ = settings_cls, dotenv_settings, file_secret_settings
+        return env_settings, init_settings
+
+
+def load_settings(path: Path | None = None) -> ServiceSettings:
+    """Load the settings file, with the environment over it.
+
+    Parameters
+    ----------
+    path : Path, optional
+        TOML file; without one, the defaults.
+
+    Returns
+    -------
+    ServiceSettings
+        Paths of machine files and bundles are resolved against the folder of the settings file.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file or environment variable, the field and the value found, one fault per line.
+    """
+    fields = {} if path is None else read_toml(path)
+    place = Path("default settings") if path is None else path
+    try:
+        settings = ServiceSettings(**fields)  # type: ignore[arg-type]  # checked by pydantic, that is the point
+    except ValidationError as error:
+        found = mistakes(error, ServiceSettings, fields)
+        raise MachineFileError("\n".join(f"{_culprit(at, place)}: {text}" for at, text in found)) from error
+    except SettingsError as error:
+        name = str(error).partition('"')[2].partition('"')[0]
+        raise MachineFileError(
+            f"environment variable {_ENV_PREFIX}{name.upper()}: expected JSON, "
+            f"found {os.environ.get(_ENV_PREFIX + name.upper(), '')!r}"
+        ) from error
+    folder = Path() if path is None else path.parent
+    entries = tuple(_resolved(entry, folder) for entry in settings.machines)
+    history = settings.history
+    if history.url is not None:
+        history = history.model_copy(update={"url": _beside(folder, history.url)})
+    recording = settings.recording
+    if recording.directory is not None:
+        recording = recording.model_copy(update={"directory": str(folder / recording.directory)})
+    settings = settings.model_copy(
+        update={
+            "machines": entries,
+            "recording": recording,
+            "history": history,
+            "link": settings.link.beside(folder),
+            "access": settings.access.beside(folder),
+            "webhooks": tuple(webhook.beside(folder) for webhook in settings.webhooks),
+        }
+    )
+    check_distinct(place, settings)
+    check_access(str(place), settings.access, settings.http.host)
+    settings.link.check_reach(str(place))
+    return settings
+
+
+def _beside(folder: Path, url: str) -> str:
+    """The URL of an SQLite file with its path relative to a folder; any other URL as it is."""
+    scheme, separator, path = url.partition(":///")
+    if scheme != "sqlite" or not separator or path == ":memory:":
+        return url
+    return f"sqlite:///{folder.absolute() / path}"
+
+
+def _culprit(at: tuple[int | str, ...], place: Path) -> str:
+    """The file, or the environment variable that is to be changed instead."""
+    parts = [str(part).upper() for part in at]
+    names = (_ENV_PREFIX + "__".join(parts[:depth]) for depth in range(len(parts), 0, -1))
+    culprit = next((name for name in names if name in os.environ), None)
+    return str(place) if culprit is None else f"environment variable {culprit}"
+
+
+def _resolved(entry: MachineEntry, folder: Path) -> MachineEntry:
+    def beside(name: str) -> str:
+        path = folder / name
+        return str(path) if path.exists() else name
+
+    # A machine file is known by its suffix; a bundle is a folder, so a name that is no folder is a shipped one.
+    file = str(folder / entry.file) if entry.file.endswith(".toml") else entry.file
+    return MachineEntry(file=file, bundle=None if entry.bundle is None else beside(entry.bundle))
+
+
+def check_distinct(place: Path, settings: ServiceSettings) -> None:
+    """Load every machine file and check that no two describe the same machine.
+
+    Raises
+    ------
+    MachineFileError
+        If one cannot be used, or two have the same site and name.
+    """
+    seen: dict[str, str] = {}
+    for entry in settings.machines:
+        root = entry.load().keys.root
+        if root in seen:
+            raise MachineFileError(f"{place}: machines: {seen[root]} and {entry.file} both describe {root}")
+        seen[root] = entry.file

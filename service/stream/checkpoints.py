@@ -1,0 +1,222 @@
+"""What of a monitor goes into the history with every hop, and how a monitor comes back from it."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+from models.errors import CheckpointError
+from rotorwatch import __version__
+from service.history.errors import StoreError
+from service.history.machine import MachineStore
+from service.history.records import (
+    Checkpoint,
+    CheckpointHead,
+    CheckpointStep,
+    Step,
+    StoredEvent,
+    StoredReading,
+    StoredReport,
+)
+from service.monitor.alarm_conversion import Identity, alarm_cloud_event, finite, rfc3339
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
+from service.monitor.alarms.book import NO_ALARMS
+from service.monitor.conversion import report as report_json
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import MonitorState, WindowReport
+
+__all__ = ["FORMAT", "StepWriter", "checkpoint_step", "restored", "stored_event", "stored_readings", "stored_report"]
+
+FORMAT = 1
+"""Goes up when what a monitor remembers changes its form."""
+
+
+def stored_report(identity: Identity, window: WindowReport) -> StoredReport:
+    """A window report as it is published."""
+    text = report_json(identity, window).model_dump_json()
+    return StoredReport(window.start_ns, window.end_ns, window.state.value, window.filled, text)
+
+
+def stored_readings(windows: Iterable[WindowReport]) -> tuple[StoredReading, ...]:
+    """Parameters, residuals of the equations, misfit and speed of each window, as points in time."""
+    found = []
+    for window in windows:
+        points: list[tuple[str, str, float | None, float | None]] = [
+            ("misfit", "misfit", window.misfit_z, None),
+            ("speed", "speed", window.speed_rad_s, None),
+        ]
+        points += [("parameter", one.name, one.change, one.standard_error) for one in window.parameters]
+        points += [("equation", one.equation, one.msd, None) for one in window.equations]
+        found += [
+            StoredReading(window.end_ns, quantity, name, value, finite(error))
+            for quantity, name, value, error in points
+            if finite(value) is not None and value is not None
+        ]
+    return tuple(found)
+
+
+def stored_event(identity: Identity, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
+    """An alarm event as it is published."""
+    said = alarm_cloud_event(identity, event)
+    return StoredEvent(
+        sequence=event.sequence,
+        id=said.id,
+        time_ns=event.time_ns,
+        recorded_ns=recorded_ns,
+        kind=event.kind.value,
+        alarm=event.alarm.name,
+        severity=event.alarm.severity.value,
+        state=event.alarm.state.value,
+        occurrence=event.alarm.occurrence,
+        actor=event.actor,
+        text=said.model_dump_json(),
+    )
+
+
+class StepWriter:
+    """Commits what one machine's monitor says, and what it remembers afterwards, in one step.
+
+    Alarm events come first: whatever else cannot be put into words, remembered or written, they go into the log and out
+    to operators. What the log refuses is tried again with the next step: it takes no event that comes after a missing
+    one.
+
+    Parameters
+    ----------
+    history : MachineStore
+    identity : Identity
+
+    Attributes
+    ----------
+    refused : Exception or None
+        Why the latest step is not in the history as a whole; None if it is, or waits to be.
+    """
+
+    def __init__(self, history: MachineStore, identity: Identity) -> None:
+        self._history = history
+        self._identity = identity
+        self._owed: tuple[AlarmEvent, ...] = ()
+        self._kept: tuple[int, ...] = ()
+        self._generation = 0
+        self.refused: Exception | None = None
+
+    def keeps(self, hops: tuple[int, ...]) -> None:
+        """Take note of the hops that are in the history already."""
+        self._kept = hops
+
+    def begun_anew(self) -> str:
+        """Why the history has to be given everything again; empty if it has not."""
+        return "" if self._generation == self._history.generation else self._history.news
+
+    def owe(self, events: tuple[AlarmEvent, ...]) -> None:
+        """Take note of events that go into the next step."""
+        self._owed += events
+
+    def commit(
+        self, monitor: MachineMonitor, windows: tuple[WindowReport, ...], recorded_ns: int
+    ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
+        """Commit windows, the events that are owed, and the state of the monitor; raises nothing.
+
+        Returns
+        -------
+        tuple
+            Reports and events as they are to be published, and whether all of it is in the database now.
+        """
+        self.refused = None
+        if (generation := self._history.generation) != self._generation:
+            self._kept, self._generation = (), generation
+        reports: tuple[StoredReport, ...] = ()
+        told = tuple(self._told(event, recorded_ns) for event in self._owed)
+        try:
+            reports = tuple(stored_report(self._identity, window) for window in windows)
+            state = monitor.state(self._kept)
+            checkpoint = checkpoint_step(self._identity, state, recorded_ns)
+            written = self._history.commit(Step(reports, stored_readings(windows), told, checkpoint))
+        except Exception as error:  # whatever it is, no alarm may be lost to it
+            self.refused, self._kept = error, ()
+            self._commit_events(told)
+            return reports, told, False
+        self._kept, self._owed = state.hops, ()
+        return reports, told, written
+
+    def _told(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
+        """An event as it is published; one that cannot be put into words is told without its particulars."""
+        try:
+            return stored_event(self._identity, event, recorded_ns)
+        except Exception as error:
+            self.refused = error
+            was = event.alarm
+            bare = Alarm(was.name, was.state, was.present, was.severity, was.since_ns, was.raised_ns, was.occurrence)
+            return stored_event(self._identity, replace(event, alarm=bare), recorded_ns)
+
+    def _commit_events(self, told: tuple[StoredEvent, ...]) -> None:
+        """Bring the events alone into the log; a restart goes on from an older state, with the log's own numbers."""
+        try:
+            if told:
+                self._history.commit(Step(events=told))
+        except StoreError:
+            return  # said already
+        self._owed = ()
+
+
+def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -> CheckpointStep:
+    """What a monitor remembers, for the history."""
+    head = CheckpointHead(
+        format=FORMAT,
+        bundle=identity.bundle,
+        machine_hash=identity.machine_hash,
+        code_version=__version__,
+        end_ns=state.end_ns or 0,
+        recorded_ns=recorded_ns,
+        alarms=state.alarms,
+        state=state.state,
+    )
+    return CheckpointStep(head, state.new_hops, state.hops)
+
+
+def restored(
+    build: Callable[[], MachineMonitor], identity: Identity, checkpoint: Checkpoint, next_sequence: int
+) -> tuple[MachineMonitor, str]:
+    """A monitor that goes on from what was remembered, as far as that fits.
+
+    Alarms are restored whatever else differs; windows and tests only if the files and the program are the same.
+
+    Parameters
+    ----------
+    build : callable
+        Gives a new monitor.
+    identity : Identity
+        Of the machine, as it is now.
+    checkpoint : Checkpoint
+        From the history.
+    next_sequence : int
+        Number of the next alarm event, by the log.
+
+    Returns
+    -------
+    MachineMonitor, str
+        The monitor, and what became of the past, in a sentence.
+    """
+    head, monitor = checkpoint.head, build()
+    at = rfc3339(head.end_ns) if head.end_ns else "the beginning, before any data"
+    differs = _differences(head, identity)
+    if not differs:
+        try:
+            monitor.restore(head.state, tuple(data for _, data in checkpoint.hops))
+        except CheckpointError as error:
+            monitor, differs = build(), [str(error)]
+    try:
+        monitor.restore_alarms(head.alarms, next_sequence, head.end_ns or None)
+    except CheckpointError as error:
+        monitor.restore_alarms(NO_ALARMS, next_sequence)
+        return monitor, f"all alarms begin anew: {error}"
+    if differs:
+        return monitor, f"alarms are as they were at {at}; the window fills anew: {'; '.join(differs)}"
+    return monitor, f"went on where it stood at {at}"
+
+
+def _differences(head: CheckpointHead, identity: Identity) -> Sequence[str]:
+    pairs = {
+        "form of what is remembered": (head.format, FORMAT),
+        "machine file": (head.machine_hash, identity.machine_hash),
+        "bundle": (head.bundle, identity.bundle),
+        "program version": (head.code_version, __version__),
+    }
+    return [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]

@@ -1,0 +1,57 @@
+"""Whether a machine's thread still comes round."""
+
+import time
+from collections.abc import Callable
+
+__all__ = ["STUCK_S", "Pulse"]
+
+STUCK_S = 60.0
+"""A thread that is at work on one block for longer is stuck; an evaluation takes a fraction of a second."""
+
+
+class Pulse:
+    """Measures how long a thread has been at work on the same thing, without its help.
+
+    What is called goes before every block that waits, so that only the present one can hold it up.
+
+    Parameters
+    ----------
+    call : callable
+        Has a function called by the thread; False if it never will be. `service.stream.inbox.Inbox.call` is one.
+    clock : callable
+        Monotonic seconds.
+
+    Examples
+    --------
+    >>> waiting, now_s = [], 5.0
+    >>> pulse = Pulse(lambda function: not waiting.append(function), lambda: now_s)
+    >>> pulse.beat()
+    >>> now_s = 75.0
+    >>> pulse.beat()
+    >>> pulse.busy_s
+    70.0
+    >>> waiting.pop()()
+    >>> pulse.busy_s
+    0.0
+    """
+
+    def __init__(self, call: Callable[[Callable[[], None]], bool], clock: Callable[[], float] = time.monotonic) -> None:
+        self._call = call
+        self._clock = clock
+        self._sent_s: float | None = None
+
+    @property
+    def busy_s(self) -> float:
+        """How long the thread has not answered; 0 if it has."""
+        sent_s = self._sent_s
+        return 0.0 if sent_s is None else self._clock() - sent_s
+
+    def beat(self) -> None:
+        """Ask for a sign of life, unless one is owed already; called every now and then."""
+        if self._sent_s is None:
+            self._sent_s = self._clock()
+            if not self._call(self._answered):
+                self._sent_s = None
+
+    def _answered(self) -> None:
+        self._sent_s = None

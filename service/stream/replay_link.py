@@ -1,0 +1,351 @@
+"""Publishes replayed messages over Zenoh, apart from what is live.
+
+Under a prefix, which is a namespace to those who listen, nobody who watches the live machine can hear them. On the
+original keys a replay is refused as long as a publisher or a monitor of the machine is alive, and stops when one
+appears.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import Protocol
+
+import zenoh
+import zenoh.ext
+
+from models.errors import RotorwatchError
+from models.signals.keys import MachineKeys
+from models.signals.link import LinkSettings
+from models.signals.recording import RecordedMessage
+from models.signals.wire import REPLAY_MARK
+from rotorwatch.records.replays import ReplayProgress
+from service.recordings.replay.control import Control
+from service.recordings.replay.player import PlayPlan, play
+from service.recordings.replay.source import RecordingSource
+from service.stream.transport import Link
+
+__all__ = ["LiveMachineError", "NetworkPlan", "ReplayLink", "ReplayTarget", "replay_to_network"]
+
+_JSON = "application/json"
+_CACHE_STREAM = 300
+_CACHE_OTHER = 100
+_HEARTBEAT_S = 0.5
+_POLL_S = 0.02
+_DRAIN_S = 60.0
+_BLOCKED_US = 20_000_000
+_LIVENESS_TIMEOUT_S = 2.0
+
+_Publisher = zenoh.Publisher | zenoh.ext.AdvancedPublisher
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkPlan:
+    """How recordings are replayed onto the network.
+
+    Attributes
+    ----------
+    link : LinkSettings
+        Endpoints.
+    machines : tuple of MachineKeys
+        Machines to replay.
+    everything : bool
+        Every recorded key, not only what a machine sends: stream, descriptor and truth.
+    prefix : str
+        What goes before every key; with several passes, the number of the pass comes after it.
+    pace : float or None
+        Seconds of data per second; None is as fast as subscribers take it.
+    passes : int or None
+        Repetitions; None is without end.
+    from_ns, to_ns : int
+        Times of the data.
+    wait_for_subscriber_s : float
+        Hold the first message of a pass back at most this long.
+    linger_s : float
+        How long a pass stays open after its last message, so that a subscriber can fetch what it missed.
+    """
+
+    link: LinkSettings
+    machines: tuple[MachineKeys, ...]
+    everything: bool
+    prefix: str
+    pace: float | None
+    passes: int | None
+    from_ns: int
+    to_ns: int
+    wait_for_subscriber_s: float = 0.0
+    linger_s: float = 2.0
+
+    def prefix_of(self, number: int) -> str:
+        """Prefix of a pass.
+
+        The blocks keep their own times, and a monitor refuses to hear the same hour twice: so each pass is, to those
+        who listen, another network.
+        """
+        return self.prefix if self.passes == 1 else f"{self.prefix}/{number}"
+
+
+class LiveMachineError(RotorwatchError):
+    """A replay on the original keys would meet a live machine; the message says which."""
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> object: ...
+
+
+class _PatientLink(LinkSettings):
+    """By default Zenoh closes the connection to a subscriber that makes the sender wait for five seconds."""
+
+    def zenoh_items(self) -> dict[str, str]:
+        items = super().zenoh_items()
+        items["transport/link/tx/queue/congestion_control/block/wait_before_close"] = str(_BLOCKED_US)
+        return items
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayTarget:
+    """Where a replay goes.
+
+    Attributes
+    ----------
+    machines : sequence of (MachineKeys, bytes or None)
+        Machines whose messages are replayed, each with its recorded channel descriptor.
+    prefix : str
+        What goes before every key; empty is the original keys.
+    wait : bool
+        Subscribers slow the replay down instead of missing messages.
+    """
+
+    machines: Sequence[tuple[MachineKeys, bytes | None]]
+    prefix: str
+    wait: bool
+
+    def key(self, key: str) -> str:
+        """Key under the prefix."""
+        return f"{self.prefix}/{key}" if self.prefix else key
+
+
+class ReplayLink:
+    """A Zenoh session that publishes one pass of a replay after the other; a context manager.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Endpoints; gives up if nobody answers at those to connect to.
+    on_live : callable
+        Called with a sentence when a live publisher or monitor appears on the original keys, on a thread of Zenoh's.
+
+    Raises
+    ------
+    LinkError
+        If the session cannot be opened.
+    """
+
+    def __init__(self, settings: LinkSettings, on_live: Callable[[str], None]) -> None:
+        self._link = Link(_PatientLink.model_validate(settings.model_dump()), fail_fast=bool(settings.connect))
+        self._on_live = on_live
+        self._target: ReplayTarget | None = None
+        self._publishers: dict[str, _Publisher] = {}
+        self._lock = threading.Lock()
+        self._live = ""
+        self._undo = ExitStack()
+
+    def __enter__(self) -> "ReplayLink":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end_pass()
+        self._link.close()
+
+    def begin_pass(self, target: ReplayTarget) -> None:
+        """Declare what one pass needs, as a live publisher would.
+
+        Raises
+        ------
+        LiveMachineError
+            If the original keys are asked for and a live publisher or monitor of a machine is there.
+        """
+        session = self._link.session
+        self._target = target
+        if not target.prefix:
+            for keys, _ in target.machines:
+                self._keep(session.liveliness().declare_token(keys.replay_alive))
+            self._watch_for_live(target)
+        for keys, descriptor in target.machines:
+            self._publisher(keys.stream)
+            self._publisher(keys.descriptor)
+            if descriptor is not None:
+                key = target.key(keys.descriptor)
+                self._keep(session.declare_queryable(key, self._link.guarded(_answering(key, descriptor))))
+            if target.prefix:
+                # On the original keys there is no token: it would say that a live machine is there, and hide one.
+                self._keep(session.liveliness().declare_token(target.key(keys.publisher_alive)))
+
+    def end_pass(self) -> None:
+        """Undeclare it all."""
+        with self._lock:
+            self._publishers.clear()
+        self._undo.close()
+
+    def put(self, message: RecordedMessage) -> None:
+        """Publish a message as it was recorded: key below the prefix, payload, attachment and encoding.
+
+        On the original keys the encoding of a block says that it is replayed, so that no monitor takes it for the
+        machine's, whenever it comes.
+        """
+        with self._lock:
+            if self._live:
+                return
+        marked = not self._present().prefix and message.key.endswith("/stream")
+        encoding = message.encoding + REPLAY_MARK if marked else message.encoding
+        self._publisher(message.key).put(message.payload, attachment=message.attachment or None, encoding=encoding)
+
+    def wait_for_subscribers(self, timeout_s: float, stopped: Callable[[], bool]) -> bool:
+        """Wait until somebody subscribes to every machine's stream; say whether that came true."""
+        target = self._present()
+        deadline_s = time.monotonic() + timeout_s
+        for keys, _ in target.machines:
+            # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
+            probe = self._link.session.declare_publisher(target.key(keys.stream))
+            try:
+                while not probe.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
+                    if stopped() or time.monotonic() > deadline_s:
+                        return False
+                    time.sleep(_POLL_S)
+            finally:
+                probe.undeclare()  # type: ignore[no-untyped-call]
+        return True
+
+    def drain(self, timeout_s: float) -> None:
+        """Wait until monitors have received everything; without a monitor there is nothing to wait for.
+
+        A query of lower priority leaves after all messages, and a link is handled in order: its answer says that they
+        have arrived.
+        """
+        target = self._present()
+        for keys, _ in target.machines:
+            for _ in self._link.session.get(
+                target.key(keys.health), priority=zenoh.Priority.BACKGROUND, timeout=timeout_s
+            ):
+                pass
+
+    def _present(self) -> ReplayTarget:
+        if self._target is None:
+            raise RuntimeError("no pass was begun")
+        return self._target
+
+    def _keep(self, declared: _Declared) -> None:
+        self._undo.callback(declared.undeclare)
+
+    def _publisher(self, key: str) -> _Publisher:
+        known = self._publishers.get(key)
+        if known is not None:
+            return known
+        target, session = self._present(), self._link.session
+        congestion = zenoh.CongestionControl.BLOCK if target.wait else zenoh.CongestionControl.DROP
+        publisher: _Publisher
+        if target.prefix:
+            publisher = zenoh.ext.declare_advanced_publisher(
+                session,
+                target.key(key),
+                encoding=_JSON,
+                congestion_control=congestion,
+                priority=zenoh.Priority.DATA_LOW,  # what is live goes first
+                cache=zenoh.ext.CacheConfig(max_samples=_CACHE_STREAM if key.endswith("/stream") else _CACHE_OTHER),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None),
+                publisher_detection=True,
+            )
+        else:
+            # No cache: a monitor that starts later must not be able to fetch what was replayed.
+            publisher = session.declare_publisher(
+                key, encoding=_JSON, congestion_control=congestion, priority=zenoh.Priority.DATA_LOW
+            )
+        self._keep(publisher)
+        self._publishers[key] = publisher
+        return publisher
+
+    def _watch_for_live(self, target: ReplayTarget) -> None:
+        session = self._link.session
+        for keys, _ in target.machines:
+            for key, who in ((keys.publisher_alive, "publisher"), (keys.monitor_alive, "monitor")):
+                text = f"a live {who} of {keys.site}/{keys.machine} is there ({key})"
+                if any(reply.ok is not None for reply in session.liveliness().get(key, timeout=_LIVENESS_TIMEOUT_S)):
+                    raise LiveMachineError(f"{text}: replay under a prefix, or stop it first")
+                watch = session.liveliness().declare_subscriber(
+                    key, self._link.guarded(self._appeared(f"{text}: the replay on the original keys was stopped")),
+                    history=True,
+                )  # fmt: skip
+                self._keep(watch)
+
+    def _appeared(self, text: str) -> Callable[[zenoh.Sample], None]:
+        def take(sample: zenoh.Sample) -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                with self._lock:
+                    self._live = text
+                self._on_live(text)
+
+        return take
+
+
+def replay_to_network(
+    source: RecordingSource,
+    plan: NetworkPlan,
+    control: Control,
+    on_progress: Callable[[ReplayProgress], None] | None = None,
+) -> int:
+    """Publish recordings until the end of the last pass, or until `control` says stop.
+
+    Returns
+    -------
+    int
+        Number of messages published.
+
+    Raises
+    ------
+    LinkError
+        If there is no session.
+    LiveMachineError
+        If a live publisher or monitor is, or appears, on the original keys.
+    RecordingError
+        Where a recording is damaged.
+    """
+    count, number = 0, 0
+    with ReplayLink(plan.link, control.stop) as link:
+        while not control.stopped and (plan.passes is None or number < plan.passes):
+            number += 1
+            described = [(keys, source.descriptor(keys, plan.from_ns)) for keys in plan.machines]
+            target = ReplayTarget(
+                machines=[(keys, None if found is None else found.payload) for keys, found in described],
+                prefix=plan.prefix_of(number),
+                wait=plan.pace is None,
+            )
+            link.begin_pass(target)
+            if plan.wait_for_subscriber_s:
+                link.wait_for_subscribers(plan.wait_for_subscriber_s, lambda: control.stopped)
+            for keys, found in described:
+                if found is not None and source.span(keys).start_ns < plan.from_ns:  # else it comes in its place
+                    link.put(found)
+            wanted = None if plan.everything else _sent_by(plan.machines)
+            stretch = PlayPlan(wanted, plan.pace, plan.from_ns, plan.to_ns, number)
+            count += play(source, link, stretch, control, on_progress)
+            if not control.stopped:
+                if plan.pace is None:
+                    link.drain(_DRAIN_S)
+                control.wait_until(control.now_s() + plan.linger_s)
+            link.end_pass()
+    if control.reason:
+        raise LiveMachineError(control.reason)
+    return count
+
+
+def _sent_by(machines: Sequence[MachineKeys]) -> frozenset[str]:
+    return frozenset(key for keys in machines for key in (keys.stream, keys.descriptor, keys.truth))
+
+
+def _answering(key: str, answer: bytes) -> Callable[[zenoh.Query], None]:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, answer, encoding=_JSON)
+
+    return reply

@@ -1,0 +1,489 @@
+"""The service's side of Zenoh; the only module of the service that imports it.
+
+::
+
+    stream ------------> on_block          descriptor, publisher_alive ---> on_descriptor, on_publisher
+    report <------------ publish_report            (dropped under congestion)
+    alarm/event <------- publish_alarm_event       (waits under congestion, the latest are kept for late joiners;
+                                                   the whole log is there by query)
+    alarm/state, health <- publish_...             (latest kept; also answered by query)
+
+Callbacks run on Zenoh's threads. An exception in one is logged and counted here, because Zenoh would only print it.
+"""
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import Protocol, TypeVar
+
+import zenoh
+import zenoh.ext
+
+from models.errors import RotorwatchError
+from models.signals.keys import PREFIX, MachineKeys
+from models.signals.link import LinkSettings
+from models.signals.recording import RecordedMessage
+from models.signals.wire import REPLAY_MARK
+from service.stream.inbox import RawBlock
+from service.stream.log_query import read_log_query
+from service.terminal.logs import logger
+
+__all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap", "TopicMessage", "follow", "route"]
+
+_JSON = "application/json"
+_CLOUD_EVENT = "application/cloudevents+json"
+_HEARTBEAT_S = 1.0
+_CACHED_BLOCKS = 300
+_CACHED_EVENTS = 200
+_QUERY_TIMEOUT_S = 10.0
+_QUICK_CONNECT_S = 3.0
+_CONNECT_S = 10.0
+_NEVER = timedelta(days=365)
+
+_T = TypeVar("_T")
+_log = logger(part="transport")
+
+
+class LinkError(RotorwatchError):
+    """No Zenoh session with these endpoints; the message names them."""
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> object: ...
+
+
+@dataclass(frozen=True, slots=True)
+class MachineCallbacks:
+    """What a machine's link calls, each on a thread of Zenoh's: be short.
+
+    Attributes
+    ----------
+    on_block : callable
+        Takes a message of the stream.
+    on_missed : callable
+        Takes the number of messages that were lost on the way and could not be fetched again.
+    on_descriptor : callable
+        Takes a channel descriptor (JSON) that a publisher announced.
+    on_publisher : callable
+        Takes whether a publisher is alive.
+    health, alarm_state : callable
+        Return the present answer (JSON) to a query.
+    alarm_events : callable
+        Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
+        time; what it raises is told to whoever asked.
+    on_replay : callable
+        Takes whether a replay is announced on the machine's own keys. Anybody may announce one, so the stream is handed
+        on all the same, but for blocks that say themselves that they are replayed.
+    """
+
+    on_block: Callable[[RawBlock], None]
+    on_missed: Callable[[int], None]
+    on_descriptor: Callable[[bytes], None]
+    on_publisher: Callable[[bool], None]
+    health: Callable[[], str]
+    alarm_state: Callable[[], str]
+    alarm_events: Callable[[int, int], str]
+    on_replay: Callable[[bool], None] = lambda _: None
+
+
+@dataclass(frozen=True, slots=True)
+class TopicMessage:
+    """A message a client received: its key and its JSON text."""
+
+    key: str
+    text: str
+
+
+class Link:
+    """A Zenoh session.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Role and endpoints.
+    fail_fast : bool
+        Give up when no endpoint in `connect` answers within three seconds. Otherwise a client tries for ten, and a
+        peer for ever, in the background.
+
+    Raises
+    ------
+    LinkError
+        If an endpoint is malformed, cannot be listened on, or does not answer in time.
+    """
+
+    def __init__(self, settings: LinkSettings, *, fail_fast: bool = False) -> None:
+        self._errors = 0
+        config = zenoh.Config()
+        items = settings.zenoh_items()
+        if fail_fast or settings.mode == "client":
+            timeout_s = _QUICK_CONNECT_S if fail_fast else _CONNECT_S
+            items["connect/timeout_ms"] = json.dumps(round(timeout_s * 1000))
+            items["connect/exit_on_failure"] = "true"
+        try:
+            for path, value in items.items():
+                config.insert_json5(path, value)
+            self.session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise LinkError(_explain(settings, str(error))) from error
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the session is open."""
+        return not self.session.is_closed()
+
+    @property
+    def errors(self) -> int:
+        """Exceptions in callbacks so far."""
+        return self._errors
+
+    def guarded(self, callback: Callable[[_T], None]) -> Callable[[_T], None]:
+        """Wrap a callback so that its exceptions are logged and counted."""
+
+        def call(argument: _T) -> None:
+            try:
+                callback(argument)
+            except Exception:  # the last frame of ours: Zenoh prints what escapes, and log and count would miss it
+                self._errors += 1
+                _log.exception("error in a callback")
+
+        return call
+
+    def close(self) -> None:
+        """Close the session."""
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+class MachineLink:
+    """Everything declared for one machine.
+
+    Parameters
+    ----------
+    link : Link
+        Open session; must outlive this object.
+    keys : MachineKeys
+        The machine's keys.
+    callbacks : MachineCallbacks
+        Where messages go.
+    wait_when_full : bool
+        `on_block` may wait, which slows the publisher down. It then runs on the network's own thread, and heartbeats of
+        the publisher are not listened to: one that overtakes waiting blocks would make Zenoh skip them.
+    """
+
+    def __init__(self, link: Link, keys: MachineKeys, callbacks: MachineCallbacks, *, wait_when_full: bool) -> None:
+        self._link = link
+        self._keys = keys
+        self._callbacks = callbacks
+        self._lock = threading.Lock()
+        self._closed = False
+        with ExitStack() as undo:
+            self._declare(link.session, undo, wait_when_full)
+            self._undeclare = undo.pop_all()
+
+    def _declare(self, session: zenoh.Session, undo: ExitStack, wait_when_full: bool) -> None:
+        keys, guarded = self._keys, self._link.guarded
+
+        def keep(declared: _Declared) -> None:
+            undo.callback(declared.undeclare)
+
+        self._report = session.declare_publisher(
+            keys.report, encoding=_JSON, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._event = _advanced_publisher(session, keys.alarm_event, _CLOUD_EVENT, _CACHED_EVENTS)
+        self._state = _advanced_publisher(session, keys.alarm_state, _JSON, 1)
+        self._health = _advanced_publisher(session, keys.health, _JSON, 1)
+        for publisher in (self._report, self._event, self._state, self._health):
+            keep(publisher)
+        for key, answer in ((keys.alarm_state, self._callbacks.alarm_state), (keys.health, self._callbacks.health)):
+            keep(session.declare_queryable(key, guarded(_answering(key, answer))))
+        log = _answering_from_log(keys.alarm_event, self._callbacks.alarm_events)
+        # A thread of its own, because it waits for the database: the others, and Zenoh, go on.
+        keep(session.declare_queryable(keys.alarm_event, zenoh.handlers.Callback(guarded(log), indirect=True)))
+        keep(session.liveliness().declare_subscriber(keys.replay_alive, guarded(self._take_replay), history=True))
+        # Descriptor and liveliness before the stream: they say what the stream should look like.
+        keep(
+            zenoh.ext.declare_advanced_subscriber(
+                session,
+                keys.descriptor,
+                guarded(self._take_descriptor),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1),
+            )
+        )
+        keep(session.liveliness().declare_subscriber(keys.publisher_alive, guarded(self._take_alive), history=True))
+        stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=wait_when_full)
+        keep(stream)
+        keep(stream.sample_miss_listener(guarded(self._take_miss)))
+        keep(session.liveliness().declare_token(keys.monitor_alive))
+
+    def publish_report(self, text: str) -> None:
+        """Publish a window report."""
+        self._put(self._report, text)
+
+    def publish_alarm_event(self, text: str) -> None:
+        """Publish an alarm event; waits if the network is congested."""
+        self._put(self._event, text)
+
+    def publish_alarm_state(self, text: str) -> None:
+        """Publish the alarms as they are now."""
+        self._put(self._state, text)
+
+    def publish_health(self, text: str) -> None:
+        """Publish the health as it is now."""
+        self._put(self._health, text)
+
+    def close(self) -> None:
+        """Undeclare everything; what is published afterwards is ignored."""
+        with self._lock:
+            self._closed = True
+        self._undeclare.close()
+
+    def _put(self, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher, text: str) -> None:
+        with self._lock:
+            if not self._closed:
+                publisher.put(text)
+
+    def _take_replay(self, sample: zenoh.Sample) -> None:
+        self._callbacks.on_replay(sample.kind == zenoh.SampleKind.PUT)
+
+    def _take_block(self, sample: zenoh.Sample) -> None:
+        encoding = str(sample.encoding)
+        if sample.kind == zenoh.SampleKind.PUT and not encoding.endswith(REPLAY_MARK):
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            self._callbacks.on_block(RawBlock(sample.payload.to_bytes(), attachment, encoding, _source(sample)))
+
+    def _take_miss(self, miss: zenoh.ext.Miss) -> None:
+        self._callbacks.on_missed(miss.nb)
+
+    def _take_descriptor(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._callbacks.on_descriptor(sample.payload.to_bytes())
+
+    def _take_alive(self, sample: zenoh.Sample) -> None:
+        alive = sample.kind == zenoh.SampleKind.PUT
+        self._callbacks.on_publisher(alive)
+        if alive:
+            # Publishers without a cache answer only queries.
+            self._link.session.get(
+                self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S
+            )
+
+    def _take_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._callbacks.on_descriptor(reply.ok.payload.to_bytes())
+
+
+class MachineTap:
+    """Hands on every message under a machine's keys as it is, whoever published it, this program included.
+
+    Parameters
+    ----------
+    link : Link
+        Open session; must outlive this object.
+    keys : MachineKeys
+        The machine's keys.
+    on_message : callable
+        Takes each message on a thread of Zenoh's: be short. Descriptors also come as answers to a query, at the start
+        and whenever a publisher appears, so that one announced earlier is known.
+    """
+
+    def __init__(self, link: Link, keys: MachineKeys, on_message: Callable[[RecordedMessage], None]) -> None:
+        self._link = link
+        self._keys = keys
+        self._on_message = on_message
+        session, guarded = link.session, link.guarded
+        with ExitStack() as undo:
+            undo.callback(session.declare_subscriber(f"{keys.root}/**", guarded(self._take)).undeclare)
+            # The stream as the monitor takes it: blocks that were lost on the way are fetched again.
+            stream = _stream_subscriber(session, keys.stream, guarded(self._take_block), wait=False)
+            undo.callback(stream.undeclare)
+            alive = session.liveliness().declare_subscriber(
+                keys.publisher_alive, guarded(self._take_alive), history=True
+            )
+            undo.callback(alive.undeclare)
+            self._undeclare = undo.pop_all()
+        self._ask()
+
+    def close(self) -> None:
+        """Undeclare the subscriptions."""
+        self._undeclare.close()
+
+    def _ask(self) -> None:
+        self._link.session.get(self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S)
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr) != self._keys.stream:
+            self._on_message(_verbatim(sample))
+
+    def _take_block(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._on_message(_verbatim(sample))
+
+    def _take_alive(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._ask()
+
+    def _take_reply(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._on_message(_verbatim(reply.ok))
+
+
+@contextmanager
+def follow(
+    settings: LinkSettings, machines: str, topics: tuple[str, ...], callback: Callable[[TopicMessage], None]
+) -> Iterator[Callable[[], bool]]:
+    """Follow what monitors publish, as a client.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Where to connect; fails fast.
+    machines : str
+        ``<site>/<machine>``, where ``*`` stands for any.
+    topics : tuple of str
+        Fields of `MachineKeys`, such as ``report`` or ``alarm_event``.
+    callback : callable
+        Takes each message on a thread of Zenoh's. Latest health and alarm state come at once; events and reports from
+        now on.
+
+    Yields
+    ------
+    callable
+        Whether the session is still open and connected to anybody.
+
+    Raises
+    ------
+    LinkError
+        If nobody answers at the endpoints.
+    """
+    site, _, machine = machines.partition("/")
+    suffixes = {name: getattr(MachineKeys("s", "m"), name).removeprefix(f"{PREFIX}/s/m/") for name in topics}
+    link = Link(settings, fail_fast=True)
+    try:
+        with ExitStack() as undo:
+            for name, suffix in suffixes.items():
+                current = name in {"health", "alarm_state"}
+
+                def take(sample: zenoh.Sample) -> None:
+                    callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
+
+                subscriber = zenoh.ext.declare_advanced_subscriber(
+                    link.session,
+                    f"{PREFIX}/{site}/{machine}/{suffix}",
+                    link.guarded(take),
+                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1) if current else None,
+                    recovery=None
+                    if name == "report"
+                    else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+                )
+                undo.callback(subscriber.undeclare)
+            yield lambda: link.is_open and bool(link.session.info.peers_zid() or link.session.info.routers_zid())
+    finally:
+        link.close()
+
+
+@contextmanager
+def route(settings: LinkSettings) -> Iterator[None]:
+    """Run a Zenoh router, whatever the role in the settings.
+
+    Raises
+    ------
+    LinkError
+        If it cannot listen.
+    """
+    link = Link(settings.model_copy(update={"mode": "router"}))
+    try:
+        yield
+    finally:
+        link.close()
+
+
+def _source(sample: zenoh.Sample) -> str:
+    """The publisher's session and its number there; empty if it numbers nothing."""
+    info = sample.source_info
+    return "" if info is None else f"{info.source_id.zid}/{info.source_id.eid}"
+
+
+def _verbatim(sample: zenoh.Sample) -> RecordedMessage:
+    """A sample with the time at which it arrived, and that of its publication if it carries one."""
+    log_time_ns = time.time_ns()
+    publish_time_ns = log_time_ns
+    if sample.timestamp is not None:
+        publish_time_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
+    attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+    return RecordedMessage(
+        str(sample.key_expr),
+        sample.payload.to_bytes(),
+        attachment,
+        str(sample.encoding),
+        log_time_ns,
+        publish_time_ns,
+    )
+
+
+def _advanced_publisher(session: zenoh.Session, key: str, encoding: str, cache: int) -> zenoh.ext.AdvancedPublisher:
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        encoding=encoding,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        cache=zenoh.ext.CacheConfig(max_samples=cache),
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+        publisher_detection=True,
+    )
+
+
+def _stream_subscriber(
+    session: zenoh.Session, key: str, callback: Callable[[zenoh.Sample], None], *, wait: bool
+) -> zenoh.ext.AdvancedSubscriber[None]:
+    """Subscribe to sample blocks: those of a publisher's cache first, those lost on the way fetched again.
+
+    With `wait` the callback may hold up the network's own thread, and no heartbeat is listened to. But what is missing
+    is fetched there as well: where blocks of the cache and new ones meet, a new one may overtake.
+    """
+    # The period is of no use but to have missing blocks fetched at all, without heartbeats.
+    fetched = zenoh.ext.RecoveryConfig(
+        periodic_queries=_NEVER if wait else None,  # type: ignore[arg-type]  # the stub says seconds
+        heartbeat=None if wait else True,
+    )
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        key,
+        zenoh.handlers.Callback(callback, indirect=not wait),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=_CACHED_BLOCKS),
+        recovery=fetched,
+        subscriber_detection=True,
+    )
+
+
+def _answering(key: str, answer: Callable[[], str]) -> Callable[[zenoh.Query], None]:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, answer(), encoding=_JSON)
+
+    return reply
+
+
+def _answering_from_log(key: str, answer: Callable[[int, int], str]) -> Callable[[zenoh.Query], None]:
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            try:
+                text = answer(*read_log_query(str(query.selector.parameters)))
+            except RotorwatchError as error:
+                query.reply_err(json.dumps({"error": f"{key}: {error}"}), encoding=_JSON)
+            else:
+                query.reply(key, text, encoding=_JSON)
+
+    return reply
+
+
+def _explain(settings: LinkSettings, error: str) -> str:
+    """Say which endpoints, and Zenoh's reason without the places in its source code."""
+    ends = [
+        f"{what} {', '.join(where)}"
+        for what, where in (("listen", settings.listen), ("connect", settings.connect))
+        if where
+    ]
+    return f"Zenoh session ({settings.mode}, {'; '.join(ends)}) could not be opened: {settings.explain(error)}"

@@ -1,0 +1,494 @@
+"""One machine's thread: takes blocks out of the inbox, steps the monitor, hands on what comes out.
+
+What a block brought and what the monitor remembers afterwards are committed to the history in one step; only then is
+anything published.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from models.commissioning.installed import Installed
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Health, StreamStatus
+from rotorwatch.records.machines import DetectableChanges, MachineDescription
+from service.analysis.snapshots.desk import LatestData, SnapshotDesk
+from service.history.machine import MachineStore
+from service.history.records import StoredEvent, StoredReport
+from service.monitor import conversion
+from service.monitor.alarm_conversion import Identity, alarm_log_page, alarm_states
+from service.monitor.alarms.alarm import AlarmEvent
+from service.monitor.alarms.book import NO_ALARMS
+from service.monitor.alarms.operation import NotInTime, Operation
+from service.monitor.descriptor import descriptor_mismatch
+from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import MachineHealth, MonitorReport, Tally, WindowReport
+from service.settings.service import QueueSettings
+from service.stream.checkpoints import StepWriter, restored
+from service.stream.inbox import Inbox, RawBlock
+from service.terminal.logs import Limiter, logger
+
+__all__ = ["Clocks", "MachineWorker", "Outlet"]
+
+_OPERATION_S = 10.0
+_HELD_UP_S = 2.0
+"""Time passes in steps of a fraction of this; if not, the program itself stood still."""
+_LATEST = 100
+_LONGEST_ERROR = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """The computer's clocks; a test puts others in.
+
+    Attributes
+    ----------
+    monotonic_s : callable
+        Seconds that only pass.
+    utc_ns : callable
+        Time of day.
+    """
+
+    monotonic_s: Callable[[], float] = time.monotonic
+    utc_ns: Callable[[], int] = time.time_ns
+
+
+class Outlet(Protocol):
+    """Where a worker publishes; `service.stream.transport.MachineLink` is one."""
+
+    def publish_report(self, text: str) -> None:
+        """Publish a window report."""
+
+    def publish_alarm_event(self, text: str) -> None:
+        """Publish an alarm event."""
+
+    def publish_alarm_state(self, text: str) -> None:
+        """Publish the alarms as they are now."""
+
+
+class MachineWorker:
+    """Monitors one machine in a thread of its own.
+
+    The monitor belongs to the thread. What others may see is an immutable snapshot that the thread replaces after every
+    block, and the history, which has its own lock.
+
+    Parameters
+    ----------
+    installed : Installed
+        The machine file, and what was trained and commissioned for it.
+    queue : QueueSettings
+    history : MachineStore
+        Where everything is kept; what is there from an earlier run is gone on from.
+    clocks : Clocks
+        Say how old the latest data are and when things were recorded, nothing else.
+    on_events : callable
+        Called after alarm events were committed.
+    """
+
+    def __init__(
+        self,
+        installed: Installed,
+        queue: QueueSettings,
+        history: MachineStore,
+        clocks: Clocks = Clocks(),  # immutable
+        on_events: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.machine = machine = installed.machine
+        self.inbox = Inbox(
+            queue.blocks,
+            queue.when_full,
+            round(queue.mb * 1e6),
+            lambda one: self._monitor.could_use(one.payload, one.attachment, one.encoding),
+        )
+        self.history = history
+        self.identity = Identity(
+            site=machine.site,
+            machine=machine.name,
+            bundle=installed.identity,
+            machine_hash=conversion.machine_hash(machine),
+        )
+        self.snapshots = SnapshotDesk(installed, self.identity)
+        self.latest = LatestData()
+        self.errors = 0
+        self.last_error = ""
+        self.tally = Tally()
+        self._clocks = clocks
+        self._on_events = on_events
+        self._log = logger(machine=f"{machine.site}/{machine.name}")
+        self._limiter = Limiter(clocks.monotonic_s)
+        self.steps = StepWriter(history, self.identity)
+        self._unpublished: tuple[StoredEvent, ...] = ()
+        self._asleep_s = 0.0
+        self._unevaluated_s = 0.0
+        self._monitor, self.restart = self._restored(installed)
+        self._snapshot: MachineHealth = self._monitor.health()
+        self._begin_s = clocks.monotonic_s()
+        self._latest_data_s: float | None = None
+        self._operated_ns = 0
+        self._told = self._monitor.next_sequence
+        self._ticked_s = self._held_up_s = clocks.monotonic_s()
+        self._missed = 0
+        self._publisher_alive = self._replay_announced = False
+        self._mismatch: tuple[str, ...] = ()
+        self._outlet: Outlet | None = None
+        self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
+        self._dropped_logged = 0
+        self._ticking = False
+        self._thread = threading.Thread(target=self._run, name=f"monitor {machine.site}/{machine.name}", daemon=True)
+
+    def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
+        """A monitor that goes on from the history, if there is anything to go on from."""
+        last = self.history.last_sequence()
+        checkpoint = self.history.restore()
+        if checkpoint is None:
+            monitor = MachineMonitor(installed)
+            if last >= 0:
+                monitor.restore_alarms(NO_ALARMS, last + 1)
+            return monitor, ""
+        monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
+        self.steps.keeps(monitor.hops)
+        self.history.go_on_from(monitor.next_sequence - 1)
+        self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
+        # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
+        latest = self.history.events(after=last - _LATEST, limit=_LATEST)
+        self._unpublished = tuple(one for one in latest if one.recorded_ns >= checkpoint.head.recorded_ns)
+        self._log.info("restart", what=text)
+        return monitor, text
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    @property
+    def trouble(self) -> str:
+        """Why the machine is not monitored as it should be although data come in; empty if it is."""
+        refused = self.steps.refused
+        reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
+        if self.history.trouble:
+            reasons.append(f"the history does not take what happens: {self.history.trouble}")
+        if self._unevaluated_s > 2 * self.machine.window.hop_s and not self._silent:
+            why = self._snapshot.reason
+            reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
+        return "; ".join(reasons)
+
+    def start(self, outlet: Outlet) -> None:
+        """Start the thread; it publishes to `outlet`."""
+        self._outlet = outlet
+        self._begin_s = self._ticked_s = self._clocks.monotonic_s()
+        self.tick()  # before any block: what time it is so far
+        for event in self._unpublished:
+            outlet.publish_alarm_event(event.text)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop after the present block."""
+        self.inbox.close()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def missed(self, count: int) -> None:
+        """Take note of messages lost on the way."""
+        self._missed += count
+        self._warn("missed", "messages were lost on the way", count=count)
+
+    def publisher(self, alive: bool) -> None:
+        """Take note of a publisher that came or went."""
+        if alive != self._publisher_alive and (withheld := self._limiter.admit(f"publisher {alive}")) is not None:
+            self._log.info("publisher is there" if alive else "publisher is gone", withheld=withheld)
+        self._publisher_alive = alive
+        if not alive:
+            self._mismatch = ()
+
+    def replay(self, announced: bool) -> None:
+        """Take note of a replay on the machine's own keys that begins or ends; its blocks do not arrive here."""
+        self._replay_announced = announced
+        if announced:
+            self._warn("replay", "a replay is announced on this machine's own keys; the machine's own blocks count")
+
+    def descriptor(self, announced: bytes) -> None:
+        """Compare an announced channel descriptor with the machine file."""
+        mismatch = descriptor_mismatch(announced, self.machine)
+        if mismatch and mismatch != self._mismatch:
+            self._warn("descriptor", "the publisher's channel descriptor differs from the file", differences=mismatch)
+        self._mismatch = mismatch
+
+    def health(self) -> Health:
+        """Where the machine stands now."""
+        latest_s, snapshot, silent = self._latest_data_s, self._snapshot, self._silent
+        return conversion.health(
+            self.identity,
+            snapshot,
+            StreamStatus(
+                publisher_alive=self._publisher_alive,
+                data_age_s=None if latest_s is None else round(max(0.0, self._clocks.monotonic_s() - latest_s), 3),
+                silent=silent,
+                silent_since_ns=snapshot.end_ns if silent else None,
+                replay_announced=self._replay_announced,
+                descriptor_mismatch=self._mismatch,
+            ),
+            queue_dropped_blocks=self.inbox.dropped,
+            unread_messages=self.inbox.unread,
+            link_missed_blocks=self._missed,
+            worker_errors=self.errors,
+            last_worker_error=self.last_error,
+            restart=self.restart,
+        )
+
+    def alarms(self, *, include_normal: bool = False) -> AlarmStates:
+        """Return the alarms as they are now."""
+        snapshot = self._snapshot
+        return alarm_states(self.identity, snapshot.alarms, snapshot.sequence, include_normal=include_normal)
+
+    def alarm_log(self, after: int, limit: int) -> str:
+        """Alarm events after a sequence number, as the JSON of an `AlarmLogPage`; from any thread.
+
+        Parameters
+        ----------
+        after : int
+            -1 for the beginning.
+        limit : int
+            At most so many events.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        latest = self.history.last_sequence()
+        events = self.history.events(after=after, limit=limit)
+        return alarm_log_page(self.identity, [event.text for event in events], latest)
+
+    def detectable(self, change: float | None) -> DetectableChanges:
+        """Return what would be found on the machine as it runs now."""
+        return conversion.detectable_changes(self.identity, self.machine, self._snapshot, change)
+
+    def description(self) -> MachineDescription:
+        """Identity, stream, keys, and the present state."""
+        return conversion.machine_description(self.identity, self.machine, self.health().state)
+
+    def operate(self, operation: Operation) -> tuple[AlarmCloudEvent, ...]:
+        """Do what an operator asks for, on the machine's thread, and say what happened.
+
+        Raises
+        ------
+        UnknownAlarm, OperationConflict, OperationRefused
+            As `AlarmBook.operate`.
+        NotInTime
+            If the thread does not answer.
+        """
+        done: Future[tuple[AlarmCloudEvent, ...]] = Future()
+
+        def work() -> None:
+            if not done.set_running_or_notify_cancel():
+                return
+            try:
+                time_ns = self._operated_ns = max(self._data_now_ns(), self._operated_ns + 1)
+                events = self._monitor.operate(operation, time_ns)
+                done.set_result(tuple(AlarmCloudEvent.model_validate_json(text) for text in self._conclude((), events)))
+            except Exception as error:  # belongs to whoever asked; the thread goes on
+                done.set_exception(error)
+
+        if not self.inbox.call(work):
+            raise NotInTime(f"{self._place}: the monitor is being stopped")
+        try:
+            return done.result(_OPERATION_S)
+        except TimeoutError as error:
+            if done.cancel():
+                raise NotInTime(f"{self._place}: busy for {_OPERATION_S:g} s; nothing was done") from error
+            raise NotInTime(
+                f"{self._place}: busy for {_OPERATION_S:g} s; look at the alarm before trying again"
+            ) from error
+
+    def tick(self) -> None:
+        """Let the machine's thread notice that time passes, with data or without; called every now and then."""
+        if not self._ticking:
+            self._ticking = True
+            self.inbox.call(self._tick)
+
+    @property
+    def _place(self) -> str:
+        return f"{self.machine.site}/{self.machine.name}"
+
+    @property
+    def _silent(self) -> bool:
+        """Whether no usable block has come for longer than a silence may last."""
+        latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
+        return self._clocks.monotonic_s() - latest_s > self.machine.ingest.no_data_after_s
+
+    def _data_now_ns(self) -> int:
+        """Data time that has been reached: end of the newest data, and what has passed since."""
+        end_ns = self._monitor.end_ns
+        if end_ns is None:
+            return self._clocks.utc_ns()
+        now_s = self._clocks.monotonic_s()
+        if self._latest_data_s is None:
+            return end_ns + round((self._asleep_s + now_s - self._begin_s) * 1e9)
+        return end_ns + round((now_s - self._latest_data_s) * 1e9)
+
+    def _tick(self) -> None:
+        self._ticking = False
+        now_s, limit_s = self._clocks.monotonic_s(), self.machine.ingest.no_data_after_s
+        if now_s - self._ticked_s > _HELD_UP_S:
+            self._held_up_s = now_s
+        self._ticked_s = now_s
+        if news := self.steps.begun_anew():
+            self._conclude((), self._monitor.fault(news, self._data_now_ns()), always=True)
+        if len(self.inbox):
+            return  # time passes with the blocks that wait
+        if self._monitor.end_ns is not None:
+            latest_s = self._begin_s if self._latest_data_s is None else self._latest_data_s
+            if now_s - max(latest_s, self._held_up_s) >= limit_s:
+                self._conclude_reports(self._monitor.flush())
+            elif self._latest_data_s is None or now_s - latest_s >= limit_s:
+                # After a restart, or where this program stood still, publishers get as long to be heard again as a
+                # silence may last.
+                return
+        self._conclude((), self._monitor.passed(self._data_now_ns()))
+
+    def _run(self) -> None:
+        while (item := self.inbox.get()) is not None:
+            try:
+                if isinstance(item, RawBlock):
+                    self._take(item)
+                else:
+                    item()
+            except Exception as error:  # one bad block must not end the monitoring of the machine
+                self._failed(error)
+                self._fault(f"{type(error).__name__}: {error}")
+        # An orderly end keeps where the monitor stands to the last block: going on needs no publisher's cache.
+        self._conclude((), (), always=True)
+
+    def _failed(self, error: Exception) -> None:
+        self.errors += 1
+        self.last_error = f"{type(error).__name__}: {error}"[:_LONGEST_ERROR]
+        if (withheld := self._limiter.admit("error")) is not None:
+            self._log.error("something was lost to an error in the monitor", withheld=withheld, exc_info=error)
+
+    def _fault(self, what: str) -> None:
+        """Let operators hear that something is wrong here, once."""
+        try:
+            events = self._monitor.fault(what, self._data_now_ns())
+            if events:
+                self._conclude((), events)
+        except Exception as error:  # there is nobody left to tell
+            self._failed(error)
+
+    def _take(self, block: RawBlock) -> None:
+        begin_s = self._clocks.monotonic_s()
+        reports = self._monitor.step_payload(block.payload, block.attachment, block.encoding, block.dropped_before)
+        tally = self.tally
+        self.tally = replace(tally, blocks=tally.blocks + 1, step_s=tally.step_s + self._clocks.monotonic_s() - begin_s)
+        if self._monitor.used:
+            self.inbox.follow(block)
+        self._conclude_reports(reports)
+
+    def _conclude_reports(self, reports: Sequence[MonitorReport]) -> None:
+        """Conclude what came of one message, in one step: the monitor's state is that after the last of the blocks."""
+        for report in reports:
+            self._explain(report)
+            if report.verdict.accepted:
+                if self._latest_data_s is None or not report.verdict.continuous:
+                    self._operated_ns = 0  # perhaps by another clock
+                self._latest_data_s = self._clocks.monotonic_s()
+                self.tally = replace(self.tally, data_s=self.tally.data_s + report.data_s)
+            if report.fault is not None:
+                self._failed(report.fault)
+            evaluated = report.windows and report.fault is None
+            self._unevaluated_s = 0.0 if evaluated else self._unevaluated_s + report.data_s
+        self._conclude(
+            tuple(window for report in reports for window in report.windows),
+            tuple(event for report in reports for event in report.events),
+        )
+
+    def _conclude(
+        self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...], *, always: bool = False
+    ) -> tuple[str, ...]:
+        """Commit, then let it be seen and publish; returns the events as they are published."""
+        events += self._monitor.take_events()  # left behind by a defect
+        self.steps.owe(events)
+        snapshot = self._monitor.health()
+        reports: tuple[StoredReport, ...] = ()
+        told: tuple[StoredEvent, ...] = ()
+        try:
+            if windows or events or always:
+                reports, told = self._commit(windows)
+        finally:
+            self._snapshot = snapshot
+            self.latest = self._held()
+        texts = tuple(one.text for one in told if one.sequence >= self._told)
+        for event in events:
+            self._log.warning("alarm", kind=event.kind.value, text=event.text, time_ns=event.time_ns)
+        if texts:
+            self._told = told[-1].sequence + 1
+            self._on_events()
+        try:
+            self._publish([one.text for one in reports], texts)
+        except Exception as error:  # the network's, of whatever kind; who lacks an event asks for it
+            self._failed(error)
+        if self.steps.refused is not None:
+            self._fault(f"the history refuses what happens: {self.steps.refused}")
+        return texts
+
+    def _commit(self, windows: tuple[WindowReport, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
+        """Bring windows, events and the monitor's state into the history, as they are to be published."""
+        begin_s = self._clocks.monotonic_s()
+        reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns())
+        if self.steps.refused is not None:
+            self._failed(self.steps.refused)
+        elif not written:
+            self._warn("history", "the history cannot be written; what happened waits in memory and is published")
+        tally = self.tally
+        self.tally = replace(
+            tally,
+            windows=tally.windows + len(windows),
+            commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s,
+        )
+        return reports, told
+
+    def _held(self) -> LatestData:
+        """What the monitor holds, for snapshots."""
+        latest, monitor = self._snapshot.latest, self._monitor
+        return LatestData(
+            window=monitor.window,
+            filled=self._snapshot.filled,
+            parameters=() if latest is None else latest.parameters,
+            why_not="" if latest is None else latest.reason,
+            blocks=monitor.blocks,
+        )
+
+    def _publish(self, reports: Iterable[str], events: Iterable[str]) -> None:
+        outlet = self._outlet
+        if outlet is None:
+            return
+        for text in reports:
+            outlet.publish_report(text)
+        for text in events:
+            outlet.publish_alarm_event(text)
+        # The latest change of each alarm is in every report; here only what an operator would call news.
+        now = tuple(
+            (alarm.name, alarm.version, alarm.beyond_ns is None, alarm.small_ns is None)
+            for alarm in self._snapshot.alarms
+        )
+        if now != self._published_alarms:
+            self._published_alarms = now
+            outlet.publish_alarm_state(self.alarms().model_dump_json())
+
+    def _explain(self, report: MonitorReport) -> None:
+        verdict = report.verdict
+        if verdict.reason is not None:
+            self._warn(f"refused {verdict.reason}", "block refused", reason=verdict.reason.value, why=verdict.text)
+        elif verdict.text:
+            self._warn("gap", "the stream was interrupted", why=verdict.text)
+        dropped = self.inbox.dropped
+        if dropped > self._dropped_logged:
+            self._warn("dropped", "cannot keep up, blocks dropped", count=dropped - self._dropped_logged)
+            self._dropped_logged = dropped
+
+    def _warn(self, kind: str, text: str, **details: object) -> None:
+        withheld = self._limiter.admit(kind)
+        if withheld is not None:
+            self._log.warning(text, **details, **({"withheld": withheld} if withheld else {}))

@@ -1,0 +1,93 @@
+"""Logging to standard error: structlog for our own lines, the standard library's loggers through the same formatter."""
+
+import logging
+import sys
+import time
+from collections.abc import Callable
+
+import structlog
+from structlog.typing import FilteringBoundLogger, Processor
+
+from service.settings.service import LogSettings
+
+__all__ = ["Limiter", "configure_logging", "logger"]
+
+_QUIET_S = 10.0
+
+
+def configure_logging(settings: LogSettings) -> None:
+    """Set up the process's logging; call it once, at start-up."""
+    shared: list[Processor] = [
+        structlog.contextvars.merge_contextvars,
+        structlog.stdlib.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+    ]
+    as_json = settings.format == "json"
+    final: list[Processor] = [structlog.stdlib.ProcessorFormatter.remove_processors_meta]
+    if as_json:
+        final += [structlog.processors.format_exc_info, structlog.processors.JSONRenderer()]
+    else:
+        final.append(
+            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback)
+        )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(structlog.stdlib.ProcessorFormatter(foreign_pre_chain=shared, processors=final))
+    root = logging.getLogger()
+    root.handlers[:] = [handler]
+    root.setLevel(settings.level.upper())
+    # The chatter of libraries is of interest only when something is wrong.
+    for name in ("uvicorn", "uvicorn.error", "uvicorn.access", "asyncio", "httpx", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    # It warns of every request that is no HTTP, which anybody can send.
+    logging.getLogger("uvicorn.error").filters[:] = [_OnceAMinute()]
+    structlog.configure(
+        processors=[*shared, structlog.stdlib.ProcessorFormatter.wrap_for_formatter],
+        logger_factory=structlog.stdlib.LoggerFactory(),
+        wrapper_class=structlog.stdlib.BoundLogger,
+        cache_logger_on_first_use=False,
+    )
+
+
+def logger(**context: str) -> FilteringBoundLogger:
+    """Return a logger whose lines carry `context`."""
+    bound: FilteringBoundLogger = structlog.get_logger("rotorwatch", **context)
+    return bound
+
+
+class Limiter:
+    """Lets one line of a kind through now and then and says how many were left out.
+
+    Parameters
+    ----------
+    clock : callable
+        Monotonic seconds.
+    quiet_s : float
+        How long after a line the next one of its kind is let through.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic, quiet_s: float = _QUIET_S) -> None:
+        self._clock = clock
+        self._quiet_s = quiet_s
+        self._next_s: dict[str, float] = {}
+        self._withheld: dict[str, int] = {}
+
+    def admit(self, kind: str) -> int | None:
+        """How many lines of this kind were withheld before this one, or None if it is to be withheld as well."""
+        now_s = self._clock()
+        if now_s < self._next_s.get(kind, float("-inf")):
+            self._withheld[kind] = self._withheld.get(kind, 0) + 1
+            return None
+        self._next_s[kind] = now_s + self._quiet_s
+        return self._withheld.pop(kind, 0)
+
+
+class _OnceAMinute(logging.Filter):
+    """Lets a warning through once a minute, and every error."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._limiter = Limiter(quiet_s=60.0)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a line is written."""
+        return record.levelno >= logging.ERROR or self._limiter.admit(str(record.msg)) is not None
