@@ -1,108 +1,47 @@
-"""``rotorwatch plot``: pictures of recordings."""
+"""``rotorwatch plot``: pictures of recordings, a command for each kind."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import FromOption, ToOption, exit_codes, one_blas_thread
+from service.commands.running import Commands, FromOption, ToOption, exit_codes, one_blas_thread
+
+if TYPE_CHECKING:
+    from service.analysis.plots.request import Lines, Paint, Recorded
 
 __all__ = ["register"]
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
-_ONLY_FOR: dict[str, tuple[str, ...]] = {
-    "--at": ("correlation", "orbit", "spectrum"),
-    "--machine": ("trend", "correlation"),
-    "--channel": ("spectrum", "waterfall"),
-    "--window": ("spectrum", "waterfall"),
-    "--resolution": ("spectrum", "waterfall"),
-    "--density": ("spectrum", "waterfall"),
-    "--scale": ("spectrum", "waterfall"),
-    "--to-hz": ("spectrum", "waterfall"),
-    "--revolutions": ("orbit",),
-    "--axis": ("waterfall",),
-    "--cascade": ("waterfall",),
-}
+_plots = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
+
+_AtOption = Annotated[
+    str | None, typer.Option("--at", metavar="TIME", help="The latest data up to then. Else up to the end.")
+]
+_ResolutionOption = Annotated[float, typer.Option("--resolution", metavar="HZ", help="Distance of the lines.")]
+_DensityOption = Annotated[
+    bool, typer.Option("--density", help="Power spectral density, not amplitudes (displacement p-p, others rms).")
+]
+_ToHzOption = Annotated[
+    float | None,
+    typer.Option(
+        "--to-hz", metavar="HZ", help="Highest frequency shown. Else as far as there is anything, 4× at least."
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command()(plot)
+    """Add the commands."""
+    app.add_typer(_plots, name="plot")
 
 
-def plot(
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.")],
-    kind: Annotated[
-        Literal["trend", "correlation", "orbit", "spectrum", "waterfall"], typer.Option("--kind", help="What to show.")
-    ],
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Picture to write: .png or .svg.")],
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there already.")] = False,
-    key: Annotated[
-        str | None,
-        typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several."),
-    ] = None,
-    from_: FromOption = None,
-    to: ToOption = None,
-    at: Annotated[
-        str | None,
-        typer.Option("--at", metavar="TIME", help="Correlation, orbit, spectrum: the latest up to here. Else the end."),
-    ] = None,
-    machine: Annotated[
-        str | None,
-        typer.Option(
-            "--machine",
-            metavar="FILE[@BUNDLE]",
-            help="Trend, correlation: evaluate with this machine file, and after @ its bundle. If left out, "
-            "the shipped machine with the recorded site and name; and a trend shows the recorded reports, if any.",
-        ),
-    ] = None,
-    channel: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--channel",
-            metavar="NAME",
-            help="Spectrum (repeatable): all displacements if left out. Waterfall: the first displacement.",
-        ),
-    ] = None,
-    revolutions: Annotated[
-        int | None, typer.Option("--revolutions", min=1, max=1000, help="Orbit: how many, 8 if left out.")
-    ] = None,
-    window: Annotated[
-        float | None,
-        typer.Option("--window", metavar="S", help="Spectrum: seconds it is taken over, 20; waterfall: of each, 4."),
-    ] = None,
-    resolution: Annotated[
-        float | None, typer.Option("--resolution", metavar="HZ", help="Distance of the lines of a spectrum, 0.5 Hz.")
-    ] = None,
-    density: Annotated[
-        bool,
-        typer.Option("--density", help="Power spectral density, not amplitudes (displacement p-p, others rms)."),
-    ] = False,
-    scale: Annotated[
-        Literal["log", "linear"] | None,
-        typer.Option("--scale", help="Of a spectrum; linear for amplitudes, log for densities and colours."),
-    ] = None,
-    to_hz: Annotated[
-        float | None,
-        typer.Option(
-            "--to-hz",
-            metavar="HZ",
-            help="Highest frequency shown; else as far as there is anything, 4× at least.",
-        ),
-    ] = None,
-    axis: Annotated[
-        Literal["time", "speed"] | None, typer.Option("--axis", help="Waterfall: over time, or over the speed.")
-    ] = None,
-    cascade: Annotated[bool, typer.Option("--cascade", help="Waterfall: lines instead of colours.")] = False,
-    title: Annotated[str | None, typer.Option("--title", help="Instead of the picture's own.")] = None,
-    size: Annotated[
-        str | None, typer.Option("--size", metavar="WxH", help="Width and height in inches, such as 10x6.")
-    ] = None,
-    dpi: Annotated[float, typer.Option("--dpi", min=30, max=600, help="Pixels per inch of a PNG.")] = 120.0,
-) -> None:
+@_plots.callback()
+def _describe() -> None:
     """Draw what is in recordings: PNG or SVG by the end of the name. Needs matplotlib: the extra "plots".
 
     Times are UTC, and those of the data, however fast they were recorded. The same input gives the same file.
@@ -110,80 +49,193 @@ def plot(
     [bold]Examples[/bold]
 
     What changed, and when:
-    [cyan]rotorwatch plot monday.mcap --kind trend --out trend.png[/cyan]
+    [cyan]rotorwatch plot trend monday.mcap --out trend.png[/cyan]
 
     What the equations' networks expected in the window that ends 170 s after the start:
-    [cyan]rotorwatch plot monday.mcap --kind correlation --at 170 --out correlation.svg[/cyan]
+    [cyan]rotorwatch plot correlation monday.mcap --at 170 --out correlation.svg[/cyan]
 
     Orbits, spectra up to 100 Hz, and a run-up over the speed:
-    [cyan]rotorwatch plot monday.mcap --kind orbit --revolutions 4 --out orbit.png[/cyan]
-    [cyan]rotorwatch plot monday.mcap --kind spectrum --channel y2 --to-hz 100 --out spectrum.png[/cyan]
-    [cyan]rotorwatch plot runup.mcap --kind waterfall --axis speed --out runup.png[/cyan]
+    [cyan]rotorwatch plot orbit monday.mcap --revolutions 4 --out orbit.png[/cyan]
+    [cyan]rotorwatch plot spectrum monday.mcap --channel y2 --to-hz 100 --out spectrum.png[/cyan]
+    [cyan]rotorwatch plot waterfall runup.mcap --axis speed --out runup.png[/cyan]
     """
-    with exit_codes():
-        one_blas_thread()
-        given = {
-            "--at": at, "--machine": machine, "--channel": channel, "--window": window, "--resolution": resolution,
-            "--density": density, "--scale": scale, "--to-hz": to_hz, "--revolutions": revolutions, "--axis": axis,
-            "--cascade": cascade,
-        }  # fmt: skip
-        _check(kind, given, out, overwrite)
-        for name, number in (("--window", window), ("--resolution", resolution), ("--to-hz", to_hz)):
-            if number is not None and not 0 < number < 1e9:
-                raise MachineFileError(f"{name} is {number:g}, expected a number above 0")
-        _need_matplotlib()
-        from service.analysis.plots.request import PlotRequest, draw_plot  # noqa: PLC0415  # keeps --help quick
-        from service.analysis.plots.style import Look  # noqa: PLC0415
-
-        draw_plot(
-            PlotRequest(
-                files=tuple(files),
-                kind=kind,
-                out=out,
-                key=key,
-                from_=from_,
-                to=to,
-                at=at,
-                machine=machine,
-                channels=tuple(channel or ()),
-                revolutions=revolutions or 8,
-                window_s=window or (20.0 if kind == "spectrum" else 4.0),
-                resolution_hz=resolution or 0.5,
-                scaling="density" if density else "amplitude",
-                log=(density or (kind == "waterfall" and not cascade)) if scale is None else scale == "log",
-                to_hz=to_hz,
-                over_speed=axis == "speed",
-                cascade=cascade,
-                look=Look(title, _inches(size), dpi),
-            )
-        )
-        typer.echo(str(out))
 
 
-def _check(kind: str, given: Mapping[str, object], out: Path, overwrite: bool) -> None:
-    for name, value in given.items():
-        if value and kind not in _ONLY_FOR[name]:
-            raise MachineFileError(f"{name} makes sense only with --kind {' or '.join(_ONLY_FOR[name])}")
-    if out.suffix.lower() not in (".png", ".svg"):
-        raise MachineFileError(f"--out is {out}, expected a name that ends in .png or .svg")
-    if out.exists() and not overwrite:
-        raise MachineFileError(f"{out}: exists already; --overwrite replaces it")
+@dataclass(frozen=True)
+class _Picture:
+    """What every picture asks for."""
+
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.")]
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Picture to write: .png or .svg.")]
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there already.")] = False
+    key: Annotated[
+        str | None,
+        typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several."),
+    ] = None
+    from_: FromOption = None
+    to: ToOption = None
+    title: Annotated[str | None, typer.Option("--title", help="Instead of the picture's own.")] = None
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help="Width and height in inches, such as 10x6.")
+    ] = None
+    dpi: Annotated[float, typer.Option("--dpi", min=30, max=600, help="Pixels per inch of a PNG.")] = 120.0
+
+    def check(self) -> None:
+        """Refuse what cannot be written, before anything is computed."""
+        if self.out.suffix.lower() not in (".png", ".svg"):
+            raise MachineFileError(f"--out is {self.out}, expected a name that ends in .png or .svg")
+        if self.out.exists() and not self.overwrite:
+            raise MachineFileError(f"{self.out}: exists already; --overwrite replaces it")
+        try:
+            import matplotlib  # noqa: F401, PLC0415  # an extra that may be missing
+        except ImportError as error:
+            raise MachineFileError(
+                "plots need the package matplotlib, which is not installed: pip install 'rotorwatch[plots]'"
+            ) from error
+
+    def recorded(self, at: str | None = None, *, reports: bool = False) -> "Recorded":
+        """The data it is of."""
+        from service.analysis.plots.request import recorded  # noqa: PLC0415  # keeps --help quick
+
+        return recorded(tuple(self.files), self.key, (self.from_, self.to), at, reports=reports)
+
+    def draw(self, paint: "Paint") -> None:
+        """Draw and write it."""
+        from service.analysis.plots.style import Look, draw  # noqa: PLC0415
+
+        draw(self.out, Look(self.title, self._inches(), self.dpi), paint)
+        typer.echo(str(self.out))
+
+    def _inches(self) -> tuple[float, float] | None:
+        if self.size is None:
+            return None
+        found = _SIZE.fullmatch(self.size)
+        width, height = (float(found[1]), float(found[2])) if found else (0.0, 0.0)
+        if not (2 <= width <= 60 and 2 <= height <= 60):
+            raise MachineFileError(f"--size is {self.size!r}, expected width x height in inches, 2 to 60, such as 10x6")
+        return width, height
 
 
-def _inches(text: str | None) -> tuple[float, float] | None:
-    if text is None:
-        return None
-    found = _SIZE.fullmatch(text)
-    width, height = (float(found[1]), float(found[2])) if found else (0.0, 0.0)
-    if not (2 <= width <= 60 and 2 <= height <= 60):
-        raise MachineFileError(f"--size is {text!r}, expected width x height in inches, 2 to 60, such as 10x6")
-    return width, height
+def _kind(paint: Callable[..., "Paint"]) -> None:
+    """Add a command: with the options of every picture, which it gets as one object, and with its own."""
+    shared = signature(_Picture).parameters
+
+    def command(**given: Any) -> None:
+        with exit_codes():
+            one_blas_thread()
+            picture = _Picture(**{name: given.pop(name) for name in shared})
+            picture.check()
+            picture.draw(paint(picture, **given))
+
+    (files, out, *others), (_, *own) = shared.values(), signature(paint).parameters.values()
+    options = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in (files, out, *own, *others)]
+    command.__signature__ = signature(command).replace(parameters=options)  # type: ignore[attr-defined]  # typer's view
+    _plots.command(paint.__name__, help=paint.__doc__)(command)
 
 
-def _need_matplotlib() -> None:
-    try:
-        import matplotlib  # noqa: F401, PLC0415  # an extra that may be missing
-    except ImportError as error:
-        raise MachineFileError(
-            "plots need the package matplotlib, which is not installed: pip install 'rotorwatch[plots]'"
-        ) from error
+@_kind
+def trend(
+    picture: _Picture,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            "--machine",
+            metavar="FILE[@BUNDLE]",
+            help="Evaluate anew with this machine file, and after @ its bundle. If left out, the recorded reports are "
+            "shown; without any, those of the shipped machine with the recorded site and name.",
+        ),
+    ] = None,
+) -> "Paint":
+    """Every parameter's change with its 95 % interval over time; state, alarms and speed."""
+    from service.analysis.plots.request import trend as read  # noqa: PLC0415
+
+    return read(picture.recorded(reports=True), machine)
+
+
+@_kind
+def correlation(
+    picture: _Picture,
+    at: _AtOption = None,
+    machine: Annotated[
+        str | None,
+        typer.Option(
+            "--machine",
+            metavar="FILE[@BUNDLE]",
+            help="Machine file, and after @ the bundle with the networks. If left out, the shipped machine with the "
+            "recorded site and name.",
+        ),
+    ] = None,
+) -> "Paint":
+    """Correlations of one window against what the networks predict, equation by equation."""
+    from service.analysis.plots.request import correlation as read  # noqa: PLC0415
+
+    return read(picture.recorded(at), machine)
+
+
+@_kind
+def orbit(
+    picture: _Picture,
+    at: _AtOption = None,
+    revolutions: Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many.")] = 8,
+) -> "Paint":
+    """The shaft's path at bearing and disc, as measured and at running speed alone."""
+    from service.analysis.plots.request import orbit as read  # noqa: PLC0415
+
+    return read(picture.recorded(at), revolutions)
+
+
+@_kind
+def spectrum(
+    picture: _Picture,
+    at: _AtOption = None,
+    channel: Annotated[
+        list[str] | None,
+        typer.Option("--channel", metavar="NAME", help="Repeatable; all displacements if left out."),
+    ] = None,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")] = 20.0,
+    resolution: _ResolutionOption = 0.5,
+    density: _DensityOption = False,
+    scale: Annotated[
+        Literal["log", "linear"] | None, typer.Option("--scale", help="Linear for amplitudes, log for densities.")
+    ] = None,
+    to_hz: _ToHzOption = None,
+) -> "Paint":
+    """Amplitudes or power spectral density of channels, 1× and 2× marked."""
+    from service.analysis.plots.request import spectrum as read  # noqa: PLC0415
+
+    lines = _lines(window, resolution, to_hz, density=density, log=density if scale is None else scale == "log")
+    return read(picture.recorded(at), tuple(channel or ()), lines)
+
+
+@_kind
+def waterfall(
+    picture: _Picture,
+    channel: Annotated[
+        list[str] | None, typer.Option("--channel", metavar="NAME", help="The first displacement if left out.")
+    ] = None,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds that each spectrum is of.")] = 4.0,
+    resolution: _ResolutionOption = 0.5,
+    density: _DensityOption = False,
+    scale: Annotated[
+        Literal["log", "linear"] | None,
+        typer.Option("--scale", help="Of colours or heights; log for colours and densities."),
+    ] = None,
+    to_hz: _ToHzOption = None,
+    axis: Annotated[Literal["time", "speed"], typer.Option("--axis", help="Over time, or over the speed.")] = "time",
+    cascade: Annotated[bool, typer.Option("--cascade", help="Lines instead of colours.")] = False,
+) -> "Paint":
+    """Spectra of one channel over time, or over speed in a run-up."""
+    from service.analysis.plots.request import waterfall as read  # noqa: PLC0415
+
+    log = density or not cascade if scale is None else scale == "log"
+    lines = _lines(window, resolution, to_hz, density=density, log=log)
+    return read(picture.recorded(), tuple(channel or ()), lines, over_speed=axis == "speed", cascade=cascade)
+
+
+def _lines(window_s: float, resolution_hz: float, to_hz: float | None, *, density: bool, log: bool) -> "Lines":
+    from service.analysis.plots.request import Lines  # noqa: PLC0415
+
+    for name, number in (("--window", window_s), ("--resolution", resolution_hz), ("--to-hz", to_hz)):
+        if number is not None and not 0 < number < 1e9:
+            raise MachineFileError(f"{name} is {number:g}, expected a number above 0")
+    return Lines(window_s, resolution_hz, "density" if density else "amplitude", log, to_hz)

@@ -11,7 +11,6 @@ from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, read_recording
 from models.signals.wire import decode_block
 from rotorwatch.records.replays import ReplayLine, ReplayProgress
-from service.analysis.plots.request import PlotRequest, draw_plot
 from service.analysis.plots.spectrum import read_spectrum, read_waterfall
 from service.analysis.plots.stretches import RecordedStream
 from service.commands.replay import summary_lines
@@ -130,9 +129,11 @@ def test_of_two_runs_the_later_one_is_shown(twice: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["spectrum", "orbit", "waterfall"])
 def test_pictures_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
-    where = {"at": "31"} if kind != "waterfall" else {"from_": "8", "to": "31"}
+    where = ("--at", "31") if kind != "waterfall" else ("--from", "8", "--to", "31")
+    seconds = () if kind == "orbit" else ("--window", "4")
     for path, out in ((slow, tmp_path / "slow.svg"), (quick, tmp_path / "quick.svg")):
-        draw_plot(PlotRequest(files=(path,), kind=kind, out=out, window_s=4.0, **where))  # type: ignore[arg-type]
+        found = CliRunner().invoke(app, ["plot", kind, str(path), "--out", str(out), *where, *seconds])
+        assert found.exit_code == 0, found.output
     assert (tmp_path / "slow.svg").read_bytes() == (tmp_path / "quick.svg").read_bytes()
 
 

@@ -56,7 +56,7 @@ def pixels(path: Path) -> tuple[int, int]:
 def test_every_kind_as_png_and_svg(faulty: Path, tmp_path: Path, kind: str) -> None:
     for suffix in ("png", "svg"):
         out = tmp_path / f"picture.{suffix}"
-        code, said = run(faulty, "--kind", kind, "--out", out, "--size", "8x6", "--dpi", "50")
+        code, said = run(kind, faulty, "--out", out, "--size", "8x6", "--dpi", "50")
         assert (code, said.strip()) == (0, str(out)), said
     assert pixels(tmp_path / "picture.png") == (400, 300)
     root = ET.parse(tmp_path / "picture.svg").getroot()  # noqa: S314  # written a moment ago
@@ -68,11 +68,12 @@ def test_every_kind_as_png_and_svg(faulty: Path, tmp_path: Path, kind: str) -> N
 def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffix: str) -> None:
     """In another process, with another matplotlibrc."""
     one, other = tmp_path / f"one.{suffix}", tmp_path / f"other.{suffix}"
-    arguments = ["--kind", "waterfall", "--from", "10", "--to", "30", "--cascade"]
-    assert run(faulty, *arguments, "--out", one)[0] == 0
+    arguments = ["--from", "10", "--to", "30", "--cascade"]
+    assert run("waterfall", faulty, *arguments, "--out", one)[0] == 0
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: yellow\nfont.size: 20\n", encoding="utf-8")
     environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7"}
-    command = [sys.executable, "-m", "service.rotorwatch", "plot", str(faulty), *arguments, "--out", str(other)]
+    command = [sys.executable, "-m", "service.rotorwatch", "plot", "waterfall", str(faulty), *arguments]
+    command += ["--out", str(other)]
     subprocess.run(command, check=True, cwd=ROOT, env=environment, timeout=300, capture_output=True)
     assert one.read_bytes() == other.read_bytes()
 
@@ -80,61 +81,60 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffi
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--kind", "spectrum", "--channel", "x9"), "--channel is 'x9', which is not a channel of demo/lab; expected"),
-        (("--kind", "waterfall", "--channel", "theta"), "--channel is 'theta', which is the shaft angle"),
-        (("--kind", "waterfall", "--channel", "y1", "--channel", "y2"), "a waterfall is of one channel"),
-        (("--kind", "waterfall", "--axis", "speed"), "the speed stays between 1320 and 1320 rpm"),
-        (("--kind", "spectrum", "--window", "1"), "--window is 1 s, expected at least 2 s"),
-        (("--kind", "spectrum", "--window", "nan"), "--window is nan, expected a number above 0"),
-        (("--kind", "spectrum", "--resolution", "900"), "--resolution is 900 Hz, expected at most 250 Hz"),
-        (("--kind", "spectrum", "--to-hz", "1"), "--to-hz is 1, expected at least four lines"),
-        (("--kind", "orbit", "--channel", "y1"), "--channel makes sense only with --kind spectrum or waterfall"),
-        (("--kind", "trend", "--at", "5"), "--at makes sense only with --kind correlation or orbit or spectrum"),
-        (("--kind", "trend", "--to", "30"), "no parameter was read in this stretch of time"),
-        (("--kind", "correlation", "--at", "30"), "a window is 60 s, usable data are 30 s"),
-        (("--kind", "correlation", "--machine", "lab"), "name a bundle that has networks, as --machine FILE@BUNDLE"),
-        (("--kind", "correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),
-        (("--kind", "orbit", "--from", "20", "--at", "20"), "--at 20: nothing was recorded before that"),
-        (("--kind", "orbit", "--from", "500"), "nothing was recorded in between"),
-        (("--kind", "orbit", "--from", "79.9", "--revolutions", "9"), "--revolutions is 9, but only"),
-        (("--kind", "orbit", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
-        (("--kind", "orbit", "--size", "big"), "--size is 'big', expected width x height in inches"),
+        (("spectrum", "--channel", "x9"), "--channel is 'x9', which is not a channel of demo/lab; expected"),
+        (("waterfall", "--channel", "theta"), "--channel is 'theta', which is the shaft angle"),
+        (("waterfall", "--channel", "y1", "--channel", "y2"), "a waterfall is of one channel"),
+        (("waterfall", "--axis", "speed"), "the speed stays between 1320 and 1320 rpm"),
+        (("spectrum", "--window", "1"), "--window is 1 s, expected at least 2 s"),
+        (("spectrum", "--window", "nan"), "--window is nan, expected a number above 0"),
+        (("spectrum", "--resolution", "900"), "--resolution is 900 Hz, expected at most 250 Hz"),
+        (("spectrum", "--to-hz", "1"), "--to-hz is 1, expected at least four lines"),
+        (("orbit", "--channel", "y1"), "No such option: --channel"),
+        (("trend", "--at", "5"), "No such option: --at"),
+        (("trend", "--to", "30"), "no parameter was read in this stretch of time"),
+        (("correlation", "--at", "30"), "a window is 60 s, usable data are 30 s"),
+        (("correlation", "--machine", "lab"), "name a bundle that has networks, as --machine FILE@BUNDLE"),
+        (("correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),
+        (("orbit", "--from", "20", "--at", "20"), "--at 20: nothing was recorded before that"),
+        (("orbit", "--from", "500"), "nothing was recorded in between"),
+        (("orbit", "--from", "79.9", "--revolutions", "9"), "--revolutions is 9, but only"),
+        (("orbit", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
+        (("orbit", "--size", "big"), "--size is 'big', expected width x height in inches"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(faulty: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     out = tmp_path / "picture.png"
-    code, said = run(faulty, *arguments, "--out", out)
+    kind, *options = arguments
+    code, said = run(kind, faulty, *options, "--out", out)
     assert code in (1, 2)
     assert message in said
     assert not out.exists()
 
 
 def test_names_of_pictures(faulty: Path, tmp_path: Path) -> None:
-    code, said = run(faulty, "--kind", "orbit", "--out", tmp_path / "orbit.pdf")
+    code, said = run("orbit", faulty, "--out", tmp_path / "orbit.pdf")
     assert (code, "expected a name that ends in .png or .svg" in said) == (2, True)
     out = tmp_path / "orbit.PNG"
-    assert run(faulty, "--kind", "orbit", "--out", out)[0] == 0
+    assert run("orbit", faulty, "--out", out)[0] == 0
     before = out.read_bytes()
-    code, said = run(faulty, "--kind", "orbit", "--out", out, "--revolutions", "2")
+    code, said = run("orbit", faulty, "--out", out, "--revolutions", "2")
     assert (code, "exists already; --overwrite replaces it" in said) == (2, True)
     assert out.read_bytes() == before
-    assert run(faulty, "--kind", "orbit", "--out", out, "--revolutions", "2", "--overwrite")[0] == 0
+    assert run("orbit", faulty, "--out", out, "--revolutions", "2", "--overwrite")[0] == 0
     assert out.read_bytes() != before
-    code, said = run(faulty, "--kind", "orbit", "--out", tmp_path / "nowhere" / "orbit.png")
+    code, said = run("orbit", faulty, "--out", tmp_path / "nowhere" / "orbit.png")
     assert (code, "cannot be written" in said) == (1, True)
-    code, said = run(tmp_path / "missing.mcap", "--kind", "orbit", "--out", tmp_path / "other.png")
+    code, said = run("orbit", tmp_path / "missing.mcap", "--out", tmp_path / "other.png")
     assert (code, "missing.mcap" in said) == (2, True)
 
 
 def test_without_a_keyphasor_there_are_spectra_but_no_orbits(without_angle: Path, tmp_path: Path) -> None:
-    code, said = run(without_angle, "--kind", "orbit", "--out", tmp_path / "orbit.png")
+    code, said = run("orbit", without_angle, "--out", tmp_path / "orbit.png")
     assert (code, "has no channel with the shaft angle (keyphasor)" in said) == (2, True)
-    code, said = run(
-        without_angle, "--kind", "waterfall", "--axis", "speed", "--window", "2", "--out", tmp_path / "w.png"
-    )
+    code, said = run("waterfall", without_angle, "--axis", "speed", "--window", "2", "--out", tmp_path / "w.png")
     assert (code, "--axis speed needs the shaft angle" in said) == (1, True)
     for kind in ("spectrum", "waterfall"):
-        code, said = run(without_angle, "--kind", kind, "--window", "2", "--out", tmp_path / f"{kind}.png")
+        code, said = run(kind, without_angle, "--window", "2", "--out", tmp_path / f"{kind}.png")
         assert code == 0, said
 
 
@@ -143,13 +143,13 @@ def test_a_recording_without_samples_and_reports(tmp_path: Path) -> None:
         tmp_path / "truth.mcap", [RecordedMessage(LAB.keys.truth, b"{}", b"", "application/json", START_NS, 0)]
     )
     for kind, message in (("trend", "machines with reports or sample blocks: none"), ("orbit", "sample blocks: none")):
-        code, said = run(path, "--kind", kind, "--out", tmp_path / "picture.png")
+        code, said = run(kind, path, "--out", tmp_path / "picture.png")
         assert (code, message in said) == (2, True)
 
 
 def test_a_stream_without_its_descriptor(faulty: Path, tmp_path: Path) -> None:
     path = write(tmp_path / "bare.mcap", list(read_recording(faulty, keys={LAB.keys.stream}))[:50])
-    code, said = run(path, "--kind", "spectrum", "--out", tmp_path / "picture.png")
+    code, said = run("spectrum", path, "--out", tmp_path / "picture.png")
     assert (code, "no channel descriptor on rotorwatch/demo/lab/descriptor" in said) == (1, True)
 
 
@@ -157,5 +157,5 @@ def test_without_matplotlib_it_says_what_to_install(
     faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)  # what import does then is what it does without the package
-    code, said = run(faulty, "--kind", "orbit", "--out", tmp_path / "orbit.png")
+    code, said = run("orbit", faulty, "--out", tmp_path / "orbit.png")
     assert (code, "pip install 'rotorwatch[plots]'" in said) == (2, True)

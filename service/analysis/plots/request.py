@@ -1,15 +1,14 @@
-"""One picture: from the recordings it is made of to the file it is written to."""
+"""What pictures are made of: the recorded data of one machine in a stretch of time, and what is drawn of them."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from matplotlib.figure import Figure
 
 from models.errors import MachineFileError, RecordingError
+from models.signals.channels import Channel
 from models.signals.keys import MachineKeys
-from rotorwatch.records.alarms import AlarmEventData
 from service.analysis.plots.correlation import correlations_of, latest_window
 from service.analysis.plots.correlation_figure import paint_correlations
 from service.analysis.plots.orbit import read_orbits
@@ -17,140 +16,164 @@ from service.analysis.plots.orbit_figure import paint_orbits
 from service.analysis.plots.spectrum import Scaling, read_spectrum, read_waterfall
 from service.analysis.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
 from service.analysis.plots.stretches import RecordedStream
-from service.analysis.plots.style import Look, draw
+from service.analysis.plots.style import Look
 from service.analysis.plots.trend import read_trend, recorded_alarms, trend_machine
 from service.analysis.plots.trend_figure import paint_trend
 from service.recordings.replay.choice import choose_machine
 from service.recordings.replay.source import RecordingSource, parse_moment
 
-__all__ = ["Kind", "PlotRequest", "draw_plot"]
+__all__ = ["Lines", "Paint", "Recorded", "correlation", "orbit", "recorded", "spectrum", "trend", "waterfall"]
 
-Kind = Literal["trend", "correlation", "orbit", "spectrum", "waterfall"]
+Paint = Callable[[Look], Figure]
+"""Draws what was read; all functions here that return one raise `RotorwatchError` if there is nothing to be seen."""
 
 
 @dataclass(frozen=True, slots=True)
-class PlotRequest:
-    """What is to be drawn.
+class Recorded:
+    """Recorded data of one machine.
 
     Attributes
     ----------
-    files : tuple of Path
-        Recordings.
-    kind : str
-    out : Path
-        Picture; its suffix, .png or .svg, is the format.
-    key : str or None
-        ``SITE/MACHINE``, where the recordings hold several.
-    from_, to, at : str or None
-        Times of the data, as `parse_moment` takes them; `at` is where the latest data end.
-    machine : str or None
-        ``FILE`` or ``FILE@BUNDLE`` for trends and correlations.
-    channels : tuple of str
-        For spectra.
-    revolutions : int
-        Of an orbit.
+    source : RecordingSource
+    keys : MachineKeys
+    from_ns, to_ns : int
+        Times of the data, from `from_ns` up to, and without, `to_ns`.
+    """
+
+    source: RecordingSource
+    keys: MachineKeys
+    from_ns: int
+    to_ns: int
+
+    @property
+    def name(self) -> str:
+        """``site/machine``."""
+        return f"{self.keys.site}/{self.keys.machine}"
+
+    @property
+    def stream(self) -> RecordedStream:
+        """The samples."""
+        return RecordedStream(self.source, self.keys, self.from_ns, self.to_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """How spectra are taken and shown.
+
+    Attributes
+    ----------
     window_s, resolution_hz : float
-        Of a spectrum.
     scaling : str
         ``amplitude`` or ``density``.
     log : bool
         Whether amplitudes are on a logarithmic scale.
     to_hz : float or None
         Highest frequency shown; None is as far as there is something to be seen.
-    over_speed, cascade : bool
-        For waterfalls: over the speed and not time; lines and not colours.
-    look : Look
     """
 
-    files: tuple[Path, ...]
-    kind: Kind
-    out: Path
-    key: str | None = None
-    from_: str | None = None
-    to: str | None = None
-    at: str | None = None
-    machine: str | None = None
-    channels: tuple[str, ...] = ()
-    revolutions: int = 8
-    window_s: float = 20.0
-    resolution_hz: float = 0.5
-    scaling: Scaling = "amplitude"
-    log: bool = False
-    to_hz: float | None = None
-    over_speed: bool = False
-    cascade: bool = False
-    look: Look = field(default_factory=Look)
+    window_s: float
+    resolution_hz: float
+    scaling: Scaling
+    log: bool
+    to_hz: float | None
 
 
-def draw_plot(request: PlotRequest) -> None:
-    """Read, compute, draw, write.
+def recorded(
+    files: tuple[Path, ...],
+    key: str | None,
+    between: tuple[str | None, str | None],
+    at: str | None = None,
+    *,
+    reports: bool = False,
+) -> Recorded:
+    """Find a machine's data in recordings.
+
+    Parameters
+    ----------
+    files : tuple of Path
+    key : str or None
+        ``SITE/MACHINE``, where the recordings hold several.
+    between : (str or None, str or None)
+        From and to, times of the data as `parse_moment` takes them.
+    at : str or None
+        Where the latest data end.
+    reports : bool
+        Whether a machine of which only reports were recorded will do.
 
     Raises
     ------
-    RotorwatchError
-        If a file cannot be used, or there is nothing to be seen; the message says what was looked for.
+    MachineFileError
+        If a file or time cannot be used, or there is no such machine.
     """
     try:
-        source = RecordingSource(request.files)
+        source = RecordingSource(files)
     except RecordingError as error:
         raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
-    keys = (trend_machine if request.kind == "trend" else RecordingSource.machine)(source, request.key)
-    from_ns, to_ns = _limits(request, source, keys)
-    if request.kind == "trend":
-        trend = read_trend(source, keys, request.machine, from_ns, to_ns)
-        draw(request.out, request.look, lambda look: paint_trend(trend, look))
-        return
-    name = f"{keys.site}/{keys.machine}"
-    if request.kind == "correlation":
-        installed = choose_machine(keys, request.machine)
-        machine, bundle = installed.known, installed.bundle
-        if machine is None or bundle is None:
-            raise MachineFileError(
-                "correlations are compared with what trained networks predict: name a bundle that has networks, as "
-                "--machine FILE@BUNDLE (one that was commissioned without the rotor's parameters has none)"
-            )
-        found = correlations_of(latest_window(source, keys, machine, from_ns, to_ns), machine, bundle)
-        networks = bundle.identity
-        draw(request.out, request.look, lambda look: paint_correlations(found, name, networks, look))
-        return
-    stream = RecordedStream(source, keys, from_ns, to_ns)
-    if request.kind == "orbit":
-        orbits = read_orbits(stream, request.revolutions)
-        draw(request.out, request.look, lambda look: paint_orbits(orbits, name, look))
-        return
-    draw(request.out, request.look, _spectra(request, stream, recorded_alarms(source, keys, from_ns, to_ns)))
+    keys = (trend_machine if reports else RecordingSource.machine)(source, key)
+    from_ns, to_ns = source.between(*between, keys)
+    if at is not None:
+        at_ns = parse_moment(at, source.span(keys).start_ns, "--at")
+        if not from_ns < at_ns:
+            raise MachineFileError(f"--at {at}: nothing was recorded before that, from {between[0] or 0} on")
+        to_ns = min(to_ns, at_ns)
+    return Recorded(source, keys, from_ns, to_ns)
 
 
-def _spectra(
-    request: PlotRequest, stream: RecordedStream, alarms: tuple[AlarmEventData, ...]
-) -> Callable[[Look], Figure]:
-    channels = stream.channels(request.channels) or stream.displacements
+def trend(data: Recorded, machine: str | None) -> Paint:
+    """Parameters over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
+    found = read_trend(data.source, data.keys, machine, data.from_ns, data.to_ns)
+    return lambda look: paint_trend(found, look)
+
+
+def correlation(data: Recorded, choice: str | None) -> Paint:
+    """Correlations of the latest window, with the shipped machine file or ``FILE[@BUNDLE]``."""
+    installed = choose_machine(data.keys, choice)
+    machine, bundle = installed.known, installed.bundle
+    if machine is None or bundle is None:
+        raise MachineFileError(
+            "correlations are compared with what trained networks predict: name a bundle that has networks, as "
+            "--machine FILE@BUNDLE (one that was commissioned without the rotor's parameters has none)"
+        )
+    window = latest_window(data.source, data.keys, machine, data.from_ns, data.to_ns)
+    found = correlations_of(window, machine, bundle)
+    return lambda look: paint_correlations(found, data.name, bundle.identity, look)
+
+
+def orbit(data: Recorded, revolutions: int) -> Paint:
+    """Orbits of the latest revolutions."""
+    found = read_orbits(data.stream, revolutions)
+    return lambda look: paint_orbits(found, data.name, look)
+
+
+def spectrum(data: Recorded, channels: tuple[str, ...], lines: Lines) -> Paint:
+    """Spectra of the latest seconds; of all displacements if no channel is named."""
+    stream = data.stream
+    chosen, up_to_hz = _chosen(stream, channels, lines)
+    found = read_spectrum(stream, chosen, lines.window_s, lines.resolution_hz, lines.scaling)
+    return lambda look: paint_spectrum(found, data.name, look, log=lines.log, up_to_hz=up_to_hz)
+
+
+def waterfall(data: Recorded, channels: tuple[str, ...], lines: Lines, *, over_speed: bool, cascade: bool) -> Paint:
+    """Spectra of one channel, the first displacement if none is named, over time or speed, as colours or as lines."""
+    if len(channels) > 1:
+        raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(channels)}")
+    stream = data.stream
+    chosen, up_to_hz = _chosen(stream, channels, lines)
+    found = read_waterfall(stream, chosen[0], lines.window_s, lines.resolution_hz, lines.scaling)
+    alarms = recorded_alarms(data.source, data.keys, data.from_ns, data.to_ns)
+    paint = paint_cascade if cascade else paint_map
+    return lambda look: paint(found, data.name, look, alarms, over_speed=over_speed, log=lines.log, up_to_hz=up_to_hz)
+
+
+def _chosen(stream: RecordedStream, names: tuple[str, ...], lines: Lines) -> tuple[tuple[Channel, ...], float | None]:
+    """Channels, and how far the spectra are shown."""
+    channels = stream.channels(names) or stream.displacements
     if not channels:
         raise MachineFileError(f"{stream.name} measures no displacement: name channels with --channel")
-    rate_hz = stream.descriptor.rate_hz
-    up_to_hz = None if request.to_hz is None else min(request.to_hz, rate_hz / 2)
-    if request.to_hz is not None and request.to_hz < 4 * request.resolution_hz:
+    if lines.to_hz is None:
+        return channels, None
+    if lines.to_hz < 4 * lines.resolution_hz:
         raise MachineFileError(
-            f"--to-hz is {request.to_hz:g}, expected at least four lines of --resolution {request.resolution_hz:g} Hz"
+            f"--to-hz is {lines.to_hz:g}, expected at least four lines of --resolution {lines.resolution_hz:g} Hz"
         )
-    log = request.log
-    if request.kind == "spectrum":
-        spectrum = read_spectrum(stream, channels, request.window_s, request.resolution_hz, request.scaling)
-        return lambda look: paint_spectrum(spectrum, stream.name, look, log=log, up_to_hz=up_to_hz)
-    if len(request.channels) > 1:
-        raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(request.channels)}")
-    waterfall = read_waterfall(stream, channels[0], request.window_s, request.resolution_hz, request.scaling)
-    paint = paint_cascade if request.cascade else paint_map
-    return lambda look: paint(
-        waterfall, stream.name, look, alarms, over_speed=request.over_speed, log=log, up_to_hz=up_to_hz
-    )
-
-
-def _limits(request: PlotRequest, source: RecordingSource, keys: MachineKeys) -> tuple[int, int]:
-    from_ns, to_ns = source.between(request.from_, request.to, keys)
-    if request.at is None:
-        return from_ns, to_ns
-    at_ns = parse_moment(request.at, source.span(keys).start_ns, "--at")
-    if not from_ns < at_ns:
-        raise MachineFileError(f"--at {request.at}: nothing was recorded before that, from {request.from_ or 0} on")
-    return from_ns, min(to_ns, at_ns)
+    return channels, min(lines.to_hz, stream.descriptor.rate_hz / 2)
