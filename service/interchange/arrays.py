@@ -5,15 +5,15 @@ memory (or from the file, where it is mapped).
 """
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+from service.interchange.source import Array, Reference, Source, SourceError, Timing, readable
 
-__all__ = ["MatlabSource", "NumpySource", "WavSource", "columns_of", "equally_long"]
+__all__ = ["MatlabSource", "NumpySource", "WavSource", "columns_of"]
 
 
 def columns_of(path: Path, array: Any, reference: Reference) -> Any:  # an ndarray, or a data set that slices like one
@@ -40,64 +40,12 @@ def columns_of(path: Path, array: Any, reference: Reference) -> Any:  # an ndarr
     return (lambda rows: array[rows, index]) if along_first else (lambda rows: array[index, rows])
 
 
-def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int]) -> int:
-    """Length of columns that belong together.
-
-    Raises
-    ------
-    SourceError
-        Naming two whose lengths differ.
-    """
-    for reference, length in zip(columns, lengths, strict=True):
-        if length != lengths[0]:
-            raise SourceError(
-                f"{path}: column {reference} has {length} rows, column {columns[0]} has {lengths[0]}; expected the same"
-            )
-    return lengths[0] if lengths else 0
-
-
-class _Arrays:
+class _Arrays(Source):
     """Columns of named arrays."""
 
-    path: Path
-
-    def __init__(self, path: Path, arrays: Mapping[str, Any]) -> None:
-        self.path = path
-        self._arrays = arrays
-
-    def names(self) -> tuple[str, ...]:
-        """Names of the arrays."""
-        return tuple(self._arrays)
-
-    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # others need them
-        """Nothing: bare arrays know no time."""
-        return Timing()
-
-    def unit(self, column: Reference) -> str:  # noqa: ARG002  # others need it
-        """Nothing: bare arrays know no units."""
-        return ""
-
-    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
-        """Rows, `CHUNK_ROWS` at a time."""
-        arrays = [self._arrays[named(self.path, reference.column, self.names())] for reference in columns]
-        reads = [columns_of(self.path, *pair) for pair in zip(arrays, columns, strict=True)]
-        count = equally_long(self.path, columns, [max(array.shape) for array in arrays])
-        for first in range(0, count, CHUNK_ROWS):
-            rows = slice(first, min(first + CHUNK_ROWS, count))
-            yield tuple(np.asarray(read(rows)) for read in reads)
-
-    def values(self, column: str) -> Array:
-        """Read the whole array, flat."""
-        return np.ravel(np.asarray(self._arrays[named(self.path, column, self.names())]))
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
+        array = self._column(Reference(reference.column))
+        return max(array.shape), columns_of(self.path, array, reference)
 
 
 class NumpySource(_Arrays):
@@ -113,8 +61,10 @@ class NumpySource(_Arrays):
         If it is not one.
     """
 
+    kind = "NumPy .npz"
+
     def __init__(self, path: Path) -> None:
-        with readable(path, "NumPy .npz"):
+        with readable(path, self.kind):
             with np.load(path, allow_pickle=False) as archive:
                 if not isinstance(archive, np.lib.npyio.NpzFile):
                     raise SourceError(f"{path}: a single array, expected an archive of named arrays (.npz)")
@@ -144,9 +94,11 @@ class MatlabSource(_Arrays):
         If it is not one.
     """
 
+    kind, package = "MATLAB", "h5py"
+
     def __init__(self, path: Path) -> None:
         self._file: Any = None
-        with readable(path, "MATLAB", "h5py"):
+        with readable(path, self.kind, self.package):
             with path.open("rb") as file:
                 head = file.read(520)
             if b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:520]):
@@ -183,10 +135,12 @@ class WavSource(_Arrays):
         If it is not one.
     """
 
+    kind = "WAV"
+
     def __init__(self, path: Path) -> None:
         from scipy.io import wavfile  # noqa: PLC0415  # slow to import; only for these files
 
-        with readable(path, "WAV"), warnings.catch_warnings():
+        with readable(path, self.kind), warnings.catch_warnings():
             warnings.simplefilter("ignore", wavfile.WavFileWarning)  # chunks of other programs that it skips
             try:
                 rate, samples = wavfile.read(path, mmap=True)

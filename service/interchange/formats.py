@@ -1,30 +1,31 @@
 """Which source reads which file."""
 
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from service.interchange.mapping import Mapping
 from service.interchange.source import Source, SourceError
 
-__all__ = ["open_source"]
+if TYPE_CHECKING:
+    from service.interchange.mapping import Mapping
 
-_SUFFIXES = {
-    ".csv": "csv",
-    ".txt": "csv",
-    ".tsv": "csv",
-    ".parquet": "parquet",
-    ".pq": "parquet",
-    ".npz": "npz",
-    ".mat": "mat",
-    ".wav": "wav",
-    ".uff": "uff",
-    ".unv": "uff",
-    ".tdms": "tdms",
-    ".mf4": "mf4",
-    ".mdf": "mf4",
+__all__ = ["Format", "open_source"]
+
+Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
+_SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
+    "csv": ("tables.CsvSource", (".csv", ".txt", ".tsv")),
+    "parquet": ("tables.ParquetSource", (".parquet", ".pq")),
+    "npz": ("arrays.NumpySource", (".npz",)),
+    "mat": ("arrays.MatlabSource", (".mat",)),
+    "wav": ("arrays.WavSource", (".wav",)),
+    "uff": ("universal.UniversalSource", (".uff", ".unv")),
+    "tdms": ("tdms.TdmsSource", (".tdms",)),
+    "mf4": ("mdf.MdfSource", (".mf4", ".mdf")),
 }
+"""Class in this package, imported when it is needed with the library that only it needs, and how files are named."""
 
 
-def open_source(path: Path, mapping: Mapping) -> Source:  # noqa: PLR0911  # one return per format
+def open_source(path: Path, mapping: "Mapping") -> Source:
     """Open a file by the format that the mapping or the end of its name says.
 
     Raises
@@ -34,41 +35,18 @@ def open_source(path: Path, mapping: Mapping) -> Source:  # noqa: PLR0911  # one
     """
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
-    kind = mapping.format or _SUFFIXES.get(path.suffix.lower())
-    match kind:  # each imports what only it needs
-        case "csv":
-            from service.interchange.tables import CsvSource  # noqa: PLC0415
-
-            return CsvSource(path, mapping.csv, mapping.time.column, datetimes=mapping.time.is_datetime)
-        case "parquet":
-            from service.interchange.tables import ParquetSource  # noqa: PLC0415
-
-            return ParquetSource(path)
-        case "npz":
-            from service.interchange.arrays import NumpySource  # noqa: PLC0415
-
-            return NumpySource(path)
-        case "mat":
-            from service.interchange.arrays import MatlabSource  # noqa: PLC0415
-
-            return MatlabSource(path)
-        case "wav":
-            from service.interchange.arrays import WavSource  # noqa: PLC0415
-
-            return WavSource(path)
-        case "uff":
-            from service.interchange.universal import UniversalSource  # noqa: PLC0415
-
-            return UniversalSource(path)
-        case "tdms":
-            from service.interchange.tdms import TdmsSource  # noqa: PLC0415
-
-            return TdmsSource(path)
-        case "mf4":
-            from service.interchange.mdf import MdfSource  # noqa: PLC0415
-
-            return MdfSource(path)
-    raise SourceError(
-        f"{path}: format {path.suffix or 'without a suffix'!r} is not known; say format = ... in the mapping, or name "
-        f"the file {', '.join(_SUFFIXES)}"
-    )
+    suffixes = {suffix: kind for kind, (_, those) in _SOURCES.items() for suffix in those}
+    kind = mapping.format or suffixes.get(path.suffix.lower())
+    if kind is None:
+        raise SourceError(
+            f"{path}: format {path.suffix or 'without a suffix'!r} is not known; say format = ... in the mapping, or "
+            f"name the file {', '.join(suffixes)}"
+        )
+    module, _, name = _SOURCES[kind][0].partition(".")
+    source = getattr(import_module(f"service.interchange.{module}"), name)
+    found: Source
+    if kind == "csv":
+        found = source(path, mapping.csv, mapping.time.column, datetimes=mapping.time.is_datetime)
+    else:
+        found = source(path)
+    return found

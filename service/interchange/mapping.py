@@ -14,6 +14,7 @@ from models.machine import MachineFile
 from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity
 from models.signals.units import time_unit_ns, unit_factor
+from service.interchange.formats import Format
 
 __all__ = ["Column", "CsvFormat", "Keyphasor", "Mapping", "TimeBase", "load_mapping"]
 
@@ -160,9 +161,7 @@ class Mapping(BaseModel):
 
     model_config = _STRICT
 
-    format: Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"] | None = Field(
-        default=None, description="format of the file where its name does not say"
-    )
+    format: Format | None = Field(default=None, description="format of the file where its name does not say")
     csv: CsvFormat = CsvFormat()
     time: TimeBase = TimeBase()
     channels: dict[str, Column] = Field(default={}, description="channel of the machine to column")

@@ -3,19 +3,18 @@
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from service.interchange.arrays import equally_long
-from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, Timing, equally_long, readable
 
 __all__ = ["MdfSource"]
 
 _SAME_TIME_S = 1e-9
 
 
-class MdfSource:
+class MdfSource(Source):
     """An MF4 file, read piece by piece.
 
     A channel is named by its own name where that is unique, and always ``number of its group/name``. ``time`` is the
@@ -31,28 +30,24 @@ class MdfSource:
         If it is not one.
     """
 
-    path: Path
+    kind, package, entry = "MF4", "asammdf", "channel"
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._places: dict[str, tuple[int, int]] = {}
-        with readable(path, "MF4", "asammdf"):
+        places: dict[str, tuple[int, int]] = {}
+        with readable(path, self.kind, self.package):
             from asammdf import MDF  # noqa: PLC0415  # an extra
 
             logging.getLogger("asammdf").setLevel(logging.CRITICAL)  # its errors come as exceptions as well
             if not path.is_file():
                 raise SourceError(f"{path}: no such file")
             self._file: Any = MDF(path)
-            for name, places in self._file.channels_db.items():
-                for group, index in places:
+            for name, found in self._file.channels_db.items():
+                for group, index in found:
                     if index != self._file.masters_db.get(group):
-                        self._places[f"{group}/{name}"] = (group, index)
-                        if len(places) == 1:
-                            self._places[name] = (group, index)
-
-    def names(self) -> tuple[str, ...]:
-        """Channels, by short and by full name, and ``time``."""
-        return ("time", *self._places)
+                        places[f"{group}/{name}"] = (group, index)
+                        if len(found) == 1:
+                            places[name] = (group, index)
+        super().__init__(path, {"time": None} | places)
 
     def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
         """Start of the measurement; every row has its own time."""
@@ -62,19 +57,19 @@ class MdfSource:
         """Unit of the channel."""
         if column.column == "time":
             return "s"
-        group, index = self._place(column)
+        group, index = self._column(column)
         return str(self._file.groups[group].channels[index].unit or "")
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
         """Rows, `CHUNK_ROWS` at a time; channels of several groups must have the same times."""
-        places = [None if reference.column == "time" else self._place(reference) for reference in columns]
+        places = [self._column(reference) for reference in columns]
         asked = [reference for reference, place in zip(columns, places, strict=True) if place is not None]
         groups = [place[0] for place in places if place is not None]
         if not groups:
             raise SourceError(f"{self.path}: time alone is no measurement, expected a channel as well")
         counts = [int(self._file.groups[group].channel_group.cycles_nr) for group in groups]
         count = equally_long(self.path, asked, counts)
-        with readable(self.path, "MF4", "asammdf"):
+        with readable(self.path, self.kind, self.package):
             for first in range(0, count, CHUNK_ROWS):
                 signals = [None if place is None else self._read(place, first) for place in places]
                 present = [signal for signal in signals if signal is not None]
@@ -87,27 +82,16 @@ class MdfSource:
 
     def values(self, column: str) -> Array:
         """Read a channel whole."""
-        group, index = self._place(Reference(column))
-        with readable(self.path, "MF4", "asammdf"):
+        group, index = self._column(Reference(column))
+        with readable(self.path, self.kind, self.package):
             return np.asarray(self._file.get(group=group, index=index).samples)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _read(self, place: tuple[int, int], first: int) -> Any:
         return self._file.get(group=place[0], index=place[1], record_offset=first, record_count=CHUNK_ROWS)
-
-    def _place(self, reference: Reference) -> tuple[int, int]:
-        if reference.index is not None:
-            raise SourceError(f"{self.path}: channel {reference}: index is for tables within .npz and .mat files")
-        return self._places[named(self.path, reference.column, self.names(), "channel")]
 
     def _start_ns(self) -> int:
         start = np.datetime64(self._file.header.start_time.replace(tzinfo=None), "ns")

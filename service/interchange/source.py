@@ -1,14 +1,14 @@
-"""What an importer asks of a file. A new format is one module with one class that does this.
+"""What an importer asks of a file. A new format is one class, and a line in `service.interchange.formats`.
 
 A source hands out columns as the file has them, in pieces, and what the file itself says of time and units. It checks
 nothing: units, times and numbers are judged in one place for all formats.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,7 @@ __all__ = [
     "SourceError",
     "Timing",
     "as_numbers",
+    "equally_long",
     "named",
     "readable",
 ]
@@ -75,44 +76,98 @@ class Timing:
     time: Reference | None = None
 
 
-class Source(Protocol):
-    """An open file of columns; a context manager."""
+class Source:
+    """An open file of named columns; a context manager.
 
-    path: Path
+    A format says how its columns are found, and of these methods what is otherwise than here: columns that have a
+    length and can be sliced, in a file that knows neither time nor units.
+
+    Parameters
+    ----------
+    path : Path
+    columns : mapping of str to object
+        What the format's library has for each column, by name.
+    """
+
+    kind: ClassVar[str]
+    """What the format is called."""
+    package: ClassVar[str] = ""
+    """Package of the extra ``io`` that reads it."""
+    entry: ClassVar[str] = "column"
+    """What the format calls a column."""
+
+    def __init__(self, path: Path, columns: Mapping[str, Any]) -> None:
+        self.path = path
+        self._columns = columns
 
     def names(self) -> tuple[str, ...]:
         """Columns that there are."""
-        ...
+        return tuple(self._columns)
 
-    def timing(self, columns: Sequence[Reference]) -> Timing:
+    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002  # others need them
         """What the file says of the time of these columns; raises `SourceError` if they contradict each other."""
-        ...
+        return Timing()
 
-    def unit(self, column: Reference) -> str:
+    def unit(self, column: Reference) -> str:  # noqa: ARG002  # others need it
         """Unit that the file states for a column, or an empty string."""
-        ...
+        return ""
 
     def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
-        """Go through the rows from the first one on; may be asked again.
+        """Go through the rows from the first one on, `CHUNK_ROWS` at a time; may be asked again.
 
         Yields
         ------
         tuple of ndarray, shape (n_rows,)
             One per column and of the same length, numbers or datetime64 as the file has them.
         """
-        ...
+        lengths, reads = zip(*(self._rows(reference) for reference in columns), strict=True) if columns else ((), ())
+        count = equally_long(self.path, columns, lengths)
+        with readable(self.path, self.kind, self.package):
+            for first in range(0, count, CHUNK_ROWS):
+                rows = slice(first, min(first + CHUNK_ROWS, count))
+                yield tuple(np.asarray(read(rows)) for read in reads)
 
     def values(self, column: str) -> Array:
         """Read an array that is no column of samples, such as scales or times of pulses, as the file has it."""
-        ...
+        with readable(self.path, self.kind, self.package):
+            return np.ravel(np.asarray(self._column(Reference(column))[...]))
 
     def close(self) -> None:
-        """Close the file."""
-        ...
+        """Close the file, if it is still open."""
 
-    def __enter__(self) -> "Source": ...
+    def __enter__(self) -> Self:
+        return self
 
-    def __exit__(self, *_: object) -> None: ...
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _column(self, reference: Reference) -> Any:
+        """What the library has for a column that has no index."""
+        found = self._columns[named(self.path, reference.column, self.names(), self.entry)]
+        if reference.index is not None:
+            raise SourceError(f"{self.path}: {self.entry} {reference}: index is for tables within .npz and .mat files")
+        return found
+
+    def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
+        """Length of a column, and what reads some of its rows."""
+        column = self._column(reference)
+        return len(column), column.__getitem__
+
+
+def equally_long(path: Path, columns: Sequence[Reference], lengths: Sequence[int]) -> int:
+    """Length of columns that belong together.
+
+    Raises
+    ------
+    SourceError
+        Naming two whose lengths differ.
+    """
+    for reference, length in zip(columns, lengths, strict=True):
+        if length != lengths[0]:
+            raise SourceError(
+                f"{path}: column {reference} has {length} rows, column {columns[0]} has {lengths[0]}; expected the same"
+            )
+    return lengths[0] if lengths else 0
 
 
 def named(path: Path, name: str, names: Sequence[str], what: str = "column") -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -10,45 +10,30 @@ import pyarrow.csv
 import pyarrow.parquet
 
 from service.interchange.mapping import CsvFormat
-from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, readable
 
 __all__ = ["CsvSource", "ParquetSource"]
 
 _BYTES = 4 << 20
 
 
-class _Table:
-    """What the two tables have in common."""
-
-    path: Path
+class _Table(Source):
+    """What the two tables have in common; a table's time is a column that the mapping names."""
 
     def __init__(self, path: Path, names: Sequence[str]) -> None:
-        self.path = path
-        self._names = tuple(names)
+        super().__init__(path, dict.fromkeys(names))
+        self._twice = {name for name in names if names.count(name) > 1}
 
-    def names(self) -> tuple[str, ...]:
-        """Names of the columns."""
-        return self._names
-
-    def timing(self, columns: Sequence[Reference]) -> Timing:  # noqa: ARG002
-        """Nothing: a table's time is a column that the mapping names."""
-        return Timing()
-
-    def close(self) -> None:
-        """Nothing stays open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def values(self, column: str) -> Array:
+        """Read a column that may be shorter than the others; empty cells are left out."""
+        pieces = [piece for (piece,) in self.chunks([Reference(column)])]
+        joined = np.concatenate(pieces) if pieces else np.empty(0)
+        return np.asarray(joined[~np.isnan(joined)])
 
     def _checked(self, columns: Sequence[Reference]) -> list[str]:
         for reference in columns:
-            named(self.path, reference.column, self._names)
-            if reference.index is not None:
-                raise SourceError(f"{self.path}: column {reference}: index is for tables within .npz and .mat files")
-            if self._names.count(reference.column) > 1:
+            self._column(reference)
+            if reference.column in self._twice:
                 raise SourceError(f"{self.path}: there are several columns named {reference.column!r}")
         return [reference.column for reference in columns]
 
@@ -73,10 +58,12 @@ class CsvSource(_Table):
         If the first lines are no table.
     """
 
+    kind = "CSV"
+
     def __init__(self, path: Path, form: CsvFormat, time_column: str | None, *, datetimes: bool) -> None:
         self._form, self._time_column = form, time_column
         self._time_type = pa.timestamp("ns", tz="UTC") if datetimes else pa.float64()
-        with readable(path, "CSV"), self._reader(path, None) as reader:
+        with readable(path, self.kind), self._reader(path, None) as reader:
             names = list(reader.schema.names)
             label = "" if time_column is None else self._label(time_column)
             if not datetimes and label in names and reader.schema.field(names.index(label)).type == pa.int64():
@@ -94,7 +81,7 @@ class CsvSource(_Table):
         """Rows, some megabytes of text at a time."""
         wanted = self._checked(columns)
         count = 0
-        with readable(self.path, "CSV"):
+        with readable(self.path, self.kind):
             try:
                 with self._reader(self.path, wanted) as reader:
                     for batch in reader:
@@ -102,12 +89,6 @@ class CsvSource(_Table):
                         yield tuple(_array(batch.column(self._label(name))) for name in wanted)
             except pa.ArrowInvalid as error:
                 raise SourceError(self._fault(wanted) or f"{self.path}: after row {count}: {error}") from error
-
-    def values(self, column: str) -> Array:
-        """Read a column that may be shorter than the others; empty cells are left out."""
-        pieces = [piece for (piece,) in self.chunks([Reference(column)])]
-        joined = np.concatenate(pieces) if pieces else np.empty(0)
-        return np.asarray(joined[~np.isnan(joined)])
 
     def _reader(self, path: Path, wanted: list[str] | None, *, as_text: bool = False) -> Any:
         form = self._form
@@ -185,8 +166,10 @@ class ParquetSource(_Table):
         If it is not one.
     """
 
+    kind = "Parquet"
+
     def __init__(self, path: Path) -> None:
-        with readable(path, "Parquet"), pa.parquet.ParquetFile(path) as file:
+        with readable(path, self.kind), pa.parquet.ParquetFile(path) as file:
             self._schema = file.schema_arrow
         super().__init__(path, self._schema.names)
 
@@ -203,15 +186,9 @@ class ParquetSource(_Table):
             if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_timestamp(kind)):
                 raise SourceError(f"{self.path}: column {name!r} holds {kind}, expected numbers")
         # With pre_buffer Arrow would keep all that it has read of the file.
-        with readable(self.path, "Parquet"), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
+        with readable(self.path, self.kind), pa.parquet.ParquetFile(self.path, pre_buffer=False) as file:
             for batch in file.iter_batches(batch_size=CHUNK_ROWS, columns=wanted, use_threads=False):
                 yield tuple(_array(batch.column(name)) for name in wanted)
-
-    def values(self, column: str) -> Array:
-        """Read a column whole; missing values are left out."""
-        pieces = [piece for (piece,) in self.chunks([Reference(column)])]
-        joined = np.concatenate(pieces) if pieces else np.empty(0)
-        return np.asarray(joined[~np.isnan(joined)])
 
 
 def _array(column: Any) -> Array:

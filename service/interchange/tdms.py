@@ -1,18 +1,17 @@
 """Source: TDMS files of LabVIEW and DIAdem."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from service.interchange.arrays import equally_long
-from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+from service.interchange.source import Reference, Source, SourceError, Timing, readable
 
 __all__ = ["TdmsSource"]
 
 
-class TdmsSource:
+class TdmsSource(Source):
     """A TDMS file, read piece by piece. Channels are named ``group/channel``, or ``channel`` where that is unique.
 
     Parameters
@@ -25,12 +24,10 @@ class TdmsSource:
         If it is not one.
     """
 
-    path: Path
+    kind, package, entry = "TDMS", "npTDMS", "channel"
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._channels: dict[str, Any] = {}
-        with readable(path, "TDMS", "npTDMS"):
+        with readable(path, self.kind, self.package):
             from nptdms import TdmsFile  # noqa: PLC0415  # an extra
 
             self._file = path.open("rb")  # ours, because the library leaves a file open that it cannot read
@@ -41,21 +38,15 @@ class TdmsSource:
                 self._file.close()
                 raise
         short = [channel.name for channel in channels]
-        for channel in channels:
-            self._channels[f"{channel.group_name}/{channel.name}"] = channel
-        for channel in channels:
-            if short.count(channel.name) == 1:
-                self._channels.setdefault(channel.name, channel)
-
-    def names(self) -> tuple[str, ...]:
-        """Channels, by full and by short name."""
-        return tuple(self._channels)
+        full = {f"{channel.group_name}/{channel.name}": channel for channel in channels}
+        unique = {channel.name: channel for channel in channels if short.count(channel.name) == 1}
+        super().__init__(path, full | {name: channel for name, channel in unique.items() if name not in full})
 
     def timing(self, columns: Sequence[Reference]) -> Timing:
         """Rate and start of the waveforms (``wf_increment``, ``wf_start_time``, ``wf_start_offset``)."""
         found: Timing | None = None
         for reference in columns:
-            properties = self._channel(reference).properties
+            properties = self._column(reference).properties
             increment_s = float(properties.get("wf_increment") or 0.0)
             timing = Timing(1 / increment_s if increment_s > 0 else None, _start_ns(properties))
             if found is not None and timing != found:
@@ -68,38 +59,17 @@ class TdmsSource:
 
     def unit(self, column: Reference) -> str:
         """Property ``unit_string``, or what NI-DAQ calls it."""
-        properties = self._channel(column).properties
+        properties = self._column(column).properties
         return str(properties.get("unit_string") or properties.get("NI_UnitDescription") or "")
-
-    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
-        """Rows, `CHUNK_ROWS` at a time."""
-        channels = [self._channel(reference) for reference in columns]
-        count = equally_long(self.path, columns, [len(channel) for channel in channels])
-        with readable(self.path, "TDMS", "npTDMS"):
-            for first in range(0, count, CHUNK_ROWS):
-                length = min(CHUNK_ROWS, count - first)
-                yield tuple(np.asarray(channel.read_data(first, length)) for channel in channels)
-
-    def values(self, column: str) -> Array:
-        """Read a channel whole."""
-        with readable(self.path, "TDMS", "npTDMS"):
-            return np.asarray(self._channel(Reference(column)).read_data())
 
     def close(self) -> None:
         """Close the file."""
         self._tdms.close()
         self._file.close()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _channel(self, reference: Reference) -> Any:
-        if reference.index is not None:
-            raise SourceError(f"{self.path}: channel {reference}: index is for tables within .npz and .mat files")
-        return self._channels[named(self.path, reference.column, self.names(), "channel")]
+    def _rows(self, reference: Reference) -> tuple[int, Callable[[slice], Any]]:
+        channel = self._column(reference)
+        return len(channel), lambda rows: channel.read_data(rows.start, rows.stop - rows.start)
 
 
 def _start_ns(properties: Any) -> int | None:

@@ -1,13 +1,12 @@
 """Source: Universal File Format, data set 58 (functions at nodal degrees of freedom), time responses."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from service.interchange.arrays import equally_long
-from service.interchange.source import CHUNK_ROWS, Array, Reference, SourceError, Timing, named, readable
+from service.interchange.source import Reference, Source, SourceError, Timing, readable
 
 __all__ = ["UniversalSource"]
 
@@ -15,7 +14,7 @@ _TIME_RESPONSE = 1
 _EVEN = 1e-6
 
 
-class UniversalSource:
+class UniversalSource(Source):
     """A UFF file, read whole. A data set is named by its first line where that is unique, and ``set 1``, ``set 2``, ...
 
     Parameters
@@ -28,11 +27,10 @@ class UniversalSource:
         If it is not one, or holds no time response.
     """
 
-    path: Path
+    kind, package, entry = "UFF", "pyuff", "data set"
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        with readable(path, "UFF", "pyuff"):
+        with readable(path, self.kind, self.package):
             import pyuff  # noqa: PLC0415  # an extra
 
             if not path.is_file():
@@ -49,10 +47,7 @@ class UniversalSource:
         for title, found in zip(titles, sets, strict=True):
             if title not in ("", "NONE") and titles.count(title) == 1:
                 self._sets.setdefault(title, found)
-
-    def names(self) -> tuple[str, ...]:
-        """Data sets, by number and by title."""
-        return tuple(self._sets)
+        super().__init__(path, {name: np.asarray(found["data"]) for name, found in self._sets.items()})
 
     def timing(self, columns: Sequence[Reference]) -> Timing:
         """Rate from the abscissa's increment, or from its values where the file gives no increment."""
@@ -67,36 +62,12 @@ class UniversalSource:
 
     def unit(self, column: Reference) -> str:
         """Label of the ordinate's unit."""
-        label = str(self._set(column)["ordinate_axis_units_lab"]).strip()
+        label = str(self._sets[column.column]["ordinate_axis_units_lab"]).strip()
         return "" if label == "NONE" else label
 
-    def chunks(self, columns: Sequence[Reference]) -> Iterator[tuple[Array, ...]]:
-        """Rows, `CHUNK_ROWS` at a time."""
-        data = [np.asarray(self._set(reference)["data"]) for reference in columns]
-        count = equally_long(self.path, columns, [column.size for column in data])
-        for first in range(0, count, CHUNK_ROWS):
-            yield tuple(column[first : first + CHUNK_ROWS] for column in data)
-
-    def values(self, column: str) -> Array:
-        """Read a data set's ordinates."""
-        return np.asarray(self._set(Reference(column))["data"])
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _set(self, reference: Reference) -> dict[str, Any]:
-        if reference.index is not None:
-            raise SourceError(f"{self.path}: {reference}: index is for tables within .npz and .mat files")
-        return self._sets[named(self.path, reference.column, self.names(), "data set")]
-
     def _rate_hz(self, reference: Reference) -> float:
-        found = self._set(reference)
+        self._column(reference)  # refuses what is not there
+        found = self._sets[reference.column]
         step_s = float(found["abscissa_inc"])
         if found["abscissa_spacing"] == 1 and step_s > 0:
             return 1 / step_s
