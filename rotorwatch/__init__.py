@@ -4,7 +4,8 @@
 eclipse-zenoh. ``docs/client.md`` shows both.
 """
 
-from rotorwatch.client.client import Client
+from typing import TYPE_CHECKING
+
 from rotorwatch.client.errors import (
     AccessRefused,
     ClientError,
@@ -15,7 +16,6 @@ from rotorwatch.client.errors import (
     RequestRefused,
     Unavailable,
 )
-from rotorwatch.client.event_stream import ServiceEvent
 from rotorwatch.records.alarms import (
     Alarm,
     AlarmCloudEvent,
@@ -37,6 +37,10 @@ from rotorwatch.records.machines import (
 from rotorwatch.records.operations import OperationDone
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from rotorwatch.records.windows import Finding, Parameter, SensorFault, Verdict
+
+if TYPE_CHECKING:
+    from rotorwatch.client.client import Client
+    from rotorwatch.client.event_stream import ServiceEvent
 
 __version__ = "0.1.0"
 
@@ -81,3 +85,16 @@ __all__ = [
     "Verdict",
     "__version__",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """Import the client where it is asked for: who wants records alone does not wait for an HTTP client."""
+    if name == "Client":
+        from rotorwatch.client.client import Client  # noqa: PLC0415
+
+        return Client
+    if name == "ServiceEvent":
+        from rotorwatch.client.event_stream import ServiceEvent  # noqa: PLC0415
+
+        return ServiceEvent
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -108,8 +108,8 @@ def run(
         configure_logging(settings.log)
         with stop_request() as stop, running(settings) as service:
             for worker in service.machines():
-                networks = worker.identity.bundle or "none: the equations are not evaluated"
-                typer.echo(f"machine {worker.identity.site}/{worker.identity.machine}, bundle {networks}")
+                networks = worker.identity["bundle"] or "none: the equations are not evaluated"
+                typer.echo(f"machine {worker.machine.site}/{worker.machine.name}, bundle {networks}")
             if settings.link.namespace:
                 typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing from outside it is heard")
             for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):

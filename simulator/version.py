@@ -9,7 +9,7 @@ __all__ = ["VersionOption"]
 
 def _say_version(context: typer.Context, wanted: bool) -> None:
     if wanted:
-        from rotorwatch import __version__  # noqa: PLC0415  # brings an HTTP client, which nothing else waits for
+        from rotorwatch import __version__  # noqa: PLC0415  # brings pydantic, which nothing else here waits for
 
         typer.echo(f"{context.find_root().info_name} {__version__}")
         raise typer.Exit

@@ -23,10 +23,11 @@ from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperNetwork, mean_
 from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
 from models.diagnosis.networks.relation_training import train_network
-from models.diagnosis.readings import Diagnostician, ParameterReading
+from models.diagnosis.readings import Diagnostician
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
+from rotorwatch.records.windows import Parameter
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 _FAULTS: tuple[dict[str, float], ...] = (
@@ -149,14 +150,16 @@ def _values(one: _Trained, window: WindowStatistics) -> dict[Measure, _Values]:
     power = float(np.mean((rows.target / rows.norm) ** 2))  # 1 where the window is normalised
     return {
         Measure.MSD: {"msd": ((reading.msd or 0.0) / power, None)},
-        Measure.PROJECTION: {one.name: (one.change or 0.0, one.change or 0.0) for one in reading.parameters},
-        Measure.OWN_ERROR: {one.name: (one.z or 0.0, one.change or 0.0) for one in reading.parameters},
+        Measure.PROJECTION: {
+            one.name: (one.relative_change or 0.0, one.relative_change or 0.0) for one in reading.parameters
+        },
+        Measure.OWN_ERROR: {one.name: (one.z or 0.0, one.relative_change or 0.0) for one in reading.parameters},
     }
 
 
 def _others(machine: Machine, bundle: Bundle, reader: Reader, window: WindowStatistics) -> dict[str, _Values]:
     """What shipped networks or the likelihood say of each equation's own parameters; nothing where they refuse."""
-    parameters: Sequence[ParameterReading] = ()
+    parameters: Sequence[Parameter] = ()
     if reader is Reader.SHIPPED:
         parameters = [one for network in bundle.networks for one in read_equation(network, window, machine).parameters]
     else:
@@ -167,7 +170,7 @@ def _others(machine: Machine, bundle: Bundle, reader: Reader, window: WindowStat
             parameters = judge.diagnose(window).evaluable
         except EstimationError:
             parameters = ()
-    read = {one.name: (one.z or 0.0, one.change or 0.0) for one in parameters}
+    read = {one.name: (one.z or 0.0, one.relative_change or 0.0) for one in parameters}
     return {number: {name: read[name] for name in own if name in read} for number, own in _OWN.items()}
 
 

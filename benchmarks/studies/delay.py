@@ -109,7 +109,7 @@ class _Watch:
         if delay_s <= 0:
             self.early = self.early or verdict.detected
             return
-        said = {finding.name for finding in verdict.findings}
+        said = {finding.name for finding in verdict.changed}
         self.wrong = self.wrong or bool(said - {self._parameter})
         if verdict.detected and self.detected_s is None:
             self.detected_s = delay_s

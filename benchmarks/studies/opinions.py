@@ -60,7 +60,7 @@ def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ..
         return {"method": one.by, "refused": refused, "seconds": seconds}
     said: dict[str, Value] = {"method": one.by, "refused": "", "seconds": seconds}
     for parameter in read:
-        figures = (parameter.change or 0.0, parameter.standard_error or 0.0)
+        figures = (parameter.relative_change or 0.0, parameter.standard_error or 0.0)
         change, error_ = (float(f"{figure:.6g}") for figure in figures)
         said |= {parameter.name: change, f"{parameter.name} error": error_}
     for prefix, rate in zip(("", "strict "), rates, strict=False):

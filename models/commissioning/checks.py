@@ -11,11 +11,11 @@ from models.commissioning.healthy import HealthyRecording
 from models.commissioning.lines import foreign_lines
 from models.diagnosis.baseline.excitation import one_source
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.sensors.finding import SensorFinding
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.physics.parameters import PARAMETER_TEXT
+from rotorwatch.records.windows import SensorFault
 
 __all__ = [
     "SAME_SPEED",
@@ -90,12 +90,12 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     return Check(name=name, verdict="passed", text=found)
 
 
-def check_sensors_of(findings: Mapping[str, Sequence[SensorFinding]]) -> Check:
+def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
     """Whether a sensor was at fault while the recordings were made.
 
     Parameters
     ----------
-    findings : mapping of str to sequence of SensorFinding
+    findings : mapping of str to sequence of SensorFault
         By recording.
     """
     name = "sensors"
@@ -302,7 +302,7 @@ def _compared(name: str, diagnoses: Sequence[Diagnosis], between: str, *, theory
             (r for each in readable for r in each.evaluable if r.name == worst), key=lambda r: abs(r.z or 0.0)
         )
         text = (
-            f"{PARAMETER_TEXT[worst]} differs {between}: {reading.change or 0.0:+.1%}, "
+            f"{PARAMETER_TEXT[worst]} differs {between}: {reading.relative_change or 0.0:+.1%}, "
             f"{abs(reading.z or 0.0):.1f} standard errors, in {named[worst]} of {len(readable)} windows"
         )
         return Check(

@@ -120,12 +120,7 @@ def _moved(machine: Machine, moves: dict[str, float], windows: Sequence[WindowSt
 
 def _with_unbalance(machine: Machine, windows: Sequence[WindowStatistics]) -> Machine:
     """Size and phase of the unbalance, from the vectors that are read in the windows."""
-    vectors = [
-        reading.vector
-        for diagnosis in _read(machine, windows)
-        for reading in diagnosis.parameters
-        if reading.vector is not None
-    ]
+    vectors = [diagnosis.unbalance for diagnosis in _read(machine, windows) if diagnosis.unbalance is not None]
     if not vectors:
         return machine
     weights = np.array([1 / (one.variance_real + one.variance_imaginary) for one in vectors])

@@ -178,7 +178,7 @@ def _errors(name: str, diagnosis: Diagnosis) -> tuple[float, float] | None:
     if name not in names:
         return None
     at = names.index(name)
-    factor = slope(name, to_scale(name, diagnosis.evaluable[at].change or 0.0))
+    factor = slope(name, to_scale(name, diagnosis.evaluable[at].relative_change or 0.0))
     total = float(diagnosis.full_covariance[at, at])
     shared = 0.0 if diagnosis.common is None else float(diagnosis.common[at, at])
     return math.sqrt(max(0.0, total - shared)) / factor, math.sqrt(shared) / factor
@@ -191,9 +191,12 @@ def _spread(readings: Sequence[HealthyReading]) -> float | None:
 def _readings(name: str, compared: Sequence[tuple[str, int, Diagnosis]]) -> tuple[HealthyReading, ...]:
     return tuple(
         HealthyReading(
-            recording=recording, end_ns=end_ns, relative_change=reading.change, standard_error=reading.standard_error
+            recording=recording,
+            end_ns=end_ns,
+            relative_change=reading.relative_change,
+            standard_error=reading.standard_error,
         )
         for recording, end_ns, diagnosis in compared
         for reading in diagnosis.evaluable
-        if reading.name == name and reading.change is not None and reading.standard_error is not None
+        if reading.name == name and reading.relative_change is not None and reading.standard_error is not None
     )

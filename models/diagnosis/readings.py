@@ -8,11 +8,14 @@ import numpy as np
 
 from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.diagnosis.window import WindowStatistics
-from models.physics.parameters import QUANTITY
+from models.errors import EstimationError
+from models.physics.parameters import PARAMETER_TEXT, QUANTITY
 from models.physics.possible import impossible
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Equation, Parameter
+from rotorwatch.records.windows import UnbalanceVector as VectorRecord
 
-__all__ = ["Z95", "Diagnosis", "Diagnostician", "EquationReading", "ParameterReading", "interval_95"]
+__all__ = ["Z95", "Diagnosis", "Diagnostician", "interval_95", "no_reading", "parameter_reading", "possible_reading"]
 
 Z95 = 1.959964
 """Standard errors on either side of a 95 % interval."""
@@ -24,87 +27,68 @@ def interval_95(value: float, standard_error: float, least: float = -math.inf) -
     return max(least, value - half), value + half
 
 
-@dataclass(frozen=True, slots=True)
-class ParameterReading:
-    """One parameter's relative change in one window, as one diagnostician sees it.
+def parameter_reading(
+    name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
+) -> Parameter:
+    """One parameter as one diagnostician reads it.
 
-    Attributes
+    Parameters
     ----------
     name : str
         One of ``models.physics.parameters.PARAMETERS``.
     by : str
-        Who says so: ``likelihood``, ``network`` (amortised) or ``relation``.
-    change, standard_error : float or None
-        Relative change from nominal and its standard error; None if not evaluable.
-    reason : str
-        Why it could not be evaluated; empty if it was.
-    vector : UnbalanceVector or None
-        Of e, where there is a phase reference: size and direction. `change` is then that of the size as long as the
-        heavy spot stays where it is, and the size of the vector of change once it has turned.
+        Who says so: ``likelihood``, ``network`` (amortised), ``relation`` or ``baseline``.
+    change, standard_error : float
+        Relative change from nominal and its standard error.
+    vector : UnbalanceVector, optional
+        Of e, where there is a phase reference. `change` is then that of its size as long as the heavy spot stays where
+        it is, and the size of the vector of change once it has turned.
+
+    Raises
+    ------
+    EstimationError
+        If the change is not finite.
     """
-
-    name: str
-    by: str
-    change: float | None = None
-    standard_error: float | None = None
-    reason: str = ""
-    vector: UnbalanceVector | None = None
-
-    @classmethod
-    def of(
-        cls, name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
-    ) -> "ParameterReading":
-        """A reading, or the reason why the number is none: physics does not allow it."""
-        reason = impossible(change, QUANTITY[name])
-        return cls(name, by, reason=reason) if reason else cls(name, by, change, standard_error, vector=vector)
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """95 % interval of the change."""
-        if self.change is None or self.standard_error is None:
-            return None
-        return interval_95(self.change, self.standard_error, least=-1.0)
-
-    @property
-    def z(self) -> float | None:
-        """Change in standard errors."""
-        if self.change is None or self.standard_error is None:
-            return None
-        return self.change / self.standard_error
+    if not math.isfinite(change):
+        raise EstimationError(f"{by}: change of {name} reads as {change}, expected a finite number")
+    known = math.isfinite(standard_error)
+    return Parameter(
+        name=name,
+        text=PARAMETER_TEXT[name],
+        by=by,
+        relative_change=change,
+        standard_error=standard_error,
+        interval_95=interval_95(change, standard_error, least=-1.0) if known else None,
+        z=change / standard_error if known and standard_error else None,
+        vector=None if vector is None else _stated(vector),
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class EquationReading:
-    """Residual of one compatibility equation in one window.
+def no_reading(name: str, by: str, reason: str) -> Parameter:
+    """Why one diagnostician cannot read a parameter."""
+    return Parameter(name=name, text=PARAMETER_TEXT[name], by=by, reason=reason)
 
-    Attributes
-    ----------
-    equation : str
-        The paper's number: "28" to "31".
-    title : str
-        What the equation is about.
-    msd : float or None
-        Mean squared deviation between the network's output and the estimated correlation, in units of the target's mean
-        square (the paper's measure).
-    msd_healthy : float or None
-        The same on healthy windows that training did not see: mean.
-    parameters : tuple of ParameterReading
-        The residual projected on the equation's own parameters.
-    reason : str
-        Why the equation could not be evaluated; empty if it was.
-    """
 
-    equation: str
-    title: str
-    msd: float | None = None
-    msd_healthy: float | None = None
-    parameters: tuple[ParameterReading, ...] = ()
-    reason: str = ""
+def possible_reading(
+    name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
+) -> Parameter:
+    """A reading, or the reason why the number is none: physics does not allow it."""
+    reason = impossible(change, QUANTITY[name])
+    return no_reading(name, by, reason) if reason else parameter_reading(name, by, change, standard_error, vector)
 
-    @property
-    def evaluable(self) -> bool:
-        """Whether the equation was evaluated."""
-        return not self.reason
+
+def _stated(vector: UnbalanceVector) -> VectorRecord:
+    turned, turned_error = vector.turned_deg, vector.turned_error_deg
+    return VectorRecord(
+        magnitude_change=vector.magnitude_change,
+        magnitude_interval_95=interval_95(vector.magnitude_change, vector.magnitude_error, least=-1.0),
+        turned_deg=turned,
+        turned_interval_95_deg=None if turned is None or turned_error is None else interval_95(turned, turned_error),
+        change=vector.change,
+        change_interval_95=interval_95(vector.change, vector.change_error, least=0.0),
+        change_angle_deg=vector.change_angle_deg,
+        text=vector.sentence,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,13 +99,15 @@ class Diagnosis:
     ----------
     by : str
         Who: ``likelihood``, ``network``, ``relation`` or ``paper``.
-    parameters : tuple of ParameterReading
+    parameters : tuple of Parameter
         The parameters it speaks of, evaluable or with the reason why not.
-    equations : tuple of EquationReading
+    equations : tuple of Equation
         The equations it evaluated; empty for the likelihood.
     covariance : ndarray, shape (m, m), or None
         Covariance of the m evaluable `parameters`' changes, in their order; None where a diagnostician knows only
         single standard errors.
+    unbalance : UnbalanceVector or None
+        Of e, where it is evaluable and there is a phase reference: size and direction.
     common : ndarray, shape (m, m), or None
         Part of `covariance` that every window shares, as the error of a commissioning does: further windows do not
         remove it. None where there is no such part.
@@ -139,9 +125,10 @@ class Diagnosis:
     """
 
     by: str
-    parameters: tuple[ParameterReading, ...] = ()
-    equations: tuple[EquationReading, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
+    equations: tuple[Equation, ...] = ()
     covariance: FloatArray | None = None
+    unbalance: UnbalanceVector | None = None
     common: FloatArray | None = None
     misfit_z: float | None = None
     suspect: str = ""
@@ -149,16 +136,16 @@ class Diagnosis:
     steps: int = 0
 
     @property
-    def evaluable(self) -> tuple[ParameterReading, ...]:
+    def evaluable(self) -> tuple[Parameter, ...]:
         """The parameters with a reading, in the order of `covariance`."""
-        return tuple(reading for reading in self.parameters if reading.change is not None)
+        return tuple(one for one in self.parameters if one.relative_change is not None)
 
     @property
     def full_covariance(self) -> FloatArray:
         """`covariance`, or the diagonal of the squared standard errors where there is none."""
         if self.covariance is not None:
             return self.covariance
-        errors = [reading.standard_error for reading in self.evaluable]
+        errors = [one.standard_error for one in self.evaluable]
         return np.diag(np.square(np.array(errors, dtype=np.float64)))
 
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Site
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Site
 
 __all__ = [
     "Alarm",
@@ -80,11 +80,11 @@ _AlarmName = Annotated[
 
 
 _AlarmChange = Annotated[
-    float | None, Field(description="relative change that decided; null for what is no parameter", examples=[-0.247])
+    Number, Field(description="relative change that decided; null for what is no parameter", examples=[-0.247])
 ]
 
 
-_AlarmError = Annotated[float | None, Field(description="its standard error", examples=[0.0071])]
+_AlarmError = Annotated[Number, Field(description="its standard error", examples=[0.0071])]
 
 
 _AlarmInterval = Annotated[
@@ -113,7 +113,7 @@ class Evidence(BaseModel):
 
     start_ns: int = Field(description="oldest data", examples=[EXAMPLE_NS - 20_000_000_000])
     end_ns: int = Field(description="end of the newest data", examples=[EXAMPLE_NS])
-    confidence: float | None = Field(
+    confidence: Number = Field(
         description="probability that what is named changed and nothing else; null where none is computed",
         examples=[0.996],
     )

@@ -1,15 +1,39 @@
 """Fields that many records have."""
 
+import math
 from typing import Annotated
 
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 
-__all__ = ["EXAMPLE_NS", "JSON", "BundleIdentity", "MachineHash", "Name", "Reason", "Site"]
+__all__ = [
+    "EXAMPLE_NS",
+    "JSON",
+    "REQUEST",
+    "BundleIdentity",
+    "MachineHash",
+    "Name",
+    "Number",
+    "Reason",
+    "Site",
+    "finite",
+]
 
-JSON = ConfigDict(extra="forbid", frozen=True)
-"""Of every record."""
+JSON = ConfigDict(frozen=True, json_schema_serialization_defaults_required=True)
+"""Of every record: whoever reads one passes over fields that a later version has added."""
+
+REQUEST = ConfigDict(extra="forbid", frozen=True)
+"""Of what a monitor is asked for: a field that it does not know is a mistake of whoever asks."""
 
 EXAMPLE_NS = 1767225805000000000
+
+
+def finite(value: float | None) -> float | None:
+    """Neither JSON nor the history has infinity and NaN: both become null."""
+    return value if value is not None and math.isfinite(value) else None
+
+
+Number = Annotated[float | None, AfterValidator(finite)]
+"""A finite number or null, whatever it is made of."""
 
 
 Site = Annotated[str, Field(description="site of the machine", examples=["demo"])]

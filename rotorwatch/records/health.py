@@ -6,7 +6,7 @@ from typing import Annotated
 from pydantic import BaseModel, Field
 
 from rotorwatch.records.alarms import Alarm
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Reason, Site
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Reason, Site
 from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
 
 __all__ = ["Health", "HealthState", "Quality", "Report", "State", "StreamStatus"]
@@ -35,7 +35,7 @@ State = Annotated[HealthState, Field(description="health in one word", examples=
 
 
 _MisfitZ = Annotated[
-    float | None,
+    Number,
     Field(
         description="distance of the window from what the model can explain, standard deviations; null without a test",
         examples=[0.4],
@@ -82,19 +82,19 @@ class Report(BaseModel):
     end_ns: int = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
     state: State
     filled: float = Field(description="fraction of a full window", examples=[1.0])
-    speed_rad_s: float | None = Field(description="mean speed in the window", examples=[138.23])
-    misfit_z: _MisfitZ
-    suspect: _Suspect
-    verdict: _Verdict
+    speed_rad_s: Number = Field(default=None, description="mean speed in the window", examples=[138.23])
+    misfit_z: _MisfitZ = None
+    suspect: _Suspect = ""
+    verdict: _Verdict = None
     parameters: tuple[Parameter, ...] = Field(
-        description="readings of the whole window by the diagnostician that decides"
+        default=(), description="readings of the whole window by the diagnostician that decides"
     )
-    opinions: _Opinions
-    equations: tuple[Equation, ...] = Field(description="the networks' residuals, equation by equation")
-    detectable: _Detectable
-    sensors: _Sensors
-    shapes: _Shapes
-    reason: Reason
+    opinions: _Opinions = ()
+    equations: tuple[Equation, ...] = Field(default=(), description="the networks' residuals, equation by equation")
+    detectable: _Detectable = ()
+    sensors: _Sensors = ()
+    shapes: _Shapes = ()
+    reason: Reason = ""
     bundle: BundleIdentity
     machine_hash: MachineHash
 
@@ -104,17 +104,26 @@ class Quality(BaseModel):
 
     model_config = JSON
 
-    accepted_blocks: int = Field(description="blocks accepted", examples=[2051])
-    refused_blocks: dict[str, int] = Field(description="blocks refused, by reason", examples=[{"not-finite": 3}])
-    gaps: int = Field(description="interruptions before accepted blocks", examples=[1])
-    missing_s: float = Field(description="data time the gaps cost", examples=[0.3])
-    queue_dropped_blocks: int = Field(description="blocks dropped because the monitor could not keep up", examples=[0])
-    link_missed_blocks: int = Field(description="blocks lost on the way, as far as the link knows", examples=[0])
+    accepted_blocks: int = Field(default=0, description="blocks accepted", examples=[2051])
+    refused_blocks: dict[str, int] = Field(
+        default={}, description="blocks refused, by reason", examples=[{"not-finite": 3}]
+    )
+    gaps: int = Field(default=0, description="interruptions before accepted blocks", examples=[1])
+    missing_s: float = Field(default=0.0, description="data time the gaps cost", examples=[0.3])
+    queue_dropped_blocks: int = Field(
+        default=0, description="blocks dropped because the monitor could not keep up", examples=[0]
+    )
+    link_missed_blocks: int = Field(
+        default=0, description="blocks lost on the way, as far as the link knows", examples=[0]
+    )
     last_refusal: str = Field(
+        default="",
         description="latest reason for refusing a block",
         examples=["demo/lab: block 740, channel y1: sample 12 is nan, expected a finite number"],
     )
-    last_gap: str = Field(description="latest gap", examples=["demo/lab: 0.3 s of data are missing (3 blocks)"])
+    last_gap: str = Field(
+        default="", description="latest gap", examples=["demo/lab: 0.3 s of data are missing (3 blocks)"]
+    )
 
 
 class StreamStatus(BaseModel):

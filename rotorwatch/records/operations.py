@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field
 
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmState
-from rotorwatch.records.fields import JSON
+from rotorwatch.records.fields import JSON, REQUEST
 
 __all__ = ["OperationDone", "OperationKind", "OperationOrder", "ReasonedOrder", "ShelveOrder"]
 
@@ -40,7 +40,7 @@ _ExpectedState = Annotated[
 class OperationOrder(BaseModel):
     """What an operator says when acknowledging, unshelving, resetting, or returning to service."""
 
-    model_config = JSON
+    model_config = REQUEST
 
     reason: _Reason = ""
     expected_state: _ExpectedState = None
@@ -49,7 +49,7 @@ class OperationOrder(BaseModel):
 class ReasonedOrder(BaseModel):
     """What is said when taking an alarm out of service."""
 
-    model_config = JSON
+    model_config = REQUEST
 
     reason: _GivenReason
     expected_state: _ExpectedState = None
@@ -58,7 +58,7 @@ class ReasonedOrder(BaseModel):
 class ShelveOrder(BaseModel):
     """What an operator says when shelving."""
 
-    model_config = JSON
+    model_config = REQUEST
 
     reason: _GivenReason
     duration_s: float | None = Field(

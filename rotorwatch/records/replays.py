@@ -5,7 +5,7 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.fields import JSON
+from rotorwatch.records.fields import JSON, REQUEST
 from rotorwatch.records.health import Report
 
 __all__ = [
@@ -77,7 +77,7 @@ class ReplayLine(BaseModel):
 class ReplayRequest(BaseModel):
     """A replay to be started."""
 
-    model_config = JSON
+    model_config = REQUEST
 
     recordings: tuple[str, ...] = Field(
         min_length=1,
@@ -147,7 +147,7 @@ class ReplaySeek(BaseModel):
     """Where a replay is to go on: a time, or a distance from where it is."""
 
     model_config = ConfigDict(
-        **JSON,
+        **REQUEST,
         json_schema_extra={
             "if": {"properties": {"to_ns": {"type": "integer"}}, "required": ["to_ns"]},
             "then": {"properties": {"by_s": {"type": "null"}}},

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, Reason
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, Number, Reason
 
 __all__ = [
     "Agreement",
@@ -55,15 +55,15 @@ class Parameter(BaseModel):
     name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
     text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
     by: str = Field(description="who says so: likelihood, network or relation", examples=["likelihood"])
-    relative_change: float | None = Field(
-        description="relative change from nominal; null if not evaluable", examples=[-0.247]
+    relative_change: Number = Field(
+        default=None, description="relative change from nominal; null if not evaluable", examples=[-0.247]
     )
-    standard_error: float | None = Field(description="standard error of the relative change", examples=[0.0071])
+    standard_error: Number = Field(default=None, description="standard error of the relative change", examples=[0.0071])
     interval_95: Interval | None = Field(
-        description="95 % interval of the relative change", examples=[(-0.261, -0.233)]
+        default=None, description="95 % interval of the relative change", examples=[(-0.261, -0.233)]
     )
-    z: float | None = Field(description="relative change in standard errors", examples=[-34.8])
-    reason: Reason
+    z: Number = Field(default=None, description="relative change in standard errors", examples=[-34.8])
+    reason: Reason = ""
     vector: UnbalanceVector | None = Field(
         default=None,
         description="of e where there is a phase reference: size and direction. Once the heavy spot has turned, "
@@ -80,13 +80,16 @@ class Equation(BaseModel):
     equation: str = Field(description="number of the compatibility equation: 28 to 31", examples=["28"])
     title: str = Field(description="what the equation is about", examples=["bearing, horizontal"])
     evaluable: bool = Field(description="whether the window allowed an evaluation", examples=[True])
-    msd: float | None = Field(
+    msd: Number = Field(
+        default=None,
         description="mean squared deviation between network and estimated correlation, over the target's mean square",
         examples=[0.0613],
     )
-    msd_healthy: float | None = Field(description="the same on healthy windows, mean", examples=[0.0018])
-    parameters: tuple[Parameter, ...] = Field(description="the residual projected on the equation's own parameters")
-    reason: Reason
+    msd_healthy: Number = Field(default=None, description="the same on healthy windows, mean", examples=[0.0018])
+    parameters: tuple[Parameter, ...] = Field(
+        default=(), description="the residual projected on the equation's own parameters"
+    )
+    reason: Reason = ""
 
 
 class Agreement(BaseModel):
@@ -99,8 +102,10 @@ class Agreement(BaseModel):
     verdict: Literal["agree", "disagree", "only-one"] = Field(
         description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
     )
-    difference_z: float | None = Field(
-        description="second minus first change in combined standard errors", examples=[0.8]
+    difference_z: Number = Field(
+        default=None,
+        description="second minus first change in combined standard errors",
+        examples=[0.8],
     )
 
 
@@ -110,9 +115,9 @@ class Opinion(BaseModel):
     model_config = JSON
 
     by: str = Field(description="who: network or relation", examples=["relation"])
-    parameters: tuple[Parameter, ...] = Field(description="what it reads")
-    agreement: tuple[Agreement, ...] = Field(description="how that compares with the likelihood")
-    reason: Reason
+    parameters: tuple[Parameter, ...] = Field(default=(), description="what it reads")
+    agreement: tuple[Agreement, ...] = Field(default=(), description="how that compares with the likelihood")
+    reason: Reason = ""
 
 
 class Finding(BaseModel):
@@ -154,7 +159,7 @@ class Verdict(BaseModel):
     outside_model: bool = Field(
         description="something changed that no parameter describes, or a sensor is at fault", examples=[False]
     )
-    outside_confidence: float | None = Field(
+    outside_confidence: Number = Field(
         description="how sure that is, 0.5 for not at all; null without a test", examples=[0.5]
     )
     decided_s: float = Field(description="length of the stretch of data that decided", examples=[20.0])
@@ -191,12 +196,12 @@ class SensorFault(BaseModel):
         description="channels, value found and what was expected, in a sentence",
         examples=["gain of y1 is 20 % lower than when it was commissioned"],
     )
-    value: float | None = Field(
+    value: Number = Field(
         description="stuck: s; clipped: part of the samples; offset: SI; gain: relative; delay: s; noise: its rms over "
         "that of the channel (rad for the shaft angle); otherwise the share of motion that the sensors have in common",
         examples=[-0.2],
     )
-    z: float | None = Field(description="in standard errors; null where no chance is involved", examples=[41.0])
+    z: Number = Field(default=None, description="in standard errors; null where no chance is involved", examples=[41.0])
 
 
 class Shape(BaseModel):
@@ -206,6 +211,6 @@ class Shape(BaseModel):
 
     state: str = Field(description="what the channel measures", examples=["y1"])
     verdict: str = Field(description="not changed, changed or not evaluable", examples=["not changed"])
-    z: float | None = Field(description="distance from the healthy shape, a standard normal value", examples=[0.4])
+    z: Number = Field(description="distance from the healthy shape, a standard normal value", examples=[0.4])
     limit: float = Field(description="what z must exceed to be called changed", examples=[3.1])
     text: str = Field(description="the same in a sentence", examples=["y1: not changed"])

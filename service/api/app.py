@@ -130,11 +130,8 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         """The machine file as it is in use, defaults filled in, and what was trained or commissioned for it."""
         view = found_machine(service, site, machine)
         return MachineConfiguration(
-            site=view.identity.site,
-            machine=view.identity.machine,
+            **view.identity,
             file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json"),
-            bundle=view.identity.bundle,
-            machine_hash=view.identity.machine_hash,
         )
 
     @app.get(f"{PLACE}/health", responses=responses(Health, 404, 422), **common)

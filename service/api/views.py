@@ -19,8 +19,8 @@ from service.api.routes.service import MeasuredView
 from service.delivery.event_feed import EventFeed
 from service.history.audit import AuditLog
 from service.history.machine import MachineStore
-from service.monitor.alarm_conversion import Identity
 from service.monitor.alarms.operation import Operation
+from service.monitor.reports import Identity
 
 __all__ = [
     "PLACE",

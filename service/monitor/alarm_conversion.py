@@ -1,9 +1,7 @@
 """Turns alarms and what happened to them into the records of `rotorwatch`."""
 
 import json
-import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 from models.alarm_names import alarm_text
@@ -13,29 +11,19 @@ from rotorwatch.records.alarms import Alarm as AlarmJson
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
 from rotorwatch.records.alarms import Evidence as EvidenceJson
 from rotorwatch.records.alarms import Shelf as ShelfJson
+from rotorwatch.records.fields import finite
 from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence
+from service.monitor.reports import Identity
 
 __all__ = [
-    "Identity",
     "alarm_cloud_event",
     "alarm_entries",
     "alarm_log_page",
     "alarm_states",
-    "finite",
     "rfc3339",
 ]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-
-
-@dataclass(frozen=True, slots=True)
-class Identity:
-    """Who speaks: the machine and the exact files its monitor runs on."""
-
-    site: str
-    machine: str
-    bundle: str | None
-    machine_hash: str
 
 
 def alarm_entries(alarms: Iterable[Alarm], *, include_normal: bool = False) -> tuple[AlarmJson, ...]:
@@ -47,29 +35,21 @@ def alarm_states(
     identity: Identity, alarms: Iterable[Alarm], sequence: int, *, include_normal: bool = False
 ) -> AlarmStates:
     """Convert the alarms of a machine; `sequence` is that of its latest event."""
-    return AlarmStates(
-        site=identity.site,
-        machine=identity.machine,
-        alarms=alarm_entries(alarms, include_normal=include_normal),
-        sequence=sequence,
-        bundle=identity.bundle,
-        machine_hash=identity.machine_hash,
-    )
+    return AlarmStates(**identity, alarms=alarm_entries(alarms, include_normal=include_normal), sequence=sequence)
 
 
 def alarm_log_page(identity: Identity, texts: Sequence[str], latest: int) -> str:
     """Join events, each the exact JSON text that was published, into the JSON of an `AlarmLogPage`."""
-    begin = json.dumps({"site": identity.site, "machine": identity.machine})
+    begin = json.dumps({"site": identity["site"], "machine": identity["machine"]})
     return f'{begin[:-1]}, "events": [{",".join(texts)}], "latest": {latest}}}'
 
 
 def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
     """Convert an alarm event."""
     alarm = event.alarm
-    place = f"{identity.site}/{identity.machine}"
+    place = f"{identity['site']}/{identity['machine']}"
     data = AlarmEventData(
-        site=identity.site,
-        machine=identity.machine,
+        **identity,
         name=alarm.name,
         text=event.text,
         kind=event.kind,
@@ -81,16 +61,14 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
         raised_ns=alarm.raised_ns,
         occurrence=alarm.occurrence,
         sequence=event.sequence,
-        relative_change=finite(alarm.change),
-        standard_error=finite(alarm.standard_error),
+        relative_change=alarm.change,
+        standard_error=alarm.standard_error,
         interval_95=_interval(alarm),
         low_confidence=alarm.low_confidence,
         note=alarm.note,
         evidence=_evidence(alarm.evidence),
         actor=event.actor,
         reason=event.reason,
-        bundle=identity.bundle,
-        machine_hash=identity.machine_hash,
         program_version=__version__,
     )
     return AlarmCloudEvent(
@@ -120,8 +98,8 @@ def _alarm(alarm: Alarm) -> AlarmJson:
         since_ns=alarm.since_ns,
         raised_ns=alarm.raised_ns,
         occurrence=alarm.occurrence,
-        relative_change=finite(alarm.change),
-        standard_error=finite(alarm.standard_error),
+        relative_change=alarm.change,
+        standard_error=alarm.standard_error,
         interval_95=_interval(alarm),
         low_confidence=alarm.low_confidence,
         note=alarm.note,
@@ -144,12 +122,7 @@ def _interval(alarm: Alarm) -> tuple[float, float] | None:
 def _evidence(evidence: Evidence | None) -> EvidenceJson | None:
     if evidence is None:
         return None
-    return EvidenceJson(start_ns=evidence.start_ns, end_ns=evidence.end_ns, confidence=finite(evidence.confidence))
-
-
-def finite(value: float | None) -> float | None:
-    """Neither JSON nor the history has infinity and NaN: both become null."""
-    return value if value is not None and math.isfinite(value) else None
+    return EvidenceJson(start_ns=evidence.start_ns, end_ns=evidence.end_ns, confidence=evidence.confidence)
 
 
 def rfc3339(time_ns: int) -> str:

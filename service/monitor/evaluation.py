@@ -18,14 +18,13 @@ from models.commissioning.commissioned import Commissioned, IdentifiedRecord
 from models.commissioning.installed import Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.fallback.shape import ChannelShape
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.limits import beyond
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
-from models.diagnosis.readings import Diagnosis, Diagnostician, EquationReading, ParameterReading
-from models.diagnosis.verdict.agreement import Agreement, agreements
+from models.diagnosis.readings import Diagnosis, Diagnostician, no_reading
+from models.diagnosis.verdict.agreement import agreements
 from models.diagnosis.verdict.calibration import month_thresholds
 from models.diagnosis.verdict.determined import determined, with_shared_error
 from models.diagnosis.verdict.sequential import SequentialSettings
@@ -34,8 +33,9 @@ from models.errors import BundleError, CheckpointError, EstimationError, Unexpla
 from models.machine import Machine, MachineFile
 from models.physics.parameters import PARAMETERS
 from models.signals.channels import Channel, with_channel_names
+from rotorwatch.records.windows import Equation, Opinion, Shape
 
-__all__ = ["Evaluation", "Opinion", "WindowEvaluator", "evaluator_for"]
+__all__ = ["Evaluation", "WindowEvaluator", "evaluator_for"]
 
 _LIKELIHOOD, _SHAPE, _EXPLAINED = "likelihood", "shape", "explained_ns"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
@@ -43,28 +43,6 @@ _EMPTY = np.zeros((0, 0))
 _STEADY = 0.15
 """Range of speed within a window, relative, up to which the rotation taken out hop by hop leaves nothing behind: on the
 rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``tests/diagnosis/test_window.py``)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Opinion:
-    """What a diagnostician beside the deciding one says.
-
-    Attributes
-    ----------
-    by : str
-        Who.
-    parameters : tuple of ParameterReading
-        What it reads.
-    agreement : tuple of Agreement
-        How that compares with the likelihood.
-    reason : str
-        Why it could say nothing of this window; empty if it could.
-    """
-
-    by: str
-    parameters: tuple[ParameterReading, ...] = ()
-    agreement: tuple[Agreement, ...] = ()
-    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,29 +55,31 @@ class Evaluation:
         The likelihood's, every parameter in the order of `PARAMETERS`.
     short : dict of int to Diagnosis
         The same of the latest hops, by how many; without those that could not be evaluated.
-    equations : tuple of EquationReading
+    equations : tuple of Equation
         Every equation of the table, by its network, or why not.
     opinions : tuple of Opinion
         What the others say.
     speed_rad_s : float or None
         Mean speed.
-    shapes : tuple of ChannelShape
+    shapes : tuple of Shape
         Where no equation can be evaluated: whether each channel's vibration is as it was.
     """
 
     deciding: Diagnosis
     short: Mapping[int, Diagnosis]
-    equations: tuple[EquationReading, ...]
+    equations: tuple[Equation, ...]
     opinions: tuple[Opinion, ...]
     speed_rad_s: float | None
-    shapes: tuple[ChannelShape, ...] = ()
+    shapes: tuple[Shape, ...] = ()
 
     def named(self, channels: Sequence[Channel]) -> "Evaluation":
         """The same with sentences in the names of a machine's channels."""
         return replace(
             self,
             deciding=replace(self.deciding, suspect=with_channel_names(self.deciding.suspect, channels)),
-            shapes=tuple(replace(one, sentence=with_channel_names(one.sentence, channels)) for one in self.shapes),
+            shapes=tuple(
+                one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes
+            ),
         )
 
 
@@ -206,7 +186,7 @@ class KnownMachineEvaluator:
             deciding = self._decide(window, self._likelihood.window)
         except UnexplainedError as error:
             reason = str(error)
-            nothing = tuple(ParameterReading(name, self.by, reason=reason) for name in PARAMETERS)
+            nothing = tuple(no_reading(name, self.by, reason) for name in PARAMETERS)
             deciding = Diagnosis(self.by, nothing, covariance=_EMPTY, unexplained=reason)
         if deciding.unexplained:
             # One machine or two in this window? If some of its data were explained, the shortest stretch says.
@@ -220,13 +200,13 @@ class KnownMachineEvaluator:
                 evaluated[hops] = self._decide(statistics, partial(self._likelihood.short, hops))
             except EstimationError:
                 continue  # too little data for itself; the window has said what there is to say
-        equations: tuple[EquationReading, ...] = ()
+        equations: tuple[Equation, ...] = ()
         opinions = []
         for other in self._others:
             try:
                 diagnosis = other.diagnose(window)
             except (EstimationError, np.linalg.LinAlgError) as error:
-                opinions.append(Opinion(other.by, reason=str(error)))
+                opinions.append(Opinion(by=other.by, reason=str(error)))
                 continue
             equations = diagnosis.equations or equations
             opinions.append(_opinion(deciding, diagnosis))
@@ -320,7 +300,7 @@ class BaselineEvaluator:
         if self._baselines:
             deciding = determined(self._baseline_for(window).diagnose(window), window, self._length_s)
         else:
-            nothing = tuple(ParameterReading(name, _SHAPE, reason=_NO_EQUATION) for name in PARAMETERS)
+            nothing = tuple(no_reading(name, _SHAPE, _NO_EQUATION) for name in PARAMETERS)
             deciding = Diagnosis(_SHAPE, nothing, covariance=_EMPTY)
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
         return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
@@ -345,21 +325,29 @@ class BaselineEvaluator:
         raise EstimationError(f"{self._place}: not evaluable here: {'; '.join(reasons)}")
 
 
-def _row_readings(deciding: Diagnosis, window: WindowStatistics) -> tuple[EquationReading, ...]:
+def _row_readings(deciding: Diagnosis, window: WindowStatistics) -> tuple[Equation, ...]:
     """The learned rows, each with the readings of its own parameters or why there are none."""
     readings = {reading.name: reading for reading in deciding.parameters}
     found = []
     for row, lacking in evaluable_rows(window.states, bool(np.isfinite(window.speed_rad_s))):
         own = tuple(readings[each.parameter] for each in row.own)
         reasons = dict.fromkeys(reading.reason for reading in own if reading.reason)
-        reason = lacking or ("" if any(reading.change is not None for reading in own) else "; ".join(reasons))
-        found.append(EquationReading(row.number, row.title, parameters=() if reason else own, reason=reason))
+        reason = lacking or ("" if any(reading.relative_change is not None for reading in own) else "; ".join(reasons))
+        found.append(
+            Equation(
+                equation=row.number,
+                title=row.title,
+                evaluable=not reason,
+                parameters=() if reason else own,
+                reason=reason,
+            )
+        )
     return tuple(found)
 
 
 def _opinion(deciding: Diagnosis, other: Diagnosis) -> Opinion:
     """What another diagnostician says; one that could read nothing says why, once."""
     if other.evaluable:
-        return Opinion(other.by, other.parameters, agreements(deciding, other))
+        return Opinion(by=other.by, parameters=other.parameters, agreement=agreements(deciding, other))
     reasons = dict.fromkeys(reading.reason for reading in other.parameters)
-    return Opinion(other.by, other.parameters, reason="; ".join(reasons) or "nothing to read")
+    return Opinion(by=other.by, parameters=other.parameters, reason="; ".join(reasons) or "nothing to read")

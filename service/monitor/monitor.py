@@ -21,7 +21,7 @@ from models.arrivals import Arrivals, Arrived
 from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
 from models.commissioning.installed import Installed
 from models.diagnosis.moments import HopMoments, plan_for
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.verdict.detectable import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
@@ -33,18 +33,25 @@ from models.senders import Senders
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Severity
-from rotorwatch.records.health import HealthState
+from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import AlarmEvent, Evidence
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import Operation
 from service.monitor.evaluation import Evaluation, evaluator_for
-from service.monitor.reports import DataQuality, MachineHealth, MonitorReport, MonitorState, WindowReport
+from service.monitor.reports import Identity, MachineHealth, MonitorReport, MonitorState, counted, identity_of
 
 __all__ = ["MachineMonitor"]
 
 _RPM = 30 / np.pi
 _NEWEST_SAMPLES = 20_000
+
+
+class _Heading(Identity):
+    start_ns: int
+    end_ns: int
+    state: HealthState
+    filled: float
 
 
 class MachineMonitor:
@@ -57,12 +64,15 @@ class MachineMonitor:
 
     Attributes
     ----------
+    identity : Identity
+        Who speaks in the reports.
     used : bool
         Whether the latest message was itself used at once, and not one that waited for it.
     """
 
     def __init__(self, installed: Installed) -> None:
         self.machine = machine = installed.machine
+        self.identity = identity_of(installed)
         self._evaluator = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
         self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
@@ -76,8 +86,8 @@ class MachineMonitor:
         self._test = SequentialTest(settings, by=self._evaluator.by)
         self._alarms = AlarmBook(machine.alarms)
         self._data_path = DataPathAlarms(self._alarms, machine)
-        self._quality = DataQuality()
-        self._latest: WindowReport | None = None
+        self._quality = Quality()
+        self._latest: Report | None = None
         self._calm = HealthState.WARMING
         self._end_ns: int | None = None
         self._reached_ns: int | None = None
@@ -175,7 +185,7 @@ class MachineMonitor:
             self._dropped += dropped
             return MonitorReport(verdict)
         self._used = block
-        windows: list[WindowReport] = []
+        windows: list[Report] = []
         try:
             for end_ns in self._hops(block, verdict, dropped):
                 windows.append(self._evaluate(end_ns))
@@ -372,10 +382,10 @@ class MachineMonitor:
         return self._count(verdict)
 
     def _count(self, verdict: Verdict) -> Verdict:
-        self._quality = self._quality.counted(verdict)
+        self._quality = counted(self._quality, verdict)
         return verdict
 
-    def _evaluate(self, end_ns: int) -> WindowReport:
+    def _evaluate(self, end_ns: int) -> Report:
         """Evaluate the window as it is after a completed hop; a defect is a reason why it cannot be."""
         self._fault = ""
         try:
@@ -383,28 +393,25 @@ class MachineMonitor:
         except Exception as error:
             self._failed(error, end_ns)
             state = self._state(HealthState.NOT_EVALUABLE)
-            report = WindowReport(end_ns, end_ns, state, self._window.filled, reason=self._fault)
+            report = Report(**self._window_now(end_ns, end_ns, state), reason=self._fault)
         self._latest = report
         self._alarms.suppress(None, end_ns)
         return report
 
-    def _evaluated(self, end_ns: int) -> WindowReport:
-        filled = self._window.filled
+    def _evaluated(self, end_ns: int) -> Report:
         self._data_path.hop(end_ns)
         self._data_path.conflict(self._senders.conflict, end_ns)
         statistics = self._statistics = self._window.statistics()
         if statistics is None:
-            return WindowReport(end_ns, end_ns, self._state(HealthState.WARMING), filled)
+            return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
         speed_rad_s = statistics.speed_rad_s
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
         self._data_path.sensors(findings, statistics)
         if findings:
-            return WindowReport(
-                statistics.start_ns,
-                end_ns,
-                self._state(HealthState.DATA_HEALTH),
-                filled,
+            state = self._state(HealthState.DATA_HEALTH)
+            return Report(
+                **self._window_now(statistics.start_ns, end_ns, state),
                 sensors=findings,
                 reason="; ".join(each.text for each in findings),
             )
@@ -413,23 +420,23 @@ class MachineMonitor:
         try:
             evaluation = self._evaluator.evaluate(statistics, present)
         except EstimationError as error:
-            return WindowReport(
-                statistics.start_ns, end_ns, self._state(HealthState.NOT_EVALUABLE), filled, reason=str(error)
-            )
+            state = self._state(HealthState.NOT_EVALUABLE)
+            return Report(**self._window_now(statistics.start_ns, end_ns, state), reason=str(error))
         evaluation = evaluation.named(self.machine.sensors)
         looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
         whole = self._test.settings.window_hops
         looks[whole] = _stretch(evaluation.deciding, statistics)
         verdict = self._test.update(looks)
-        changed = [shape.sentence for shape in evaluation.shapes if shape.changed]
-        self._alarms.found(verdict, evaluation.deciding.suspect, end_ns)
-        parameters = tuple(
-            ParameterReading(one.name, one.by, reason=one.vector.foreign) if one.vector and one.vector.foreign else one
-            for one in evaluation.deciding.parameters
-        )
+        changed = [shape.text for shape in evaluation.shapes if shape.verdict == "changed"]
+        self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
+        vector, parameters = evaluation.deciding.unbalance, evaluation.deciding.parameters
+        if vector is not None and vector.foreign:
+            parameters = tuple(
+                no_reading(one.name, one.by, vector.foreign) if one.vector is not None else one for one in parameters
+            )
         unexplained = evaluation.deciding.unexplained
         if unexplained:
-            parameters = tuple(ParameterReading(one.name, one.by, reason=unexplained) for one in parameters)
+            parameters = tuple(no_reading(one.name, one.by, unexplained) for one in parameters)
         # Where the window straddles a change, what is explained is in the verdict's current readings.
         reason = "" if verdict.current else unexplained
         if not unexplained and not evaluation.deciding.evaluable:
@@ -437,12 +444,10 @@ class MachineMonitor:
         if evaluation.shapes:
             evidence = Evidence(statistics.start_ns, end_ns)
             self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
-        outside = verdict.isolation.outside
-        return WindowReport(
-            start_ns=statistics.start_ns,
-            end_ns=end_ns,
-            state=self._state(_calm_state(evaluation, outside=outside)),
-            filled=filled,
+        outside = verdict.outside_model
+        state = self._state(_calm_state(evaluation, outside=outside))
+        return Report(
+            **self._window_now(statistics.start_ns, end_ns, state),
             speed_rad_s=evaluation.speed_rad_s,
             parameters=parameters,
             equations=evaluation.equations,
@@ -458,6 +463,11 @@ class MachineMonitor:
             reason=reason,
             shapes=evaluation.shapes,
         )
+
+    def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> _Heading:
+        """First fields of a report."""
+        filled = self._window.filled
+        return {**self.identity, "start_ns": start_ns, "end_ns": end_ns, "state": state, "filled": filled}
 
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""
@@ -477,7 +487,7 @@ def _calm_state(evaluation: Evaluation, *, outside: bool) -> HealthState:
         return HealthState.OUTSIDE_MODEL
     if evaluation.deciding.evaluable:
         return HealthState.HEALTHY
-    states = {shape.state for shape in evaluation.shapes}
+    states = {shape.verdict for shape in evaluation.shapes}
     if "not changed" in states and "changed" not in states:
         return HealthState.UNCHANGED
     return HealthState.NOT_EVALUABLE

@@ -1,112 +1,67 @@
-"""What a monitor says: of one window, of one block, of the machine; and what it remembers."""
+"""Who speaks in what a monitor says, what it says of one block and of the machine; and what it remembers."""
 
-from dataclasses import dataclass, replace
+import hashlib
+import json
+from dataclasses import dataclass
+from typing import TypedDict
 
-from models.diagnosis.fallback.shape import ChannelShape
-from models.diagnosis.readings import EquationReading, ParameterReading
-from models.diagnosis.sensors.finding import SensorFinding
-from models.diagnosis.verdict.detectable import DetectableChange
-from models.diagnosis.verdict.sequential import SequentialVerdict
+from models.commissioning.installed import Installed
 from models.ingest import Verdict
-from rotorwatch.records.health import HealthState
+from models.machine import MachineFile
+from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
-from service.monitor.evaluation import Opinion
 
-__all__ = ["DataQuality", "MachineHealth", "MonitorReport", "MonitorState", "Tally", "WindowReport"]
-
-
-@dataclass(frozen=True, slots=True)
-class DataQuality:
-    """What came in since the monitor started.
-
-    Attributes
-    ----------
-    accepted : int
-        Blocks accepted.
-    refused : dict of str to int
-        Blocks refused, by reason.
-    gaps : int
-        Interruptions before accepted blocks.
-    missing_s : float
-        Data time that the gaps cost.
-    last_refusal : str
-        Latest reason for refusing a block, in a sentence.
-    last_gap : str
-        Latest gap, in a sentence.
-    """
-
-    accepted: int = 0
-    refused: tuple[tuple[str, int], ...] = ()
-    gaps: int = 0
-    missing_s: float = 0.0
-    last_refusal: str = ""
-    last_gap: str = ""
-
-    def counted(self, verdict: Verdict) -> "DataQuality":
-        """Return the same after one more block."""
-        if verdict.reason is not None:
-            refused = dict(self.refused)
-            refused[verdict.reason] = refused.get(verdict.reason, 0) + 1
-            return replace(self, refused=tuple(sorted(refused.items())), last_refusal=verdict.text)
-        accepted = self.accepted + 1
-        if verdict.continuous:
-            return replace(self, accepted=accepted)
-        missing_s = self.missing_s + verdict.gap_s
-        return replace(self, accepted=accepted, gaps=self.gaps + 1, missing_s=missing_s, last_gap=verdict.text)
+__all__ = [
+    "Identity",
+    "MachineHealth",
+    "MonitorReport",
+    "MonitorState",
+    "Tally",
+    "counted",
+    "identity_of",
+    "machine_hash",
+]
 
 
-@dataclass(frozen=True, slots=True)
-class WindowReport:
-    """One evaluation of the window, at the end of a hop.
+class Identity(TypedDict):
+    """Who speaks, the same in every record: the machine and the exact files its monitor runs on."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Oldest and newest data in the window.
-    state : HealthState
-        After this window: warming, healthy, alert, danger, outside-model, data-health, unchanged (no
-        equation can be evaluated, but every channel is as it was) or not-evaluable.
-    filled : float
-        Fraction of a full window.
-    speed_rad_s : float or None
-        Mean speed in the window.
-    parameters : tuple of ParameterReading
-        Readings of the whole window by the diagnostician that decides: the likelihood, or the baseline.
-    equations : tuple of EquationReading
-        The networks' opinion, equation by equation.
-    opinions : tuple of Opinion
-        What the other diagnosticians read, and whether they agree.
-    misfit_z : float or None
-        How far the window is from what the model can explain; standard normal where the model holds.
-    suspect : str
-        What explains the misfit best, if one thing does.
-    verdict : SequentialVerdict or None
-        What has changed since the machine was nominal; the alarms are decided on it.
-    detectable : tuple of DetectableChange
-        What would have been noticed in this window, parameter by parameter.
-    reason : str
-        Why the window was not evaluated; empty if it was.
-    sensors : tuple of SensorFinding
-        Faults of sensors in the window; with any of them nothing is said of the machine.
-    shapes : tuple of ChannelShape
-        Where no equation can be evaluated: whether each channel's vibration is as it was.
-    """
+    site: str
+    machine: str
+    bundle: str | None
+    machine_hash: str
 
-    start_ns: int
-    end_ns: int
-    state: HealthState
-    filled: float
-    speed_rad_s: float | None = None
-    parameters: tuple[ParameterReading, ...] = ()
-    equations: tuple[EquationReading, ...] = ()
-    opinions: tuple[Opinion, ...] = ()
-    misfit_z: float | None = None
-    suspect: str = ""
-    verdict: SequentialVerdict | None = None
-    detectable: tuple[DetectableChange, ...] = ()
-    reason: str = ""
-    sensors: tuple[SensorFinding, ...] = ()
-    shapes: tuple[ChannelShape, ...] = ()
+
+def identity_of(installed: Installed) -> Identity:
+    """Identity of a machine with what it is monitored with."""
+    machine = installed.machine
+    return {
+        "site": machine.site,
+        "machine": machine.name,
+        "bundle": installed.identity,
+        "machine_hash": machine_hash(machine),
+    }
+
+
+def machine_hash(machine: MachineFile) -> str:
+    """Twelve hexadecimal digits that change with anything in the machine file but comments and layout."""
+    text = json.dumps(machine.model_dump(mode="json"), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def counted(quality: Quality, verdict: Verdict) -> Quality:
+    """What has come in, with one more block."""
+    if verdict.reason is not None:
+        refused = {**quality.refused_blocks}
+        refused[verdict.reason.value] = refused.get(verdict.reason.value, 0) + 1
+        return quality.model_copy(
+            update={"refused_blocks": dict(sorted(refused.items())), "last_refusal": verdict.text}
+        )
+    update: dict[str, object] = {"accepted_blocks": quality.accepted_blocks + 1}
+    if not verdict.continuous:
+        gap = {"gaps": quality.gaps + 1, "missing_s": quality.missing_s + verdict.gap_s, "last_gap": verdict.text}
+        update |= gap
+    return quality.model_copy(update=update)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +72,7 @@ class MonitorReport:
     ----------
     verdict : Verdict
         Accepted or refused, and why.
-    windows : tuple of WindowReport
+    windows : tuple of Report
         One per hop that the block completed.
     events : tuple of AlarmEvent
         What happened to alarms.
@@ -128,7 +83,7 @@ class MonitorReport:
     """
 
     verdict: Verdict
-    windows: tuple[WindowReport, ...] = ()
+    windows: tuple[Report, ...] = ()
     events: tuple[AlarmEvent, ...] = ()
     data_s: float = 0.0
     fault: Exception | None = None
@@ -168,11 +123,11 @@ class MachineHealth:
     state : HealthState
     filled : float
         Fraction of a full window.
-    latest : WindowReport or None
+    latest : Report or None
         The latest window.
     alarms : tuple of Alarm
         All that have been seen so far.
-    quality : DataQuality
+    quality : Quality
     sequence : int
         Number of the latest alarm event.
     reason : str
@@ -183,9 +138,9 @@ class MachineHealth:
 
     state: HealthState
     filled: float
-    latest: WindowReport | None
+    latest: Report | None
     alarms: tuple[Alarm, ...]
-    quality: DataQuality
+    quality: Quality
     sequence: int = -1
     reason: str = ""
     end_ns: int | None = None

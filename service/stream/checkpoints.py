@@ -5,6 +5,8 @@ from dataclasses import replace
 
 from models.errors import CheckpointError
 from rotorwatch import __version__
+from rotorwatch.records.fields import finite
+from rotorwatch.records.health import Report
 from service.history.errors import StoreError
 from service.history.machine import MachineStore
 from service.history.records import (
@@ -16,12 +18,11 @@ from service.history.records import (
     StoredReading,
     StoredReport,
 )
-from service.monitor.alarm_conversion import Identity, alarm_cloud_event, finite, rfc3339
+from service.monitor.alarm_conversion import alarm_cloud_event, rfc3339
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import NO_ALARMS
-from service.monitor.conversion import report as report_json
 from service.monitor.monitor import MachineMonitor
-from service.monitor.reports import MonitorState, WindowReport
+from service.monitor.reports import Identity, MonitorState
 
 __all__ = ["FORMAT", "StepWriter", "checkpoint_step", "restored", "stored_event", "stored_readings", "stored_report"]
 
@@ -29,13 +30,12 @@ FORMAT = 1
 """Goes up when what a monitor remembers changes its form."""
 
 
-def stored_report(identity: Identity, window: WindowReport) -> StoredReport:
+def stored_report(window: Report) -> StoredReport:
     """A window report as it is published."""
-    text = report_json(identity, window).model_dump_json()
-    return StoredReport(window.start_ns, window.end_ns, window.state.value, window.filled, text)
+    return StoredReport(window.start_ns, window.end_ns, window.state.value, window.filled, window.model_dump_json())
 
 
-def stored_readings(windows: Iterable[WindowReport]) -> tuple[StoredReading, ...]:
+def stored_readings(windows: Iterable[Report]) -> tuple[StoredReading, ...]:
     """Parameters, residuals of the equations, misfit and speed of each window, as points in time."""
     found = []
     for window in windows:
@@ -43,7 +43,7 @@ def stored_readings(windows: Iterable[WindowReport]) -> tuple[StoredReading, ...
             ("misfit", "misfit", window.misfit_z, None),
             ("speed", "speed", window.speed_rad_s, None),
         ]
-        points += [("parameter", one.name, one.change, one.standard_error) for one in window.parameters]
+        points += [("parameter", one.name, one.relative_change, one.standard_error) for one in window.parameters]
         points += [("equation", one.equation, one.msd, None) for one in window.equations]
         found += [
             StoredReading(window.end_ns, quantity, name, value, finite(error))
@@ -110,7 +110,7 @@ class StepWriter:
         self._owed += events
 
     def commit(
-        self, monitor: MachineMonitor, windows: tuple[WindowReport, ...], recorded_ns: int
+        self, monitor: MachineMonitor, windows: tuple[Report, ...], recorded_ns: int
     ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
         """Commit windows, the events that are owed, and the state of the monitor; raises nothing.
 
@@ -125,7 +125,7 @@ class StepWriter:
         reports: tuple[StoredReport, ...] = ()
         told = tuple(self._told(event, recorded_ns) for event in self._owed)
         try:
-            reports = tuple(stored_report(self._identity, window) for window in windows)
+            reports = tuple(stored_report(window) for window in windows)
             state = monitor.state(self._kept)
             checkpoint = checkpoint_step(self._identity, state, recorded_ns)
             written = self._history.commit(Step(reports, stored_readings(windows), told, checkpoint))
@@ -160,8 +160,8 @@ def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -
     """What a monitor remembers, for the history."""
     head = CheckpointHead(
         format=FORMAT,
-        bundle=identity.bundle,
-        machine_hash=identity.machine_hash,
+        bundle=identity["bundle"],
+        machine_hash=identity["machine_hash"],
         code_version=__version__,
         end_ns=state.end_ns or 0,
         recorded_ns=recorded_ns,
@@ -215,8 +215,8 @@ def restored(
 def _differences(head: CheckpointHead, identity: Identity) -> Sequence[str]:
     pairs = {
         "form of what is remembered": (head.format, FORMAT),
-        "machine file": (head.machine_hash, identity.machine_hash),
-        "bundle": (head.bundle, identity.bundle),
+        "machine file": (head.machine_hash, identity["machine_hash"]),
+        "bundle": (head.bundle, identity["bundle"]),
         "program version": (head.code_version, __version__),
     }
     return [f"{what} was {then}, is {now}" for what, (then, now) in pairs.items() if then != now]

@@ -13,19 +13,19 @@ from typing import Protocol
 
 from models.commissioning.installed import Installed
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
-from rotorwatch.records.health import Health, StreamStatus
+from rotorwatch.records.health import Health, Report, StreamStatus
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from service.analysis.snapshots.desk import LatestData, SnapshotDesk
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion
-from service.monitor.alarm_conversion import Identity, alarm_log_page, alarm_states
+from service.monitor.alarm_conversion import alarm_log_page, alarm_states
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.alarms.operation import NotInTime, Operation
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
-from service.monitor.reports import MachineHealth, MonitorReport, Tally, WindowReport
+from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, restored
 from service.stream.inbox import Inbox, RawBlock
@@ -104,12 +104,7 @@ class MachineWorker:
             lambda one: self._monitor.could_use(one.payload, one.attachment, one.encoding),
         )
         self.history = history
-        self.identity = Identity(
-            site=machine.site,
-            machine=machine.name,
-            bundle=installed.identity,
-            machine_hash=conversion.machine_hash(machine),
-        )
+        self.identity = identity_of(installed)
         self.snapshots = SnapshotDesk(installed, self.identity)
         self.latest = LatestData()
         self.errors = 0
@@ -405,7 +400,7 @@ class MachineWorker:
         )
 
     def _conclude(
-        self, windows: tuple[WindowReport, ...], events: tuple[AlarmEvent, ...], *, always: bool = False
+        self, windows: tuple[Report, ...], events: tuple[AlarmEvent, ...], *, always: bool = False
     ) -> tuple[str, ...]:
         """Commit, then let it be seen and publish; returns the events as they are published."""
         events += self._monitor.take_events()  # left behind by a defect
@@ -433,7 +428,7 @@ class MachineWorker:
             self._fault(f"the history refuses what happens: {self.steps.refused}")
         return texts
 
-    def _commit(self, windows: tuple[WindowReport, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
+    def _commit(self, windows: tuple[Report, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
         """Bring windows, events and the monitor's state into the history, as they are to be published."""
         begin_s = self._clocks.monotonic_s()
         reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns())

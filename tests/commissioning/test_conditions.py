@@ -4,7 +4,7 @@ import pytest
 
 from models.commissioning.commission import Commissioning
 from models.commissioning.installed import Installed
-from models.diagnosis.readings import ParameterReading
+from rotorwatch.records.windows import Parameter
 from service.monitor.evaluation import Evaluation, evaluator_for
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, stream
@@ -30,7 +30,7 @@ def evaluated(made: Commissioning, seed: int, *events: Event) -> Evaluation:
     return evaluator_for(Installed(NOTHING, None, made.commissioned)).evaluate(window, {})
 
 
-def reading(found: Evaluation, name: str) -> ParameterReading:
+def reading(found: Evaluation, name: str) -> Parameter:
     return next(one for one in found.deciding.parameters if one.name == name)
 
 
@@ -67,8 +67,8 @@ def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
     assert abs(reading(evaluated(made, 94, at(FAST), stiffer), "k_by").z or 99.0) < 4
     assert abs(reading(evaluated(made, 95, at(SLOW)), "k_by").z or 99.0) < 4
     lost = reading(evaluated(made, 96, at(FAST)), "k_by")  # the stiffness of the slow machine, at the high speed
-    assert lost.change is not None
-    assert abs(lost.change - (1 / 1.3 - 1)) < 0.05
+    assert lost.relative_change is not None
+    assert abs(lost.relative_change - (1 / 1.3 - 1)) < 0.05
 
 
 @pytest.mark.slow

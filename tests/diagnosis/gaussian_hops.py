@@ -122,7 +122,7 @@ def detection_delays(
             if number < before_hops:
                 false = false or verdict.detected
                 continue
-            said = {finding.name for finding in verdict.findings}
+            said = {finding.name for finding in verdict.changed}
             misnamed = misnamed or bool(said - set(changes))
             detected_s = min(detected_s, delay_s if verdict.detected else np.inf)
             named_s = min(named_s, delay_s if said == set(changes) else np.inf)

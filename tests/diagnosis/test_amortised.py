@@ -97,8 +97,8 @@ def test_the_shipped_networks_find_and_size_faults_on_new_windows(parameter: str
             np.sqrt(np.diag(diagnosis.covariance)),
             np.array([one.standard_error for one in diagnosis.evaluable], dtype=np.float64),
         )
-        assert by_name[parameter].change is not None
-        read.append(by_name[parameter].change)
+        assert by_name[parameter].relative_change is not None
+        read.append(by_name[parameter].relative_change)
         z_others += [abs(one.z or 0.0) for name, one in by_name.items() if name != parameter]
     assert np.median(np.array(read, dtype=np.float64)) == pytest.approx(FAULTS[parameter], abs=0.03)
     assert np.mean(np.array(z_others) > 3.14) < 0.1

@@ -61,8 +61,8 @@ def test_what_changed_is_named_and_nothing_else(name: str, rotor: Rotor, low: fl
     diagnosis = monitor().diagnose(window)
     assert isolate_window(diagnosis, 0.001).changed == (name,)
     reading = next(reading for reading in diagnosis.parameters if reading.name == name)
-    assert reading.change is not None
-    assert low < reading.change < high
+    assert reading.relative_change is not None
+    assert low < reading.relative_change < high
 
 
 @pytest.mark.slow

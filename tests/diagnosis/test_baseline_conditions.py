@@ -15,7 +15,7 @@ from models.diagnosis.baseline.gain import gain_suspicion
 from models.diagnosis.baseline.learned import Baseline, learn_baseline, learned_rows
 from models.diagnosis.baseline.rows import ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from tests.diagnosis.fe_rotor import INDEPENDENT, Excitation, Rotor, plan, simulate, windows, with_bearing
@@ -45,9 +45,9 @@ def test_every_commissioned_speed_has_its_own_unbalance() -> None:
         heavier = replace(rotor, unbalance_kg_m=1.6 * rotor.unbalance_kg_m)
         e = monitor.diagnose(*recorded(heavier, Excitation(), seed, 1)).evaluable[-1]
         assert e.name == "e"
-        assert e.change is not None
+        assert e.relative_change is not None
         assert e.standard_error is not None
-        assert abs(e.change - 0.6) < 3 * e.standard_error
+        assert abs(e.relative_change - 0.6) < 3 * e.standard_error
     between = replace(SLOW, speed_rad_s=2 * np.pi * 28.0)
     found = {one.name: one.reason for one in monitor.diagnose(*recorded(between, OTHER, 85, 1)).parameters}
     assert found["e"] == "speed 1680 rpm, the baseline was learned at 1440, 1980 rpm"
@@ -127,7 +127,7 @@ def test_a_damaged_baseline_is_refused(damage: str) -> None:
 def suspected(k: float, c: float, states: tuple[str, ...] = ("y1", "y2")) -> str:
     errors = np.array([0.005, 0.02])
     readings = tuple(
-        ParameterReading(name, "baseline", value, float(error))
+        parameter_reading(name, "baseline", value, float(error))
         for name, value, error in zip(("k_by", "c_by"), (k, c), errors, strict=True)
     )
     first, _ = baseline().relations

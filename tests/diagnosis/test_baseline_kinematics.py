@@ -115,7 +115,7 @@ def test_one_quantity_per_place_names_what_changed(states: tuple[str, ...]) -> N
     (softer,) = recorded(with_bearing(Rotor(), k_y=-0.1), OTHER, 74, 1)
     diagnosis = monitor.diagnose(of_states(softer, states))
     assert names(diagnosis) == ("k_by",)
-    assert diagnosis.evaluable[0].change == pytest.approx(-0.09, abs=0.03)
+    assert diagnosis.evaluable[0].relative_change == pytest.approx(-0.09, abs=0.03)
     (looser,) = recorded(with_bearing(Rotor(), c_z=-0.4), OTHER, 75, 1)
     assert names(monitor.diagnose(of_states(looser, states))) == ("c_bz",)
 
@@ -149,9 +149,9 @@ def test_without_a_phase_reference_the_unbalance_is_read_from_the_line_itself() 
     (window,) = windows(simulate(heavier, Excitation(), 63, 76), sizes)
     assert not window.phase_reference
     e = {reading.name: reading for reading in monitor.diagnose(window).parameters}["e"]
-    assert e.change is not None
+    assert e.relative_change is not None
     assert e.standard_error is not None
-    assert abs(e.change - 0.5) < 3 * e.standard_error
+    assert abs(e.relative_change - 0.5) < 3 * e.standard_error
 
 
 def test_a_row_that_is_added_is_learned_and_read() -> None:
@@ -162,4 +162,4 @@ def test_a_row_that_is_added_is_learned_and_read() -> None:
     (softer,) = recorded(with_bearing(Rotor(), k_y=-0.1), OTHER, 74, 1)
     found = {reading.name: reading for reading in monitor.diagnose(of_states(softer, DISPLACEMENTS)).parameters}
     assert set(found) == {*parameters_of(), "EI"}
-    assert found["EI"].change == pytest.approx(-0.09, abs=0.03)
+    assert found["EI"].relative_change == pytest.approx(-0.09, abs=0.03)

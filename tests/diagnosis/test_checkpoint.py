@@ -16,7 +16,7 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import HopMoments, plan_for
-from models.diagnosis.verdict.sequential import Finding, SequentialState
+from models.diagnosis.verdict.sequential import SequentialState, finding
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError
@@ -80,7 +80,7 @@ def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str) ->
     assert sum(bool(window.parameters) for report in expected for window in report.windows) >= 6
     last = expected[hops[-1]].windows[-1].verdict
     assert last is not None
-    assert [finding.name for finding in last.findings] == ["k_by"]
+    assert [finding.name for finding in last.changed] == ["k_by"]
     assert {report.verdict.reason for report in expected} == {None, "overlap"}
     assert sum(not report.verdict.continuous for report in expected) == 3  # two gaps, one repetition
 
@@ -109,10 +109,10 @@ def test_what_the_likelihood_remembers_matters(forgotten: str) -> None:
     (now,), (then,) = reports[-1].windows, expected[evaluated[2]].windows
     assert now.parameters != then.parameters
     for one, other in zip(now.parameters, then.parameters, strict=True):
-        if one.change is not None:
-            assert other.change is not None
+        if one.relative_change is not None:
+            assert other.relative_change is not None
             assert other.standard_error is not None
-            assert abs(one.change - other.change) < other.standard_error
+            assert abs(one.relative_change - other.relative_change) < other.standard_error
 
 
 @lru_cache
@@ -260,7 +260,7 @@ def stretches(draw: st.DrawFn) -> Stretch:
     )
 
 
-findings = st.builds(Finding, st.sampled_from(PARAMETERS), times, times, numbers)
+findings = st.builds(finding, st.sampled_from(PARAMETERS), times, times, numbers)
 states = st.builds(
     SequentialState,
     st.dictionaries(st.sampled_from([1, 2, 4, 8, 16, 32]), st.lists(stretches(), min_size=1, max_size=4)),

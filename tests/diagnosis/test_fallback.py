@@ -44,7 +44,7 @@ def test_false_alarms_stay_at_the_declared_rate_whatever_the_number_of_healthy_w
         for window in windows[healthy:]:
             judged = shape.judge(window, rate)
             z.append([one.z for one in judged])
-            any_changed += any(one.changed for one in judged)
+            any_changed += any(one.verdict == "changed" for one in judged)
     values = np.array(z, dtype=float)
     assert binomtest(any_changed, len(z), rate, alternative="greater").pvalue > 0.005
     for channel in values.T:
@@ -56,24 +56,24 @@ def test_a_lost_fifth_of_stiffness_is_seen_and_never_named() -> None:
     shape = learn_shape(recorded(1, 6))
     for window in recorded(2, 8, change=-0.2):
         judged = shape.judge(window)
-        assert judged[0].changed
+        assert judged[0].verdict == "changed"
         assert judged[0].z is not None
         assert judged[0].z > judged[0].limit
         for one in judged:
-            said = one.sentence.replace(one.channel, "")
+            said = one.text.replace(one.state, "")
             assert not any(name in said.split() for name in (*PARAMETERS, "bearing", "disc", "stiffness", "damping"))
-    assert [one.channel for one in shape.judge(recorded(1, 6)[0])] == ["y1", "z1", "y2_ddot"]
+    assert [one.state for one in shape.judge(recorded(1, 6)[0])] == ["y1", "z1", "y2_ddot"]
 
 
 @pytest.mark.slow
 def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
     one_colour = learn_shape(recorded(1, 6))
     other_colours = [recorded(7, 1, condition=number)[0] for number in range(2, 26)]
-    assert sum(any(one.changed for one in one_colour.judge(window)) for window in other_colours) > 12
+    assert sum(any(one.verdict == "changed" for one in one_colour.judge(window)) for window in other_colours) > 12
     colours = learn_shape(other_colours[:12])
     assert all(one.beyond_sampling > 2 for one in colours.channels)
     assert all(one.beyond_sampling < 1.6 for one in one_colour.channels)
-    flagged = sum(any(one.changed for one in colours.judge(window, 0.05)) for window in other_colours[12:])
+    flagged = sum(any(one.verdict == "changed" for one in colours.judge(window, 0.05)) for window in other_colours[12:])
     assert binomtest(flagged, 12, 0.05, alternative="greater").pvalue > 0.005
 
 
@@ -112,8 +112,8 @@ def test_what_cannot_be_compared_says_why_and_is_neither_changed_nor_healthy() -
     }
     for reason, case in cases.items():
         judged = shape.judge(case)[0]
-        assert (judged.state, judged.z, judged.changed) == ("not evaluable", None, False)
-        assert reason in judged.sentence
+        assert (judged.verdict, judged.z) == ("not evaluable", None)
+        assert reason in judged.text
     with pytest.raises(ValueError, match="rate is 0"):
         shape.judge(window, 0)
 

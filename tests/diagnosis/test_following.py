@@ -40,7 +40,7 @@ def slid(layout: Layout, step: tuple[str, float] | None = None) -> tuple[Sliding
 
 def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
     read = diagnosis.evaluable
-    return np.array([one.change or 0.0 for one in read]), np.array([one.standard_error or 0.0 for one in read])
+    return np.array([one.relative_change or 0.0 for one in read]), np.array([one.standard_error or 0.0 for one in read])
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
 from models.diagnosis.verdict.isolation import Isolation, isolate_window, outside_confidence
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
@@ -26,7 +26,7 @@ def window(values: FloatArray, cov: FloatArray, misfit_z: float | None = None) -
     slopes = np.array([slope(name, value) for name, value in zip(PARAMETERS, values, strict=True)])
     errors = np.sqrt(np.diag(cov)) * slopes
     readings = tuple(
-        ParameterReading(name, "likelihood", from_scale(name, float(value)), float(error))
+        parameter_reading(name, "likelihood", from_scale(name, float(value)), float(error))
         for name, value, error in zip(PARAMETERS, values, errors, strict=True)
     )
     return Diagnosis("likelihood", readings, covariance=cov * np.outer(slopes, slopes), misfit_z=misfit_z)
@@ -107,11 +107,13 @@ def test_the_restricted_estimate_is_sharper_and_right() -> None:
     for _ in range(500):
         found = isolate_window(window(rng.multivariate_normal([-0.3, 0, 0, 0, 0, 0], cov), cov), 0.01)
         (reading,) = (one for one in found.readings if one.name == "k_by")
-        assert reading.change is not None
+        assert reading.relative_change is not None
         assert reading.standard_error is not None
-        z.append((to_scale("k_by", reading.change) + 0.3) / (reading.standard_error / (1 + reading.change)))
+        z.append(
+            (to_scale("k_by", reading.relative_change) + 0.3) / (reading.standard_error / (1 + reading.relative_change))
+        )
         if len(found.changed) == 1:
-            assert reading.standard_error < 0.65 * 0.01 * (1 + reading.change)
+            assert reading.standard_error < 0.65 * 0.01 * (1 + reading.relative_change)
     assert float(np.std(z)) == pytest.approx(1.0, abs=0.1)
     assert abs(float(np.mean(z))) < 0.2
 
@@ -131,8 +133,7 @@ def test_parameters_without_a_reading_take_no_part() -> None:
     cov = np.diag(np.full(6, 1e-4))
     full = window(np.array([0.2, 0, 0, 0, 0, 0]), cov)
     missing = tuple(
-        ParameterReading(one.name, one.by, reason="not measured") if one.name == "c_bz" else one
-        for one in full.parameters
+        no_reading(one.name, one.by, "not measured") if one.name == "c_bz" else one for one in full.parameters
     )
     found = isolate_window(Diagnosis("network", missing, covariance=np.delete(np.delete(cov, 3, 0), 3, 1)), 0.01)
     assert found.changed == ("k_by",)

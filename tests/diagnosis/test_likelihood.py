@@ -109,7 +109,10 @@ def read(draw: Draw, numbers: range, faults: dict[str, float]) -> tuple[np.ndarr
     """Errors of the readings in their own standard errors, shape (n_windows, 6)."""
     diagnoses = [LikelihoodFit(draw.machine).diagnose(simulate_window(draw, number)) for number in numbers]
     z = [
-        [((one.change or 0) - faults.get(one.name, 0.0)) / (one.standard_error or 1) for one in diagnosis.parameters]
+        [
+            ((one.relative_change or 0) - faults.get(one.name, 0.0)) / (one.standard_error or 1)
+            for one in diagnosis.parameters
+        ]
         for diagnosis in diagnoses
     ]
     return np.array(z), diagnoses
@@ -178,7 +181,7 @@ def test_a_warm_start_ends_where_a_cold_one_does() -> None:
     from_first, cold = warm.diagnose(second), LikelihoodFit(machine).diagnose(second)
     assert from_first.steps <= 15
     for one, other in zip(from_first.parameters, cold.parameters, strict=True):
-        assert abs((one.change or 0) - (other.change or 0)) < 0.4 * (other.standard_error or 0)
+        assert abs((one.relative_change or 0) - (other.relative_change or 0)) < 0.4 * (other.standard_error or 0)
 
 
 def test_windows_of_the_same_size_at_other_frequencies_have_groups_of_their_own() -> None:

@@ -11,7 +11,7 @@ from models.diagnosis.likelihood.goodness import Alternative, Goodness
 from models.diagnosis.limits import beyond
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, parameter_reading, possible_reading
 from models.diagnosis.verdict.determined import determined
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
@@ -120,7 +120,7 @@ def test_beside_a_misfit_the_rotor_must_be_seen(window: WindowStatistics) -> Non
 
 def test_a_vague_reading_says_how_vague(window: WindowStatistics) -> None:
     for error in (0.2001, 0.204, 0.5, 3.0):
-        vague = Diagnosis("likelihood", (ParameterReading("k_by", "likelihood", 0.1, error),))
+        vague = Diagnosis("likelihood", (parameter_reading("k_by", "likelihood", 0.1, error),))
         assert_beyond(determined(vague, window, 60.0).parameters[0].reason)
 
 
@@ -156,8 +156,8 @@ def test_networks_say_what_they_do_not_know(window: WindowStatistics) -> None:
 @pytest.mark.parametrize("change", [-1.0, -1.004, -4.7])
 def test_what_physics_does_not_allow_is_no_reading(change: float) -> None:
     for name in ("k_by", "e"):
-        reading = ParameterReading.of(name, "relation", change, 0.1)
-        assert reading.change is None
+        reading = possible_reading(name, "relation", change, 0.1)
+        assert reading.relative_change is None
         assert reading.reason == impossible(change, "distance" if name == "e" else "stiffness")
 
 

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors import (
-    SensorFinding,
+    SensorFault,
     SensorReference,
     implicated,
     learn_sensor_reference,
@@ -73,12 +73,12 @@ def column(state: str) -> int:
     return plan_of("lab").states.index(state)
 
 
-def found_in(samples: FloatArray, reference: SensorReference | None = None) -> tuple[SensorFinding, ...]:
+def found_in(samples: FloatArray, reference: SensorReference | None = None) -> tuple[SensorFault, ...]:
     (window,) = windows_of(plan_of("lab"), samples)
     return sensor_findings(window, reference, machine_of("lab").sensors)
 
 
-def only(findings: tuple[SensorFinding, ...]) -> SensorFinding:
+def only(findings: tuple[SensorFault, ...]) -> SensorFault:
     assert len(findings) == 1, [finding.text for finding in findings]
     return findings[0]
 
@@ -168,7 +168,7 @@ def test_a_wrong_gain_is_measured_and_the_pair_named(state: str, gain: float) ->
     assert finding.kind == "gain"
     assert set(finding.states) == {place, f"{place}_dot"}
     seen = gain if state.endswith("_dot") else 1 / gain
-    assert 1 + finding.value == pytest.approx(seen, rel=0.005)
+    assert 1 + (finding.value or 0.0) == pytest.approx(seen, rel=0.005)
 
 
 def test_sensors_that_always_disagreed_are_healthy_and_a_new_gain_is_the_channels() -> None:
@@ -259,7 +259,7 @@ def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() ->
         (window,) = windows_of(plan, samples)
         findings = sensor_findings(window)
         assert implicated(findings) <= {plan.states[1]}
-        found += [finding.value for finding in findings]
+        found += [finding.value or 0.0 for finding in findings]
     assert len(found) >= 2
     np.testing.assert_allclose(found, -0.3, atol=0.1)
 

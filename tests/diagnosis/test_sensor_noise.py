@@ -9,10 +9,11 @@ import pytest
 from pydantic import ValidationError
 
 from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.sensors import SensorFinding, SensorReference, learn_sensor_reference, sensor_findings
+from models.diagnosis.sensors import SensorReference, learn_sensor_reference, sensor_findings
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.stream import blocks
 
@@ -81,13 +82,13 @@ def reference_of(name: str, *, displacements: bool = False) -> SensorReference:
 
 def found_in(
     samples: FloatArray, *, displacements: bool = False, reference: SensorReference | None = None
-) -> tuple[SensorFinding, ...]:
+) -> tuple[SensorFault, ...]:
     (window,) = windows_of("lab", samples, displacements=displacements)
     reference = reference_of("lab", displacements=displacements) if reference is None else reference
     return sensor_findings(window, reference, machine_of("lab").sensors)
 
 
-def only(findings: tuple[SensorFinding, ...]) -> SensorFinding:
+def only(findings: tuple[SensorFault, ...]) -> SensorFault:
     assert len(findings) == 1, [finding.text for finding in findings]
     return findings[0]
 

@@ -7,10 +7,11 @@ import pytest
 
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
-from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, SequentialVerdict
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Verdict
 from tests.diagnosis.gaussian_hops import GaussianHops, detection_delays
 from tests.diagnosis.test_isolation import window
 
@@ -28,9 +29,7 @@ def true(**changes: float) -> FloatArray:
     return values
 
 
-def play(
-    test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]
-) -> list[tuple[int, SequentialVerdict]]:
+def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray]) -> list[tuple[int, Verdict]]:
     """Feed hops with these true values; verdicts with the number of the hop."""
     verdicts, number = [], 0
     for count, values in story:
@@ -70,7 +69,7 @@ def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
             looks = hops.looks(offset)
             if looks:
                 verdict = test.update({12: replace(looks[12], common=common)})  # sums are made of whole windows
-        named[common is None] = [finding.name for finding in verdict.findings]
+        named[common is None] = [finding.name for finding in verdict.changed]
     assert named == {True: ["k_by"], False: []}
 
 
@@ -113,12 +112,12 @@ def test_delays_stay_within_twice_those_of_a_fixed_length(name: str, change: flo
 def test_a_small_change_accumulates_over_windows() -> None:
     """Damping 4 % down is no more than three standard errors of a window; sums of windows find it."""
     verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 2), (24, true()), (160, true(c_by=-0.04)))
-    number, first = next((n, v) for n, v in verdicts if v.findings)
-    (finding,) = first.findings
+    number, first = next((n, v) for n, v in verdicts if v.changed)
+    (finding,) = first.changed
     assert finding.name == "c_by"
     assert finding.stretch_s >= 120.0
     assert 36 < number < 24 + 120
-    assert {f.name for _, verdict in verdicts for f in verdict.findings} == {"c_by"}
+    assert {f.name for _, verdict in verdicts for f in verdict.changed} == {"c_by"}
 
 
 @pytest.mark.slow
@@ -149,7 +148,7 @@ def test_what_a_straddling_window_reads_wrong_is_not_named() -> None:
         said: list[tuple[str, ...]] = []
         for since in range(1, 26):  # to where two whole windows have left the change behind
             looks = straddling(hops.looks(true(k_by=-0.25)), since, true(c_by=0.07))
-            said.append(tuple(finding.name for finding in test.update(looks).findings))
+            said.append(tuple(finding.name for finding in test.update(looks).changed))
         assert set(said[1:]) == {("k_by",)}
 
 
@@ -157,10 +156,10 @@ def test_two_changes_at_once_and_one_after_the_other() -> None:
     both, first = true(k_by=-0.2, c_bz=-0.25), true(k_by=-0.2)
     for story in [((20, true()), (30, both)), ((20, true()), (30, first), (30, both))]:
         verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 4), *story)
-        assert [f.name for f in verdicts[-1][1].findings] == ["k_by", "c_bz"]
-        named = {tuple(f.name for f in verdict.findings) for _, verdict in verdicts}
+        assert [f.name for f in verdicts[-1][1].changed] == ["k_by", "c_bz"]
+        named = {tuple(f.name for f in verdict.changed) for _, verdict in verdicts}
         assert named <= {(), ("k_by",), ("c_bz",), ("k_by", "c_bz")}
-    k_by, c_bz = verdicts[-1][1].findings
+    k_by, c_bz = verdicts[-1][1].changed
     assert k_by.since_ns < c_bz.since_ns  # each change has its own date
     assert abs(k_by.since_ns / 5e9 - 20) <= 4
     assert abs(c_bz.since_ns / 5e9 - 50) <= 4
@@ -169,17 +168,17 @@ def test_two_changes_at_once_and_one_after_the_other() -> None:
 def test_a_repair_is_noticed_within_seconds() -> None:
     verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 5), (20, true()), (30, true(k_by=-0.25)), (20, true()))
     late = [verdict for number, verdict in verdicts if number >= 50 + 4]
-    assert all(not verdict.findings for verdict in late)
+    assert all(not verdict.changed for verdict in late)
     assert not late[0].settled
     (k_by,) = (reading for reading in late[0].current if reading.name == "k_by")
-    assert abs(k_by.change or 1.0) < 0.04
+    assert abs(k_by.relative_change or 1.0) < 0.04
 
 
 def test_readings_are_those_of_the_new_machine_while_the_window_straddles() -> None:
     verdicts = play(SequentialTest(SETTINGS), gaussian(SEED + 6), (20, true()), (6, true(k_by=-0.25)))
     last = verdicts[-1][1]
     (k_by,) = (reading for reading in last.current if reading.name == "k_by")
-    assert k_by.change == pytest.approx(-0.25, abs=0.03)
+    assert k_by.relative_change == pytest.approx(-0.25, abs=0.03)
     assert not last.settled
 
 
@@ -189,7 +188,7 @@ def test_what_is_outside_the_model_is_said_of_clean_data() -> None:
         for _ in range(20):
             looks = {h: replace(look, misfit_z=misfit) for h, look in hops.looks(true()).items()}
             if looks:
-                assert test.update(looks).isolation.outside == outside
+                assert test.update(looks).outside_model == outside
 
 
 def test_a_gap_is_no_part_of_a_sum() -> None:

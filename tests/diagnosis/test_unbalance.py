@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.readings import ParameterReading
+from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine
+from rotorwatch.records.windows import Parameter
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 SEED = 7_700_021
@@ -30,16 +31,16 @@ def turned(window: WindowStatistics, degrees: float) -> WindowStatistics:
     return replace(window, synchronous=turn * window.synchronous, hop_synchronous=turn * window.hop_synchronous)
 
 
-def e_of(window: WindowStatistics) -> ParameterReading:
-    return LikelihoodFit(MACHINE).diagnose(window).parameters[-1]
+def e_of(window: WindowStatistics) -> tuple[Parameter, UnbalanceVector]:
+    diagnosis = LikelihoodFit(MACHINE).diagnose(window)
+    assert diagnosis.unbalance is not None
+    return diagnosis.parameters[-1], diagnosis.unbalance
 
 
 @pytest.mark.parametrize("degrees", [-170.0, -90.0, 40.0, 180.0])
 @pytest.mark.parametrize("e", [-0.5, 0.0, 1.0])
 def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(degrees: float, e: float) -> None:
-    reading = e_of(turned(drawn(1, e), degrees))
-    vector = reading.vector
-    assert vector is not None
+    reading, vector = e_of(turned(drawn(1, e), degrees))
     assert vector.magnitude_change == pytest.approx(e, abs=4.5 * vector.magnitude_error)
     assert vector.turned_deg is not None
     assert vector.turned_error_deg is not None
@@ -47,12 +48,14 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(degrees
     assert abs(apart) < 4.5 * vector.turned_error_deg + 0.5
     true = (1 + e) * np.exp(1j * np.radians(degrees)) - 1
     assert vector.change == pytest.approx(abs(true), abs=4.5 * vector.change_error + 0.01)
-    assert reading.change is not None
-    assert reading.change > -1
+    assert reading.relative_change is not None
+    assert reading.relative_change > -1
     # As much of a change as there is, or of the size where the turn is the lesser part of it.
-    assert reading.change == pytest.approx(abs(true) if abs(reading.change - e) > 0.05 else e, abs=0.1)
-    assert reading.interval is not None
-    assert reading.interval[0] >= -1
+    assert reading.relative_change == pytest.approx(
+        abs(true) if abs(reading.relative_change - e) > 0.05 else e, abs=0.1
+    )
+    assert reading.interval_95 is not None
+    assert reading.interval_95[0] >= -1
 
 
 @pytest.mark.slow
@@ -64,11 +67,10 @@ def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
     for window in drawings:
         assert window.synchronous is not None
         assert last.synchronous is not None
-        reading = e_of(replace(window, synchronous=window.synchronous - last.synchronous))
-        assert reading.change is not None
-        assert -1 < reading.change < -0.8
-        assert reading.vector is not None
-        assert reading.vector.turned_deg is None
+        reading, vector = e_of(replace(window, synchronous=window.synchronous - last.synchronous))
+        assert reading.relative_change is not None
+        assert -1 < reading.relative_change < -0.8
+        assert vector.turned_deg is None
 
 
 def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
@@ -76,7 +78,7 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
     assert window.synchronous is not None
     foreign = np.abs(window.synchronous) * np.exp(1j * np.random.default_rng(5).uniform(0, 6, len(window.states)))
     diagnosis = LikelihoodFit(MACHINE).diagnose(replace(window, synchronous=foreign))
-    vector = diagnosis.parameters[-1].vector
+    vector = diagnosis.unbalance
     assert vector is not None
     assert "not what an unbalance makes" in vector.foreign
     verdict = isolate_window(diagnosis, 0.001)
@@ -92,8 +94,7 @@ def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
     """
     z = []
     for number in range(12):
-        vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0)).vector
-        assert vector is not None
+        _, vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0))
         assert vector.turned_deg is not None
         assert vector.turned_error_deg is not None
         z.append(

@@ -39,5 +39,5 @@ def test_a_change_is_named_alone(name: str, change: float) -> None:
     diagnosis = read(SEED + 1, 0.1, Event(at_s=0.0, parameter=name, relative_change=change))
     assert isolate_window(diagnosis, 0.001).changed == (name,)
     reading = next(one for one in diagnosis.evaluable if one.name == name)
-    assert reading.interval is not None
-    assert reading.change == pytest.approx(change, abs=4 * (reading.standard_error or 0.0))
+    assert reading.interval_95 is not None
+    assert reading.relative_change == pytest.approx(change, abs=4 * (reading.standard_error or 0.0))

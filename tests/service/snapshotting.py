@@ -1,7 +1,6 @@
 """What the tests of snapshots share: windows of the rotor kit as a monitor holds them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -14,6 +13,7 @@ from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot
 from service.analysis.snapshots.desk import LatestData, SnapshotDesk
+from service.monitor.reports import Identity
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, stream
 
@@ -23,7 +23,6 @@ __all__ = [
     "SECONDS",
     "SEED",
     "S",
-    "Speaker",
     "by_plane",
     "desk_of",
     "latest",
@@ -39,18 +38,10 @@ K_BY = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
 NAMES = [channel.name for channel in LAB.sensors]
 
 
-@dataclass(frozen=True)
-class Speaker:
-    """Who speaks in these tests."""
-
-    site: str = "demo"
-    machine: str = "lab"
-    bundle: str | None = None
-    machine_hash: str = "9a0c41d27be8"
-
-
 def desk_of(machine: MachineFile) -> SnapshotDesk:
-    return SnapshotDesk(Installed(machine), Speaker())
+    return SnapshotDesk(
+        Installed(machine), Identity(site="demo", machine="lab", bundle=None, machine_hash="9a0c41d27be8")
+    )
 
 
 def window_of(machine: MachineFile, stream_: Sequence[SampleBlock], *, lagged: bool = True) -> WindowStatistics:

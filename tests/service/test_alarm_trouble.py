@@ -17,19 +17,18 @@ from models.machine import AlarmSettings, IngestSettings, Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from rotorwatch.records.alarms import AlarmState
-from rotorwatch.records.health import HealthState
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Report
 from service.history.errors import StoreError
 from service.history.machine import MachineStore
 from service.history.records import Checkpoint, Step
 from service.history.retention import Retention
 from service.history.store import Store
-from service.monitor.alarm_conversion import Identity
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.operation import Operation
-from service.monitor.conversion import machine_hash
 from service.monitor.monitor import MachineMonitor
-from service.monitor.reports import WindowReport
+from service.monitor.reports import Identity, identity_of
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import checkpoint_step, restored, stored_readings
 from service.stream.inbox import RawBlock
@@ -309,11 +308,11 @@ def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expect
     before.step(block(0))
     end_ns = block(0).end_ns
     before.operate(order("shelve", "k_by", duration_s=HOUR_S), end_ns)
-    identity = Identity("demo", "lab", None, "old")
+    identity = Identity(site="demo", machine="lab", bundle=None, machine_hash="old")
     step = checkpoint_step(identity, before.state(), 1)
     then = Checkpoint(step.head, step.new_hops)
     changed = install(machine(on_delay_s=77.0), None)
-    now = replace(identity, machine_hash=machine_hash(changed.machine))
+    now = identity_of(changed)
     after, text = restored(lambda: MachineMonitor(changed), now, then, 1)
     assert "the window fills anew: machine file was old" in text
     assert after.end_ns == end_ns
@@ -444,5 +443,6 @@ def test_a_gap_and_a_silence_name_the_time_without_data() -> None:
 
 
 def test_a_reading_that_is_no_number_is_left_out_and_holds_nothing_up() -> None:
-    window = WindowReport(0, 1, HealthState.HEALTHY, 1.0, speed_rad_s=float("nan"), misfit_z=2.0)
+    said = {"speed_rad_s": float("nan"), "misfit_z": 2.0, "parameters": (), "equations": ()}
+    window = Report.model_validate(example(Report) | said)
     assert [one.quantity for one in stored_readings([window])] == ["misfit"]

@@ -41,7 +41,7 @@ def test_machines_are_listed(http: httpx.Client, seen: tuple[Runtime, MachineWor
     assert (machine.site, machine.machine, machine.state) == ("demo", "lab", "alert")
     assert machine.keys["health"] == "rotorwatch/demo/lab/health"
     assert len(machine.channels) == 9
-    assert machine.bundle == seen[1].identity.bundle is not None
+    assert machine.bundle == seen[1].identity["bundle"] is not None
 
 
 def test_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runtime, MachineWorker]) -> None:
@@ -49,7 +49,7 @@ def test_configuration_is_the_machine_file(http: httpx.Client, seen: tuple[Runti
     assert (file := Machine.model_validate(found.file)) == seen[1].machine
     assert file.alarms.on_delay_s == 10.0
     assert file.rotor.k_by_N_per_m == load_machine("lab").rotor.k_by_N_per_m
-    assert found.machine_hash == seen[1].identity.machine_hash
+    assert found.machine_hash == seen[1].identity["machine_hash"]
 
 
 def test_health_names_the_fault_with_its_interval(http: httpx.Client) -> None:

@@ -3,25 +3,27 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import httpx
 import pytest
 
-from models.diagnosis.readings import EquationReading, ParameterReading
+from models.commissioning.installed import Installed
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmState, AlarmStates, EventKind
 from rotorwatch.records.example import example
-from rotorwatch.records.health import Health, HealthState, Report, StreamStatus
+from rotorwatch.records.health import Health, HealthState, Quality, Report, StreamStatus
 from rotorwatch.records.history import AlarmEventList, AuditList
 from rotorwatch.records.machines import MachineDescription
+from rotorwatch.records.windows import Equation, Parameter
 from service.monitor import conversion
-from service.monitor.alarm_conversion import Identity, alarm_cloud_event
+from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
-from service.monitor.reports import DataQuality, MachineHealth, WindowReport
+from service.monitor.reports import MachineHealth, identity_of, machine_hash
 from service.runtime import Runtime
 from tests.service.live import LAB
 from tests.service.monitored import PLACE, answered, client, fed
 
-IDENTITY = Identity("demo", "lab", None, conversion.machine_hash(LAB))
+IDENTITY = identity_of(Installed(LAB))
 NAMES = ("k_by", "e", "model")
 
 
@@ -123,17 +125,27 @@ def test_every_field_is_described_and_has_an_example(
 
 
 def test_infinite_and_undefined_numbers_become_null() -> None:
-    readings = (
-        ParameterReading("k_by", "likelihood", float("nan"), 0.1),
-        ParameterReading("c_by", "likelihood", 0.1, float("inf")),
-        ParameterReading("e", "likelihood", 0.1, 0.0),
-        ParameterReading("EI", "likelihood", reason="no phase reference"),
+    readings: list[dict[str, Any]] = [
+        {"relative_change": float("nan"), "standard_error": 0.1},
+        {"relative_change": 0.1, "standard_error": float("inf")},
+        {"reason": "no phase reference"},
+    ]
+    read = tuple(Parameter(name="k_by", text="", by="likelihood", **one) for one in readings)
+    equation = Equation(
+        equation="28", title="", evaluable=True, msd=float("inf"), msd_healthy=float("nan"), parameters=read
     )
-    equation = EquationReading("28", "bearing", float("inf"), float("nan"), readings)
-    latest = WindowReport(0, 1, HealthState.HEALTHY, 1.0, float("nan"), readings, (equation,), misfit_z=float("inf"))
+    latest = Report.model_validate(
+        {
+            **example(Report),
+            "speed_rad_s": float("nan"),
+            "misfit_z": float("inf"),
+            "equations": (equation,),
+            "parameters": read,
+        }
+    )
     health = conversion.health(
         IDENTITY,
-        MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", beyond_ns=1),), DataQuality(), -1),
+        MachineHealth(HealthState.HEALTHY, 1.0, latest, (Alarm("k_by", beyond_ns=1),), Quality(), -1),
         StreamStatus(
             publisher_alive=False,
             silent=False,
@@ -153,16 +165,16 @@ def test_infinite_and_undefined_numbers_become_null() -> None:
     assert fields["misfit_z"] is None
     assert fields["equations"][0]["msd"] is None
     assert fields["alarms"][0]["standard_error"] is None
-    assert [entry["interval_95"] for entry in fields["parameters"]] == [None, None, [0.1, 0.1], None]
-    assert [entry["z"] for entry in fields["parameters"]] == [None, None, None, None]
+    assert [entry["relative_change"] for entry in fields["parameters"]] == [None, 0.1, None]
+    assert [entry["standard_error"] for entry in fields["parameters"]] == [0.1, None, None]
     assert Health.model_validate_json(text) == health
 
 
 def test_no_data_is_said_beside_a_raised_alarm_and_hides_it_not() -> None:
     state = AlarmState.UNACKNOWLEDGED
     alarm = Alarm("k_by", state, present=True, raised_ns=5, occurrence=1, change=-0.3, standard_error=0.01)
-    latest = WindowReport(0, 7, HealthState.HEALTHY, 1.0)
-    record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), DataQuality(), 0)
+    latest = Report.model_validate(example(Report))
+    record = MachineHealth(HealthState.ALERT, 1.0, latest, (alarm, Alarm("e")), Quality(), 0)
     lost = StreamStatus(
         publisher_alive=True,
         data_age_s=9.0,
@@ -193,6 +205,6 @@ def test_event_identity_is_stable_and_differs_between_events() -> None:
 
 def test_machine_hash_follows_the_content() -> None:
     changed = LAB.model_copy(update={"description": "another"})
-    assert conversion.machine_hash(LAB) == IDENTITY.machine_hash
-    assert conversion.machine_hash(changed) != IDENTITY.machine_hash
-    assert len(IDENTITY.machine_hash) == 12
+    assert machine_hash(LAB) == IDENTITY["machine_hash"]
+    assert machine_hash(changed) != IDENTITY["machine_hash"]
+    assert len(IDENTITY["machine_hash"]) == 12

@@ -7,16 +7,15 @@ from models.commissioning.installed import install
 from models.machine import load_machine
 from models.physics.parameters import PARAMETERS
 from rotorwatch.records.alarms import EventKind
-from rotorwatch.records.health import HealthState
+from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
-from service.monitor.reports import WindowReport
 from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign
 
 DURATION_S = 80.0
 SEED = 7_730_001
 
 
-def watched(name: str, kind: Foreign, seed: int) -> tuple[list[WindowReport], set[str]]:
+def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]]:
     """Reports of full windows, and the alarms that were raised."""
     machine = load_machine(name)
     alarms = machine.alarms.model_copy(update={"on_delay_s": machine.window.hop_s})
@@ -40,8 +39,8 @@ def judge(name: str, kind: Foreign, seed: int) -> None:
         assert window.state not in {HealthState.HEALTHY, HealthState.DANGER}
         assert window.reason
         assert not window.suspect
-        assert all(reading.change is None for reading in window.parameters)
-        assert window.verdict is None or not window.verdict.findings
+        assert all(reading.relative_change is None for reading in window.parameters)
+        assert window.verdict is None or not window.verdict.changed
 
 
 @pytest.mark.parametrize("kind", FOREIGN)

@@ -114,7 +114,7 @@ def test_two_publishers_on_one_key_are_named() -> None:
     (alarm,) = [alarm for alarm in monitor.health().alarms if alarm.raised]
     assert alarm.name == CONFLICT
     assert "runs 1 and 2" in alarm.note
-    assert monitor.health().quality.accepted == len(ours)  # the first goes on undisturbed
+    assert monitor.health().quality.accepted_blocks == len(ours)  # the first goes on undisturbed
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 5])
@@ -129,7 +129,7 @@ def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
         monitor.step_payload(*encode_block(one, ""))
     monitor.flush()
     health = monitor.health()
-    assert dict(health.quality.refused)["conflict"] == 14
+    assert dict(health.quality.refused_blocks)["conflict"] == 14
     assert CONFLICT in raised(monitor)
     assert {name for name in raised(monitor) if of_the_machine(name)} == set()
 
@@ -163,7 +163,7 @@ def test_what_can_be_no_block_costs_none(seed: int) -> None:
         monitor.step_payload(*encode_block(one, ""))
     monitor.flush()
     quality = monitor.health().quality
-    assert (quality.accepted, quality.gaps) == (len(ours), 0)
+    assert (quality.accepted_blocks, quality.gaps) == (len(ours), 0)
     assert not monitor.health().alarms
 
 

@@ -145,7 +145,7 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
     assert states.pop(worker.health().state.value) == 1.0
     assert set(states.values()) == {0.0}
     identity = worker.identity
-    assert read.of_lab("machine_info", bundle="", machine_hash=identity.machine_hash) == 1.0
+    assert read.of_lab("machine_info", bundle="", machine_hash=identity["machine_hash"]) == 1.0
 
 
 def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:

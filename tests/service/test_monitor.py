@@ -11,10 +11,9 @@ from models.ingest import Reason
 from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
-from rotorwatch.records.health import HealthState
+from rotorwatch.records.health import HealthState, Report
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
-from service.monitor.reports import WindowReport
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 
@@ -33,8 +32,8 @@ def monitor() -> MachineMonitor:
     return MachineMonitor(install(machine, "lab"))
 
 
-def feed(target: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[WindowReport], list[AlarmEvent]]:
-    windows: list[WindowReport] = []
+def feed(target: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Report], list[AlarmEvent]]:
+    windows: list[Report] = []
     events: list[AlarmEvent] = []
     for block in stream:
         report = target.step(block)
@@ -75,7 +74,7 @@ def test_every_parameter_and_equation_is_accounted_for() -> None:
     assert [reading.name for reading in window.parameters] == list(PARAMETERS)
     for reading in window.parameters:
         assert reading.by == "likelihood"
-        assert reading.interval is not None
+        assert reading.interval_95 is not None
         assert abs(reading.z or 0.0) < 4.5
     verdicts = {equation.equation: equation for equation in window.equations}
     assert list(verdicts) == ["28", "29", "30", "31"]
@@ -151,7 +150,7 @@ def test_undecodable_bytes_are_a_refusal_like_any_other() -> None:
     (report,) = target.step_payload(b"abc", b"too short", "application/x-rotorwatch-block")
     assert report.verdict.reason is Reason.MALFORMED
     assert "demo/lab: header (attachment) has 9 bytes, expected 32" in report.verdict.text
-    assert target.health().quality.refused == (("malformed", 1),)
+    assert target.health().quality.refused_blocks == {"malformed": 1}
 
 
 def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
@@ -182,7 +181,7 @@ def test_an_unsteady_speed_is_not_evaluable() -> None:
 @pytest.mark.parametrize("kind", ["stuck angle", "backwards", "constant channel", "dead probe", "twins", "clipped"])
 def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
     target = monitor()
-    seen: list[WindowReport] = []
+    seen: list[Report] = []
     events: list[AlarmEvent] = []
     rng = np.random.default_rng(1)
     for block in stream("healthy", 131.0):  # two windows: long enough for an alarm
@@ -217,9 +216,9 @@ def test_parameters_that_the_sensors_cannot_see_are_not_read() -> None:
     blocks_ = [replace(block, samples=block.samples[:, horizontal]) for block in stream("healthy", 63.0)]
     window = feed(MachineMonitor(install(part, None)), blocks_)[0][-1]
     readings = {reading.name: reading for reading in window.parameters}
-    assert readings["k_bz"].change is None
+    assert readings["k_bz"].relative_change is None
     assert readings["k_bz"].reason == "no displacement or velocity measured in z"
-    assert abs(readings["k_by"].change or 1.0) < 0.1
+    assert abs(readings["k_by"].relative_change or 1.0) < 0.1
 
 
 def test_one_wild_sample_does_not_blind_the_monitor() -> None:
@@ -238,8 +237,8 @@ def test_a_report_says_what_would_have_been_noticed_and_who_agrees() -> None:
         assert found.loss < 0 < found.gain
         assert found.gain > 6 * (reading.standard_error or 1.0)  # threshold and power together
     assert window.verdict is not None
-    assert (window.verdict.findings, window.verdict.detected, window.verdict.settled) == ((), False, True)
-    assert window.verdict.isolation.confidence > 0.99
+    assert (window.verdict.changed, window.verdict.detected, window.verdict.settled) == ((), False, True)
+    assert window.verdict.confidence > 0.99
     (relation,) = (opinion for opinion in window.opinions if opinion.by == "relation")
     assert {one.verdict for one in relation.agreement if one.name != "EI"} == {"agree"}
     assert {one.verdict for one in relation.agreement if one.name == "EI"} == {"only-one"}
@@ -258,11 +257,11 @@ def test_a_stiffness_fault_is_named_sized_and_the_only_alarm() -> None:
     # 140 s after the start the stiffness drops; two hops later there is clean data, one hop later the delay is over.
     assert (events[0].time_ns - windows[0].end_ns) / 1e9 + 6.0 <= 140.0 + 21.0
     assert events[0].alarm.change == pytest.approx(-0.25, abs=0.03)
-    named = {tuple(finding.name for finding in window.verdict.findings) for window in windows if window.verdict}
+    named = {tuple(finding.name for finding in window.verdict.changed) for window in windows if window.verdict}
     assert named == {(), ("k_by",)}
     assert windows[-1].state is HealthState.ALERT
     # The network of equation 28 says so too, that of equation 31 sees nothing.
     seen = {reading.name: reading for equation in windows[-1].equations for reading in equation.parameters}
-    assert seen["k_by"].change == pytest.approx(-0.25, abs=0.08)
+    assert seen["k_by"].relative_change == pytest.approx(-0.25, abs=0.08)
     assert (seen["k_by"].z or 0.0) < -3
     assert abs(seen["k_bz"].z or 0.0) < 4.5

@@ -17,11 +17,10 @@ from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState
 from service.history.errors import StoreError
 from service.history.records import Checkpoint, Step
-from service.monitor.alarm_conversion import Identity
 from service.monitor.alarms.alarm import AlarmEvent, Evidence
-from service.monitor.conversion import machine_hash
 from service.monitor.evaluation import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
+from service.monitor.reports import identity_of
 from service.runtime import running
 from service.stream.checkpoints import checkpoint_step, restored
 from service.stream.inbox import Inbox, RawBlock
@@ -302,7 +301,7 @@ def test_whatever_is_accepted_can_be_remembered_and_restored(
         metadata = {"rate_hz": repr(rate_hz), **{name: decimal(value) for name, value in whole.items()}}
         payload = write_arrow(good.samples, metadata)
         monitor.step_payload(payload, b"", ARROW_ENCODING)
-    identity = Identity("demo", "lab", None, machine_hash(installed.machine))
+    identity = identity_of(installed)
     step = checkpoint_step(identity, monitor.state(), 1)
     again, text = restored(lambda: MachineMonitor(installed), identity, Checkpoint(step.head, step.new_hops), 0)
     assert again.state().state == monitor.state().state

@@ -225,7 +225,7 @@ def test_late_joiner_asks_for_health_and_alarm_state() -> None:
         with open_session(address) as session:
             health = Health.model_validate_json(query(session, KEYS.health))
             assert health.quality.accepted_blocks == 5
-            assert health.machine_hash == worker.identity.machine_hash
+            assert health.machine_hash == worker.identity["machine_hash"]
             states = AlarmStates.model_validate_json(query(session, KEYS.alarm_state))
             assert (states.site, states.machine, states.alarms) == ("demo", "lab", ())
             alive = [reply.ok.key_expr for reply in session.liveliness().get("rotorwatch/**") if reply.ok is not None]

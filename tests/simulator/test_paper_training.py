@@ -79,7 +79,7 @@ def test_diagnostician_names_equations_and_no_sizes(
     assert diagnosis.by == "paper"
     assert [reading.equation for reading in diagnosis.equations] == ["28", "29", "30", "31"]
     assert all(reading.msd is not None and reading.msd_healthy is not None for reading in diagnosis.equations)
-    assert all(reading.change is None and reading.reason for reading in diagnosis.parameters)
+    assert all(reading.relative_change is None and reading.reason for reading in diagnosis.parameters)
     assert "28" in paper.flagged_equations(diagnosis)
 
 

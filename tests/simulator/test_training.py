@@ -125,7 +125,7 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
     trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 10, equation.kept_nominal), SHORT)
     draw = Draw(SHORT, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
     readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(8)]
-    k_by = np.array([reading[0].change for reading in readings], dtype=np.float64)
+    k_by = np.array([reading[0].relative_change for reading in readings], dtype=np.float64)
     assert np.median(k_by) == pytest.approx(-0.2, abs=0.04)
     assert all((reading[0].z or 0.0) < -2 for reading in readings)
     assert abs(np.median([reading[1].z or 0.0 for reading in readings])) < 2  # c_by did not change

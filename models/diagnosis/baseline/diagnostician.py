@@ -30,7 +30,7 @@ from models.diagnosis.baseline.unbalance import (
     slopes,
 )
 from models.diagnosis.limits import beyond
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
@@ -119,7 +119,7 @@ class BaselineDiagnostician:
         """Judge one window; never raises: what cannot be read carries its reason."""
         reason = unsuitable(window)
         if reason:
-            return Diagnosis(self.by, tuple(ParameterReading(n, self.by, reason=reason) for n in self._parameters))
+            return Diagnosis(self.by, tuple(no_reading(n, self.by, reason) for n in self._parameters))
         changes: list[RowChange | None] = []
         reasons: dict[str, str] = {}
         for row, relation, why in zip(self._rows, self._baseline.relations, self._baseline.reasons, strict=True):
@@ -147,9 +147,9 @@ class BaselineDiagnostician:
         covariance = positive(total[np.ix_(known, known)])
         errors = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
         parameters = tuple(
-            ParameterReading(name, self.by, reason=reasons[name])
+            no_reading(name, self.by, reasons[name])
             if reasons[name]
-            else ParameterReading(name, self.by, float(values[names.index(name)]), errors[names.index(name)])
+            else parameter_reading(name, self.by, float(values[names.index(name)]), errors[names.index(name)])
             for name in self._parameters
         )
         diagnosis = Diagnosis(
@@ -271,9 +271,9 @@ class BaselineDiagnostician:
 def _impossible(diagnosis: Diagnosis) -> str:
     """What no bearing does: a stiffness or damping that is gone or has changed its sign, or cannot be told at all."""
     for reading in diagnosis.evaluable:
-        if reading.name == "e" or reading.change is None or reading.standard_error is None:
+        if reading.name == "e" or reading.relative_change is None or reading.standard_error is None:
             continue
-        gone = reading.change + 2 * reading.standard_error < _GONE
+        gone = reading.relative_change + 2 * reading.standard_error < _GONE
         if gone or (reading.name.startswith("k") and reading.standard_error > _LOST):
             return f"a sensor of this plane that is swapped, reversed or late ({reading.name} makes no sense)"
     return ""

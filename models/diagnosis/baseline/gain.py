@@ -85,7 +85,7 @@ def _row_suspicion(diagnosis: Diagnosis, row: Row, single: tuple[str, ...], test
     if any(own.parameter not in names for own in row.own):
         return None
     at = [names.index(own.parameter) for own in row.own]
-    changes = np.array([max(_MOST_LOSS, readings[i].change or 0.0) for i in at])
+    changes = np.array([max(_MOST_LOSS, readings[i].relative_change or 0.0) for i in at])
     x = np.log1p(changes)
     J = np.linalg.inv(diagnosis.full_covariance[np.ix_(at, at)] / np.outer(1 + changes, 1 + changes))
     b, everything = J @ x, float(x @ J @ x)

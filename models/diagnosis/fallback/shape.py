@@ -20,8 +20,7 @@ E. Brunner, H. Dette, A. Munk, "Box-type approximations in nonparametric factori
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -30,8 +29,9 @@ from scipy.special import fdtrc, ndtri
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Shape
 
-__all__ = ["FEWEST_WINDOWS", "ChannelShape", "HealthyShape", "ShapeSpread", "learn_shape"]
+__all__ = ["FEWEST_WINDOWS", "HealthyShape", "ShapeSpread", "learn_shape"]
 
 FEWEST_WINDOWS = 4
 """Healthy windows without which nothing is learned; six or more are advised, from several recordings."""
@@ -42,36 +42,6 @@ _LAG_TOLERANCE_S = 1e-9
 _LEAST_P = 1e-300
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
-State = Literal["not changed", "changed", "not evaluable"]
-
-
-@dataclass(frozen=True, slots=True)
-class ChannelShape:
-    """What is said of one channel in one window.
-
-    Attributes
-    ----------
-    channel : str
-        State variable it measures.
-    state : {"not changed", "changed", "not evaluable"}
-    z : float or None
-        Distance from the healthy shape as a standard normal value; None if not evaluable.
-    limit : float
-        What `z` must exceed for "changed", from the declared rate.
-    sentence : str
-        The same in words, with the reason if it could not be evaluated.
-    """
-
-    channel: str
-    state: State
-    z: float | None
-    limit: float
-    sentence: str
-
-    @property
-    def changed(self) -> bool:
-        """Whether the shape changed."""
-        return self.state == "changed"
 
 
 class ShapeSpread(BaseModel):
@@ -141,7 +111,7 @@ class HealthyShape(BaseModel):
                 raise ValueError(f"channel {one.channel}: {len(one.mean)} values for {len(self.lags_s)} lags")
         return self
 
-    def judge(self, window: WindowStatistics, rate: float = 0.01) -> tuple[ChannelShape, ...]:
+    def judge(self, window: WindowStatistics, rate: float = 0.01) -> tuple[Shape, ...]:
         """Compare every channel of a window with its healthy shape; what cannot be compared says why.
 
         Parameters
@@ -178,16 +148,20 @@ class HealthyShape(BaseModel):
                 return f"speed {now * rpm:.0f} rpm, commissioned at {seen}"
         return ""
 
-    def _judged(
-        self, one: ShapeSpread, window: WindowStatistics, common: str, rate: float, limit: float
-    ) -> ChannelShape:
+    def _judged(self, one: ShapeSpread, window: WindowStatistics, common: str, rate: float, limit: float) -> Shape:
         reason = common
         if not reason and one.channel not in window.states:
             reason = "not measured"
         rho = None if reason else _shape(window, one.channel)
         if rho is None:
             reason = reason or "it does not move, or its correlation is not finite"
-            return ChannelShape(one.channel, "not evaluable", None, limit, f"{one.channel}: not evaluable, {reason}")
+            return Shape(
+                state=one.channel,
+                verdict="not evaluable",
+                z=None,
+                limit=limit,
+                text=f"{one.channel}: not evaluable, {reason}",
+            )
         d = np.array(one.directions) @ (rho - np.array(one.mean))
         # a shorter window scatters more; that a longer one scatters less is not relied on
         wider = (1 + 1 / self.windows) * max(1.0, self.window_s / window.duration_s)
@@ -196,13 +170,13 @@ class HealthyShape(BaseModel):
         z = -float(ndtri(min(max(p, _LEAST_P), 1 - 1e-16)))
         figures = f"{z:.1f} standard deviations, limit {limit:.1f}"
         if p < rate:
-            sentence = (
+            text = (
                 f"{one.channel}: its correlation function has changed shape ({figures}); whether the machine or its "
                 "excitation did, this comparison cannot tell"
             )
-            return ChannelShape(one.channel, "changed", z, limit, sentence)
-        sentence = f"{one.channel}: its correlation function has its healthy shape ({figures})"
-        return ChannelShape(one.channel, "not changed", z, limit, sentence)
+            return Shape(state=one.channel, verdict="changed", z=z, limit=limit, text=text)
+        text = f"{one.channel}: its correlation function has its healthy shape ({figures})"
+        return Shape(state=one.channel, verdict="not changed", z=z, limit=limit, text=text)
 
 
 def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:

@@ -25,7 +25,7 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL
 from models.diagnosis.likelihood.start import starting_point
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
@@ -246,15 +246,18 @@ class LikelihoodFit:
         change, spread = ratio - 1, structural * np.outer(ratio, ratio)
         errors = np.sqrt(np.diag(spread))
         readings = [
-            ParameterReading(name, self.by, float(value), float(error))
+            parameter_reading(name, self.by, float(value), float(error))
             for name, value, error in zip(STRUCTURAL, change, errors, strict=True)
         ]
+        vector = None
         if window.synchronous is not None:
             e = self._unbalance(window, model, point, structural, speed)
             cross = (e.covariance * ratio)[:, None]
             spread = np.block([[spread, cross], [cross.T, np.array([[e.variance]])]])
-            readings.append(ParameterReading("e", self.by, e.change, math.sqrt(e.variance), vector=e.vector))
-        return Diagnosis(self.by, tuple(readings), covariance=np.asarray(spread, dtype=np.float64))
+            readings.append(parameter_reading("e", self.by, e.change, math.sqrt(e.variance), e.vector))
+            vector = e.vector
+        covariance = np.asarray(spread, dtype=np.float64)
+        return Diagnosis(self.by, tuple(readings), covariance=covariance, unbalance=vector)
 
     def _unbalance(
         self, window: WindowStatistics, model: SpectralModel, point: ModelPoint, structural: FloatArray, speed: float

@@ -13,10 +13,11 @@ import numpy.typing as npt
 
 from models.diagnosis.limits import beyond
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Parameter
 
 __all__ = ["LAYERS", "LIMIT", "OWN", "AmortisedNetwork", "AmortisedNetworks", "Calibration", "NetworkDiagnostician"]
 
@@ -179,14 +180,12 @@ class NetworkDiagnostician:
             return self._refused(
                 f"the window is unlike what the networks were trained on ({text} apart, evaluated is at most {limit})"
             )
-        readings: list[ParameterReading] = []
+        readings: list[Parameter] = []
         blocks: list[FloatArray] = []
         for network in amortised.networks:
             n_inputs = network.direct.shape[0]
             if inputs.shape[1] < n_inputs:
-                readings += [
-                    ParameterReading(name, self.by, reason="no phase reference") for name in OWN[network.equation]
-                ]
+                readings += [no_reading(name, self.by, "no phase reference") for name in OWN[network.equation]]
                 continue
             mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
             read, covariance = self._read(network.equation, mean[0], factor[0])
@@ -206,7 +205,7 @@ class NetworkDiagnostician:
             if value > _MOST_APART
         )
 
-    def _read(self, equation: str, mean: FloatArray, factor: FloatArray) -> tuple[list[ParameterReading], FloatArray]:
+    def _read(self, equation: str, mean: FloatArray, factor: FloatArray) -> tuple[list[Parameter], FloatArray]:
         """Readings of one equation and the covariance of those that could be made."""
         amortised = self._amortised
         covariance = factor @ factor.T
@@ -223,20 +222,20 @@ class NetworkDiagnostician:
             if abs(log_ratio) > amortised.log_range:
                 low, high = np.expm1(-amortised.log_range), np.expm1(amortised.log_range)
                 reason = f"beyond the changes trained for ({low:+.0%} to {high:+.0%})"
-                readings.append(ParameterReading(name, self.by, reason=reason))
+                readings.append(no_reading(name, self.by, reason))
             elif not error < _VAGUE:
                 text, limit = beyond(100 * error, 100 * _VAGUE)
                 reason = f"not determined in this window (standard error {text} %, at most {limit} % is a reading)"
-                readings.append(ParameterReading(name, self.by, reason=reason))
+                readings.append(no_reading(name, self.by, reason))
             else:
-                readings.append(ParameterReading(name, self.by, ratio - 1, error))
+                readings.append(parameter_reading(name, self.by, ratio - 1, error))
                 kept.append(position)
                 scales.append(ratio * scale)
         return readings, covariance[np.ix_(kept, kept)] * np.outer(scales, scales)
 
     def _refused(self, reason: str) -> Diagnosis:
         names = [name for network in self._amortised.networks for name in OWN[network.equation]]
-        return Diagnosis(self.by, tuple(ParameterReading(name, self.by, reason=reason) for name in names))
+        return Diagnosis(self.by, tuple(no_reading(name, self.by, reason) for name in names))
 
 
 def _block_diagonal(blocks: list[FloatArray]) -> FloatArray:

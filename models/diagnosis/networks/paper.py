@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.networks.relation import Network
-from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
+from models.diagnosis.readings import Diagnosis, no_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Equation
 
 __all__ = [
     "PAPER_EQUATIONS",
@@ -271,7 +272,7 @@ class PaperDiagnostician:
         for trained, reading in zip(self._networks, equations, strict=True):
             verdict = "inconsistent" if reading.equation in flagged else "consistent"
             reason = reading.reason or f"equation {reading.equation} is {verdict}; it gives no size"
-            parameters += [ParameterReading(name, self.by, reason=reason) for name in trained.equation.parameters]
+            parameters += [no_reading(name, self.by, reason) for name in trained.equation.parameters]
         return Diagnosis(self.by, tuple(parameters), equations)
 
     def flagged_equations(self, diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -281,16 +282,17 @@ class PaperDiagnostician:
     def _with_means(self) -> list[tuple[PaperNetwork, float]]:
         return list(zip(self._networks, self._healthy.mean, strict=True))
 
-    def _read(self, trained: PaperNetwork, mean: float, window: WindowStatistics) -> EquationReading:
+    def _read(self, trained: PaperNetwork, mean: float, window: WindowStatistics) -> Equation:
         equation = trained.equation
         measured = window.states if window.synchronous is None else (*window.states, "theta")
         absent = [name for name in equation.channels if name not in measured]
         if absent:
-            return EquationReading(equation.number, equation.title, reason=f"not measured: {', '.join(absent)}")
+            reason = f"not measured: {', '.join(absent)}"
+            return Equation(equation=equation.number, title=equation.title, evaluable=False, reason=reason)
         msd = mean_squared_deviation(trained, window, self._machine)
-        return EquationReading(equation.number, equation.title, msd=msd, msd_healthy=mean)
+        return Equation(equation=equation.number, title=equation.title, evaluable=True, msd=msd, msd_healthy=mean)
 
-    def _exceeds(self, reading: EquationReading) -> bool:
+    def _exceeds(self, reading: Equation) -> bool:
         limits = {
             trained.equation.number: limit
             for trained, limit in zip(self._networks, self._healthy.threshold, strict=True)

@@ -15,10 +15,12 @@ from models.diagnosis.networks.equations import (
     SynchronousEquation,
     missing,
 )
-from models.diagnosis.readings import Diagnosis, EquationReading, ParameterReading
+from models.diagnosis.readings import Diagnosis, no_reading, possible_reading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Equation as EquationReading
+from rotorwatch.records.windows import Parameter
 
 __all__ = [
     "HIDDEN",
@@ -129,11 +131,11 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     equation = trained.equation
     absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
     if absent:
-        return EquationReading(equation.number, equation.title, reason=f"not measured: {', '.join(absent)}")
+        return _not_read(equation, f"not measured: {', '.join(absent)}")
     rows = equation.rows(window_view(window, machine), machine)
     norm = rows.norm
     if not norm > 0:
-        return EquationReading(equation.number, equation.title, reason="the target correlation is zero")
+        return _not_read(equation, "the target correlation is zero")
     residual = _residual(trained.network, rows, norm)
     projection = np.linalg.pinv(rows.signatures / norm)
     change = projection @ residual
@@ -147,12 +149,13 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     if healthy is not None:
         error = error * np.array(healthy.z_scale)
     readings = tuple(
-        ParameterReading.of(name, "relation", float(value), float(spread))
+        possible_reading(name, "relation", float(value), float(spread))
         for name, value, spread in zip(equation.parameters, change, error, strict=True)
     )
     return EquationReading(
-        equation.number,
-        equation.title,
+        equation=equation.number,
+        title=equation.title,
+        evaluable=True,
         msd=float(np.mean(residual**2)),
         msd_healthy=None if healthy is None else healthy.msd,
         parameters=readings,
@@ -166,6 +169,10 @@ def _residual(network: Network, rows: EquationRows, norm: float) -> FloatArray:
 def equation_by_number(number: str) -> Equation | SynchronousEquation:
     """Look an equation up; KeyError for a number that is not in the table."""
     return {equation.number: equation for equation in EQUATIONS}[number]
+
+
+def _not_read(equation: Equation | SynchronousEquation, reason: str) -> EquationReading:
+    return EquationReading(equation=equation.number, title=equation.title, evaluable=False, reason=reason)
 
 
 class RelationDiagnostician:
@@ -190,15 +197,15 @@ class RelationDiagnostician:
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
         equations: list[EquationReading] = []
-        parameters: list[ParameterReading] = []
+        parameters: list[Parameter] = []
         for equation in EQUATIONS:
             trained = self._networks.get(equation.number)
             if trained is None:
-                reading = EquationReading(equation.number, equation.title, reason="no trained network")
+                reading = _not_read(equation, "no trained network")
             else:
                 reading = read_equation(trained, window, self._machine)
             equations.append(reading)
             parameters += reading.parameters or [
-                ParameterReading(name, self.by, reason=reading.reason) for name in equation.parameters
+                no_reading(name, self.by, reading.reason) for name in equation.parameters
             ]
         return Diagnosis(self.by, tuple(parameters), tuple(equations))

@@ -111,7 +111,7 @@ def calibrate(trained: EquationNetwork, windows: Sequence[WindowStatistics], mac
     readings = [
         read_equation(EquationNetwork(trained.equation, trained.network, None), window, machine) for window in windows
     ]
-    change = np.array([[reading.change for reading in one.parameters] for one in readings], dtype=np.float64)
+    change = np.array([[reading.relative_change for reading in one.parameters] for one in readings], dtype=np.float64)
     error = np.array([[reading.standard_error for reading in one.parameters] for one in readings], dtype=np.float64)
     z = change / error
     healthy = Healthy(

@@ -1,12 +1,13 @@
 """Sensor faults told from machine faults: what each channel's samples and what pairs of channels say."""
 
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.sensors.finding import FaultKind, SensorFinding, implicated
+from models.diagnosis.sensors.finding import FaultKind, implicated
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
+from rotorwatch.records.windows import SensorFault
 
 __all__ = [
     "FaultKind",
-    "SensorFinding",
+    "SensorFault",
     "SensorReference",
     "implicated",
     "learn_sensor_reference",

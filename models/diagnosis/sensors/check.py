@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from models.diagnosis.pairs import motion_pairs
 from models.diagnosis.sensors.disagreement import gain_and_delay
 from models.diagnosis.sensors.exchange import BROKEN, suspect_pairs, swapped
-from models.diagnosis.sensors.finding import Naming, SensorFinding, implicated
+from models.diagnosis.sensors.finding import Naming, implicated
 from models.diagnosis.sensors.jump import gain_jump
 from models.diagnosis.sensors.kinematics import PairReading, banded, read_pair
 from models.diagnosis.sensors.level import clipped, offset, stuck
@@ -14,13 +14,14 @@ from models.diagnosis.sensors.phase import phase_faults
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.channels import Channel
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["sensor_findings"]
 
 
 def sensor_findings(
     window: WindowStatistics, reference: SensorReference | None = None, channels: Iterable[Channel] = ()
-) -> tuple[SensorFinding, ...]:
+) -> tuple[SensorFault, ...]:
     """Check the sensors of a window.
 
     Parameters
@@ -34,7 +35,7 @@ def sensor_findings(
 
     Returns
     -------
-    tuple of SensorFinding
+    tuple of SensorFault
         Empty if nothing was found. A channel that is stuck or clipped is not looked at further; where the shaft angle
         jumps, slips or jitters, channels are not compared: what turns with the shaft stays among what they share.
     """
@@ -68,7 +69,7 @@ def sensor_findings(
             f"{naming.name(second)} and {naming.name(first)} measure one motion but share only {reading.shared:.2f} of "
             "it, expected nearly 1: noise, a loose sensor, or a wrong channel"
         )
-        findings.append(SensorFinding((first, second), "incoherent", text, reading.shared))
+        findings.append(SensorFault(states=(first, second), kind="incoherent", text=text, value=reading.shared))
     bad = implicated(findings)
     findings += gain_and_delay(window, readings, bands, naming, reference)
     findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.pairs import MotionPair
-from models.diagnosis.sensors.finding import FaultKind, Naming, SensorFinding
+from models.diagnosis.sensors.finding import FaultKind, Naming
 from models.diagnosis.sensors.kinematics import Banded, PairReading, gain_course
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["gain_and_delay"]
 
@@ -51,11 +52,11 @@ def gain_and_delay(
     bands: Mapping[MotionPair, Banded],
     naming: Naming,
     reference: SensorReference | None,
-) -> list[SensorFinding]:
+) -> list[SensorFault]:
     """Findings on pairs that do see the same motion, but not at the same size or time."""
     departures = {reading.pair: _departure(window, reading, bands[reading.pair], reference) for reading in readings}
     rate_hz = window.n_samples / window.duration_s
-    findings: list[SensorFinding] = []
+    findings: list[SensorFault] = []
     for departure in departures.values():
         least_gain = LEAST_GAIN_CHANGE if departure.known else LEAST_GAIN
         least_delay = LEAST_DELAY_CHANGE_S if departure.known else LEAST_DELAY_S
@@ -111,7 +112,7 @@ def _gain(
     reference: SensorReference | None,
     *,
     moving: bool,
-) -> SensorFinding:
+) -> SensorFault:
     pair = departure.reading.pair
     first, second = window.states[pair.first], window.states[pair.second]
     guilty = _by_chain(departure, departures, "gain", moving=moving)
@@ -125,7 +126,7 @@ def _gain(
     expected = "as they were on the healthy machine" if departure.known else "the same motion, 0 % apart"
     if departure.reversed:
         text = f"{naming.name(second)} moves against {naming.name(first)}: one of them is reversed"
-        return SensorFinding((first, second), "gain", text, -2.0, z)
+        return SensorFault(states=(first, second), kind="gain", text=text, value=-2.0, z=z)
     if guilty is not None:
         state = window.states[guilty]
         own = size if guilty == pair.second else float(1 / (1 + size) - 1)
@@ -134,13 +135,13 @@ def _gain(
         text = (
             f"{naming.name(state)}: its gain {change} (± {error:.1%}) against {naming.name(other)}, expected {expected}"
         )
-        return SensorFinding((state,), "gain", text, own, z)
+        return SensorFault(states=(state,), kind="gain", text=text, value=own, z=z)
     change = f"came apart by {size:+.1%} within the window" if moving else f"are {size:+.1%} apart"
     text = (
         f"{naming.name(second)} and {naming.name(first)} {change} (± {error:.1%}) in gain, expected {expected}; "
         "which of them is wrong does not show"
     )
-    return SensorFinding((first, second), "gain", text, size, z)
+    return SensorFault(states=(first, second), kind="gain", text=text, value=size, z=z)
 
 
 def _delay(
@@ -149,7 +150,7 @@ def _delay(
     departures: dict[MotionPair, _Departure],
     naming: Naming,
     rate_hz: float,
-) -> SensorFinding:
+) -> SensorFault:
     pair, delay = departure.reading.pair, departure.delay_s
     guilty = _by_chain(departure, departures, "delay", moving=False)
     if guilty is None:  # sensors come late, not early
@@ -161,7 +162,7 @@ def _delay(
         f"{naming.name(state)}: comes {1e3 * late:.3g} ms ({late * rate_hz:.2g} samples, ± "
         f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(window.states[other])}, expected {expected}"
     )
-    return SensorFinding((state,), "delay", text, late, departure.delay_z)
+    return SensorFault(states=(state,), kind="delay", text=text, value=late, z=departure.delay_z)
 
 
 def _by_chain(
@@ -242,9 +243,9 @@ def _one_of(departure: _Departure, changes: list[float], size: float) -> int | N
     return None
 
 
-def _once(findings: list[SensorFinding]) -> list[SensorFinding]:
+def _once(findings: list[SensorFault]) -> list[SensorFault]:
     """The same fault of the same channel once, as its clearest pair shows it."""
-    best: dict[tuple[tuple[str, ...], str], SensorFinding] = {}
+    best: dict[tuple[tuple[str, ...], str], SensorFault] = {}
     for finding in sorted(findings, key=lambda one: -(one.z or 0.0)):
         best.setdefault((finding.states, finding.kind), finding)
     return list(best.values())

@@ -6,11 +6,12 @@ from itertools import combinations
 import numpy as np
 
 from models.diagnosis.pairs import MotionPair, motion_pairs
-from models.diagnosis.sensors.finding import Naming, SensorFinding
+from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.kinematics import Banded, banded, same
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["BROKEN", "suspect_pairs", "swapped"]
 
@@ -44,16 +45,16 @@ def suspect_pairs(
 
 def swapped(
     window: WindowStatistics, broken: list[MotionPair], naming: Naming, reference: SensorReference | None
-) -> tuple[list[SensorFinding], set[MotionPair]]:
+) -> tuple[list[SensorFault], set[MotionPair]]:
     """Find the exchange of two channels of one quantity that restores the pairs that are broken.
 
     Returns
     -------
-    findings : list of SensorFinding
+    findings : list of SensorFault
     explained : set of MotionPair
         Pairs that need no other explanation.
     """
-    findings: list[SensorFinding] = []
+    findings: list[SensorFault] = []
     explained: set[MotionPair] = set()
     for one, other in combinations(broken, 2):
         if one.order != other.order or {one, other} & explained:
@@ -78,7 +79,7 @@ def swapped(
             else f"{naming.names(states[:2])} are swapped, or {naming.names(states[2:])}"
         )
         text = f"{either}: {pairs}, but not as they are connected (shared {then:.3f} crossed, {now:.3f} as connected)"
-        findings.append(SensorFinding(states, "swapped", text, now))
+        findings.append(SensorFault(states=states, kind="swapped", text=text, value=now))
     return findings, explained
 
 

@@ -1,12 +1,12 @@
 """What is said about a sensor, and whose data must not be used because of it."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import Literal, get_args
 
 from models.signals.channels import Channel, state_name
+from rotorwatch.records.windows import SensorFault
 
-__all__ = ["FAULT_KINDS", "FaultKind", "Naming", "SensorFinding", "implicated"]
+__all__ = ["FAULT_KINDS", "FaultKind", "Naming", "implicated"]
 
 FaultKind = Literal["stuck", "clipped", "offset", "gain", "delay", "swapped", "incoherent", "noise"]
 
@@ -14,36 +14,7 @@ FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 """All kinds of fault."""
 
 
-@dataclass(frozen=True, slots=True)
-class SensorFinding:
-    """One fault of a sensor, or of one of two sensors that contradict each other.
-
-    Attributes
-    ----------
-    states : tuple of str
-        What the channels measure whose data must not be used: one, or all among which the fault could not be told.
-    kind : str
-        ``stuck``, ``clipped``, ``offset``, ``gain``, ``delay``, ``swapped``, ``noise``: it shows more than it did of
-        what is not the machine's, or ``incoherent``: two sensors of one motion show different things, and none of the
-        other kinds explains it.
-    text : str
-        One sentence: the channels, the value found, what was expected.
-    value : float
-        ``stuck``: how long it stood still, s. ``clipped``: part of the samples at the limit. ``offset``: the change of
-        the mean, SI. ``gain``: relative change. ``delay``: s. ``swapped``, ``incoherent``: how much of the motion the
-        two sensors share, 0 to 1. ``noise``: rms of the noise over that of the channel.
-    z : float or None
-        Standard errors by which it exceeds what a healthy sensor shows; None where no chance is involved.
-    """
-
-    states: tuple[str, ...]
-    kind: FaultKind
-    text: str
-    value: float
-    z: float | None = None
-
-
-def implicated(findings: Iterable[SensorFinding]) -> set[str]:
+def implicated(findings: Iterable[SensorFault]) -> set[str]:
     """Channels whose data must not be used, by what they measure (``theta`` is the shaft angle)."""
     return {state for finding in findings for state in finding.states}
 

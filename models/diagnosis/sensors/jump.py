@@ -9,9 +9,10 @@ the other channels moving too, cannot be told from the machine and is left to th
 import numpy as np
 
 from models.diagnosis.pairs import motion_pairs
-from models.diagnosis.sensors.finding import Naming, SensorFinding
+from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["gain_jump"]
 
@@ -23,7 +24,7 @@ LEAST_JUMP = 0.08
 _FEWEST_SIDE = 3
 
 
-def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
+def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
     """Find channels without a second sensor of their motion whose gain jumped within the window."""
     vectors, n = window.rotation_vectors, len(window.states)
     paired = {column for pair in motion_pairs(window.states) for column in (pair.first, pair.second)}
@@ -54,7 +55,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
                 f"{abs(value) / z:.1%}) while {naming.names(window.states[i] for i in others)} stayed as they were, "
                 "expected a machine to show in more than one channel: its gain jumped"
             )
-            findings.append(SensorFinding((state,), "gain", text, value, z))
+            findings.append(SensorFault(states=(state,), kind="gain", text=text, value=value, z=z))
     return findings
 
 

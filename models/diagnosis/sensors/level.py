@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from models.diagnosis.sensors.finding import Naming, SensorFinding
+from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["clipped", "offset", "stuck"]
 
@@ -25,7 +26,7 @@ _TOGETHER = 0.3
 """Where another displacement moves by at least this part of a displacement's step, the shaft has moved."""
 
 
-def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
+def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
     """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn."""
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
@@ -38,25 +39,25 @@ def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
         if state == "theta":
             if runs.max() >= limit:
                 text = f"{name}: the shaft angle stood still for {longest_s:.3g} s; it must turn or be left out"
-                findings.append(SensorFinding((state,), "stuck", text, longest_s))
+                findings.append(SensorFault(states=(state,), kind="stuck", text=text, value=longest_s))
         elif np.any(coarse):
             quiet_s = float(coarse.sum()) * hops.n_samples / rate_hz
             text = (
                 f"{name}: shows nothing but its own steps of {naming.value(state, float(step[coarse].max()))} for "
                 f"{quiet_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
             )
-            findings.append(SensorFinding((state,), "stuck", text, quiet_s))
+            findings.append(SensorFault(states=(state,), kind="stuck", text=text, value=quiet_s))
         elif runs.max() >= limit:
             level = float(hops.mean[int(runs.argmax()), column])
             text = (
                 f"{name}: repeated the value {naming.value(state, level)} for {longest_s:.3g} s, "
                 f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
             )
-            findings.append(SensorFinding((state,), "stuck", text, longest_s))
+            findings.append(SensorFault(states=(state,), kind="stuck", text=text, value=longest_s))
     return findings
 
 
-def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
+def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
     """Channels whose tops are flat: more samples exactly at a hop's extreme than even a quantised sine would leave."""
     hops, findings = window.hop_waveform, []
     n = len(window.states)
@@ -81,11 +82,11 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFinding]:
                 f"{naming.name(state)}: cut off at {where}, {flat:.1%} of the samples stand exactly there, "
                 f"expected less than {float(allowed[:, column].max()):.1%}: the measuring range is too small"
             )
-            findings.append(SensorFinding((state,), "clipped", text, flat))
+            findings.append(SensorFault(states=(state,), kind="clipped", text=text, value=flat))
     return findings
 
 
-def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFinding]:
+def offset(window: WindowStatistics, naming: Naming, reference: SensorReference | None) -> list[SensorFault]:
     """Channels whose mean steps or runs away within the window, or stands elsewhere than in the reference."""
     means = window.hop_waveform.mean[:, : len(window.states)]
     rms, spread = _scale(window), _spread(window)
@@ -110,7 +111,7 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
                 f"{name}: the mean jumped by {naming.value(state, value)} within the window ({abs(value) / own:.3g} "
                 f"times the channel's rms), expected a steady one: connector, supply or gap"
             )
-            findings.append(SensorFinding((state,), "offset", text, value, z))
+            findings.append(SensorFault(states=(state,), kind="offset", text=text, value=value, z=z))
         elif abs(drifts[column]) > max(DRIFT_PART * own, STEP_SPREADS * spread[column]) and not _shaft(
             window.states, column, drifts
         ):
@@ -119,14 +120,18 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
                 f"{name}: the mean drifted by {naming.value(state, value)} within the window, allowed are "
                 f"{DRIFT_PART:g} times the channel's rms ({naming.value(state, DRIFT_PART * own)})"
             )
-            findings.append(SensorFinding((state,), "offset", text, value, abs(value) / float(spread[column])))
+            findings.append(
+                SensorFault(
+                    states=(state,), kind="offset", text=text, value=value, z=abs(value) / float(spread[column])
+                )
+            )
         elif abs(moved[column]) > floor[column] and not _shaft(window.states, column, moved):
             value = float(moved[column])
             text = (
                 f"{name}: the mean stands {naming.value(state, value)} from where it was on the healthy machine, "
                 f"expected within {naming.value(state, float(floor[column]))}"
             )
-            findings.append(SensorFinding((state,), "offset", text, value))
+            findings.append(SensorFault(states=(state,), kind="offset", text=text, value=value))
     return findings
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.diagnosis.pairs import MotionPair
-from models.diagnosis.sensors.finding import Naming, SensorFinding
+from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.kinematics import Banded, PairReading
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.sensors.unshared import (
@@ -26,6 +26,7 @@ from models.diagnosis.sensors.unshared import (
 )
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["noisy"]
 
@@ -76,7 +77,7 @@ def noisy(
     naming: Naming,
     reference: SensorReference | None,
     sound: Callable[..., bool],
-) -> list[SensorFinding]:
+) -> list[SensorFault]:
     """Channels whose noise is above what it was on the healthy machine.
 
     Parameters
@@ -108,7 +109,7 @@ def _of_pairs(
     bands: Mapping[MotionPair, Banded],
     naming: Naming,
     reference: SensorReference,
-) -> list[SensorFinding]:
+) -> list[SensorFault]:
     known = []
     for reading in readings:
         then = reference.pair(window.states[reading.pair.first], window.states[reading.pair.second])
@@ -150,7 +151,13 @@ def _of_pairs(
             text += "; which of the two it is does not show"
         scatter = float(np.hypot(_PAIR_SCATTER, np.sqrt(1 / own.averages.min())))
         findings.append(
-            SensorFinding(states, "noise", text, sizes[column] / float(rms[column]), float(rise[row].max()) / scatter)
+            SensorFault(
+                states=states,
+                kind="noise",
+                text=text,
+                value=sizes[column] / float(rms[column]),
+                z=float(rise[row].max()) / scatter,
+            )
         )
     return findings
 
@@ -179,7 +186,7 @@ def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -
 
 def _of_single(
     window: WindowStatistics, noises: Sequence[ChannelNoise], naming: Naming, reference: SensorReference
-) -> list[SensorFinding]:
+) -> list[SensorFault]:
     known = []
     for now in noises:
         channel = reference.channel(window.states[now.column])
@@ -204,7 +211,7 @@ def _of_single(
                 f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, then.line_rms)} on "
                 "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
             )
-            findings.append(SensorFinding((state,), "noise", text, now.line_rms / own))
+            findings.append(SensorFault(states=(state,), kind="noise", text=text, value=now.line_rms / own))
         elif risen and now.flat > FLOOR_FLAT and size > LEAST_FLOOR * own:
             factor = float(np.exp(rise[row] / 2))
             text = (
@@ -212,5 +219,9 @@ def _of_single(
                 f"{factor:.3g} times the healthy one, expected less than {np.sqrt(FLOOR_RISE):.2g} times: "
                 "cable, earthing or amplifier"
             )
-            findings.append(SensorFinding((state,), "noise", text, size / own, float(rise[row]) / _FLOOR_SCATTER))
+            findings.append(
+                SensorFault(
+                    states=(state,), kind="noise", text=text, value=size / own, z=float(rise[row]) / _FLOOR_SCATTER
+                )
+            )
     return findings

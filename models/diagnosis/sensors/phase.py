@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.sensors.finding import FaultKind, Naming, SensorFinding
+from models.diagnosis.sensors.finding import FaultKind, Naming
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 
 __all__ = ["phase_faults"]
 
@@ -57,7 +58,7 @@ class _Common:
 
 def phase_faults(
     window: WindowStatistics, columns: Sequence[int], naming: Naming, reference: SensorReference | None
-) -> list[SensorFinding]:
+) -> list[SensorFault]:
     """At most one finding on the shaft angle.
 
     Parameters
@@ -82,11 +83,11 @@ def phase_faults(
     return [found] if found else []
 
 
-def _theta(kind: FaultKind, text: str, value: float, z: float | None = None) -> SensorFinding:
-    return SensorFinding(("theta",), kind, text, value, z)
+def _theta(kind: FaultKind, text: str, value: float, z: float | None = None) -> SensorFault:
+    return SensorFault(states=("theta",), kind=kind, text=text, value=value, z=z)
 
 
-def _lost(window: WindowStatistics, name: str) -> SensorFinding | None:
+def _lost(window: WindowStatistics, name: str) -> SensorFault | None:
     """Whole turns that are missing from, or too many in, single hops of a shaft that is steady otherwise."""
     hops = len(window.waveforms)
     if hops < _FEWEST_HOPS:
@@ -134,7 +135,7 @@ def _bin(window: WindowStatistics, speed_rad_s: float) -> int | None:
 
 def _elsewhere(
     window: WindowStatistics, columns: Sequence[int], name: str, reference: SensorReference | None
-) -> SensorFinding | None:
+) -> SensorFault | None:
     """The rotation that every channel used to show is gone from the angle's speed and stands at another one."""
     vectors = window.hop_synchronous
     if reference is None or vectors is None or window.frequencies_hz.size <= 4 * _AROUND_BINS:
@@ -174,7 +175,7 @@ def _common(columns: Sequence[int], vectors: ComplexArray) -> _Common:
     return _Common(unit, np.asarray(left[:, 0] * singular[0], dtype=np.complex128))
 
 
-def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFinding | None:
+def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFault | None:
     """The vectors keep their length and turn evenly, hop by hop."""
     course = common.course
     length = np.abs(course)
@@ -193,7 +194,7 @@ def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFinding
     return _theta("incoherent", text, 1 + per_minute / (window.speed_rad_s * 30 / np.pi), abs(mean) / max(error, 1e-9))
 
 
-def _jump(common: _Common, name: str) -> SensorFinding | None:
+def _jump(common: _Common, name: str) -> SensorFault | None:
     """The vectors of all channels turned by one angle between two hops and kept their lengths."""
     n = len(common.course)
     best, at = 0.0, 0
@@ -231,7 +232,7 @@ def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
     return np.asarray(np.angle(second * first.conj())), np.asarray(np.maximum(error, 1e-3))
 
 
-def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, name: str) -> SensorFinding | None:
+def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexArray, name: str) -> SensorFault | None:
     """A line stays in the spectrum at the speed although what is steady with the angle was taken out."""
     speeds = np.abs(window.hop_speed_rad_s)
     edges = [window.speed_rad_s, window.speed_rad_s]

@@ -1,41 +1,20 @@
 """Minimum detectable change: what this machine, with this excitation, would have to show to be noticed."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.special import ndtri
 
 from models.diagnosis.verdict.calibration import Thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, to_scale
+from rotorwatch.records.windows import Detectable
 
-__all__ = ["DetectableChange", "detectable_changes", "length_to_find"]
+__all__ = ["detectable_changes", "length_to_find"]
 
 _POWER = 0.95
 
 
-@dataclass(frozen=True, slots=True)
-class DetectableChange:
-    """Smallest change of one parameter, alone, that is found with the stated power.
-
-    Attributes
-    ----------
-    name : str
-        Parameter.
-    loss, gain : float
-        Relative change downwards (negative; -1 where even a total loss would not be found for certain) and upwards.
-    length_s : float
-        Data it takes.
-    """
-
-    name: str
-    loss: float
-    gain: float
-    length_s: float
-
-
 def detectable_changes(
     stretch: Stretch, thresholds: Thresholds, length_s: float, power: float = _POWER
-) -> tuple[DetectableChange, ...]:
+) -> tuple[Detectable, ...]:
     """Minimum detectable changes of a stretch of data, from its own information.
 
     In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
@@ -55,19 +34,22 @@ def detectable_changes(
     """
     distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
     return tuple(
-        DetectableChange(
-            name, max(-1.0, from_scale(name, -distance * error)), from_scale(name, distance * error), length_s
+        Detectable(
+            name=name,
+            loss=max(-1.0, from_scale(name, -distance * error)),
+            gain=from_scale(name, distance * error),
+            length_s=length_s,
         )
         for name, error in zip(stretch.names, errors, strict=True)
     )
 
 
-def length_to_find(found: DetectableChange, change: float) -> float:
+def length_to_find(found: Detectable, change: float) -> float:
     """Data it takes to find another change of the parameter: standard errors fall as one over the root of the length.
 
     Parameters
     ----------
-    found : DetectableChange
+    found : Detectable
         Smallest change and the length it takes.
     change : float
         Relative change that is to be found instead, not 0 and above -1.

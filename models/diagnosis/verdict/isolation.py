@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr
 
-from models.diagnosis.readings import Diagnosis, ParameterReading
+from models.diagnosis.readings import Diagnosis, possible_reading
 from models.diagnosis.verdict.calibration import Thresholds, window_thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch_of
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Parameter
 
 __all__ = ["Isolation", "isolate", "isolate_window", "model_test", "outside_confidence", "reading_of", "restricted"]
 
@@ -40,7 +41,7 @@ class Isolation:
         Posterior probability of exactly this set among all sets.
     probability : tuple of float
         Posterior probability of each of `PARAMETERS` to be among the changed ones.
-    readings : tuple of ParameterReading
+    readings : tuple of Parameter
         The changed parameters with all others held at nominal: sharper than the free estimates, and right if the
         verdict is.
     outside : bool
@@ -53,7 +54,7 @@ class Isolation:
     changed: tuple[str, ...]
     confidence: float
     probability: tuple[float, ...]
-    readings: tuple[ParameterReading, ...] = ()
+    readings: tuple[Parameter, ...] = ()
     outside: bool = False
     outside_confidence: float | None = None
 
@@ -173,7 +174,7 @@ def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) 
     return explained
 
 
-def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[ParameterReading, ...]:
+def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Parameter, ...]:
     """Read some parameters with all others held at nominal.
 
     Parameters
@@ -196,7 +197,7 @@ def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Param
     )
 
 
-def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float) -> ParameterReading:
+def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float) -> Parameter:
     """A parameter's reading from its value and standard error in the scale of the errors.
 
     Parameters
@@ -207,6 +208,6 @@ def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float)
     value, error : float
     """
     if name != "e":
-        return ParameterReading.of(name, by, from_scale(name, value), error * slope(name, value))
+        return possible_reading(name, by, from_scale(name, value), error * slope(name, value))
     # Where errors put an unbalance that is all but gone below none, it is as much of one on the other side.
-    return ParameterReading.of(name, by, abs(1 + value) - 1, error, stretch.unbalance)
+    return possible_reading(name, by, abs(1 + value) - 1, error, stretch.unbalance)

@@ -15,22 +15,23 @@ All times are those of the data.
 """
 
 from bisect import bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 
 import numpy as np
 
 from models.checkpoint import checked
-from models.diagnosis.readings import ParameterReading
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
 from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of, restricted
 from models.diagnosis.verdict.stretch import Stretch, added
 from models.errors import CheckpointError
 from models.machine import MachineFile
-from models.physics.parameters import PARAMETERS
+from models.physics.parameters import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Finding, Parameter, Verdict
 
-__all__ = ["Finding", "SequentialSettings", "SequentialState", "SequentialTest", "SequentialVerdict"]
+__all__ = ["SequentialSettings", "SequentialState", "SequentialTest", "finding"]
 
 _SHORT_HOPS = (2, 4, 7)
 """Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
@@ -102,60 +103,6 @@ class SequentialSettings:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One parameter that changed, and how that was found.
-
-    Attributes
-    ----------
-    name : str
-        Parameter.
-    since_ns : int
-        The change is not known to be older than this: start of the stretch that found it first.
-    found_ns : int
-        When it was found: end of that stretch.
-    stretch_s : float
-        Length of that stretch.
-    """
-
-    name: str
-    since_ns: int
-    found_ns: int
-    stretch_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class SequentialVerdict:
-    """What is known at the end of a hop.
-
-    Attributes
-    ----------
-    detected : bool
-        Some stretch says that something changed, whether or not it is clear yet what.
-    findings : tuple of Finding
-        Parameters that changed, in the order of `PARAMETERS`.
-    isolation : Isolation
-        Verdict of the stretch that decided.
-    decided_s : float
-        Length of that stretch.
-    settled : bool
-        No change within the window: the window's own readings hold for one machine.
-    current : tuple of ParameterReading
-        Readings of the longest clean stretch up to the window, with the changed parameters' others held at nominal;
-        empty for the moment in which there is no clean stretch.
-    unexplained : str
-        Why nothing can be said of parameters, see `Diagnosis`: then none is named, and none is read. Empty otherwise.
-    """
-
-    detected: bool
-    findings: tuple[Finding, ...]
-    isolation: Isolation
-    decided_s: float
-    settled: bool
-    current: tuple[ParameterReading, ...]
-    unexplained: str = ""
-
-
 @dataclass(slots=True)
 class SequentialState:
     """All that the test remembers.
@@ -216,7 +163,7 @@ class SequentialState:
         if np.any((findings[:, 0] < 0) | (findings[:, 0] >= len(PARAMETERS))):
             raise CheckpointError(f"findings are of parameters {findings[:, 0].tolist()}, there are {len(PARAMETERS)}")
         state.findings = tuple(
-            Finding(PARAMETERS[number], since, found, length)
+            finding(PARAMETERS[number], since, found, length)
             for (number, since, found), length in zip(findings.tolist(), lengths.tolist(), strict=True)
         )
         for windows in (2**power for power in range(_DOUBLINGS)):
@@ -262,6 +209,11 @@ class SequentialTest:
         Where an earlier test stood.
     by : str
         Whose readings these are.
+
+    Attributes
+    ----------
+    unexplained : str
+        Why nothing can be said of parameters at the latest hop, see `Diagnosis`: then none is named, and none is read.
     """
 
     def __init__(
@@ -269,6 +221,7 @@ class SequentialTest:
     ) -> None:
         self.settings = settings
         self.state = SequentialState() if state is None else state
+        self.unexplained = ""
         self._by = by
         self._thresholds = {hops: settings.thresholds(hops) for hops in settings.lengths}
         self._contradiction = window_thresholds(_CONTRADICTION_RATE, len(PARAMETERS)).first
@@ -299,7 +252,7 @@ class SequentialTest:
                 return (max((hops for hops in short if hops <= next_hops), default=short[0]),)
         return short
 
-    def update(self, looks: Mapping[int, Stretch]) -> SequentialVerdict:
+    def update(self, looks: Mapping[int, Stretch]) -> Verdict:
         """Judge one hop.
 
         Parameters
@@ -341,14 +294,20 @@ class SequentialTest:
             outside=bool(unexplained) or outside,
             outside_confidence=confidence,
         )
-        return SequentialVerdict(
-            detected=bool(verdicts) and not unexplained,
-            findings=() if unexplained else self.state.findings,
-            isolation=isolation,
+        self.unexplained = unexplained
+        findings = () if unexplained else self.state.findings
+        detected = bool(verdicts) and not unexplained
+        return Verdict(
+            changed=findings,
+            text=_in_words(findings, isolation, detected=detected, read=bool(current)),
+            detected=detected,
+            confidence=isolation.confidence,
+            low_confidence=isolation.low_confidence,
+            outside_model=isolation.outside,
+            outside_confidence=isolation.outside_confidence,
             decided_s=decided.duration_s,
             settled=window_hops in clean,
             current=current,
-            unexplained=unexplained,
         )
 
     def _is_loud(self, hops: int, look: Stretch) -> bool:
@@ -446,12 +405,12 @@ class SequentialTest:
         verdicts: Mapping[int, Isolation],
     ) -> None:
         """Keep when each changed parameter was first found; forget what is no longer so."""
-        known = {finding.name: finding for finding in self.state.findings}
+        known = {one.name: one for one in self.state.findings}
         found = {name: known[name] for name in known if name in changed or self._still(name, clean)}
         for name in changed:
             if name not in known:
                 shortest = next(every[hops] for hops, verdict in verdicts.items() if name in verdict.changed)
-                found[name] = Finding(name, shortest.start_ns, shortest.end_ns, shortest.duration_s)
+                found[name] = finding(name, shortest.start_ns, shortest.end_ns, shortest.duration_s)
         self.state.findings = tuple(found[name] for name in PARAMETERS if name in found)
 
     def _still(self, name: str, clean: Mapping[int, Stretch]) -> bool:
@@ -464,7 +423,7 @@ class SequentialTest:
         values, variances = _values(clean[max(clean)])
         return bool(abs(values[at] - self.state.before[at]) < self._contradiction * np.sqrt(variances[at]))
 
-    def _current(self, look: Stretch, changed: tuple[str, ...]) -> tuple[ParameterReading, ...]:
+    def _current(self, look: Stretch, changed: tuple[str, ...]) -> tuple[Parameter, ...]:
         """Free readings of a stretch; the changed parameters with the unchanged ones held at nominal."""
         sharp = {reading.name: reading for reading in restricted(look, changed, self._by)}
         values, covariance = look.estimate()
@@ -473,6 +432,34 @@ class SequentialTest:
             sharp.get(name) or reading_of(look, name, self._by, value, error)
             for name, value, error in zip(look.names, values.tolist(), errors, strict=True)
         )
+
+
+def finding(name: str, since_ns: int, found_ns: int, stretch_s: float) -> Finding:
+    """A parameter that changed, and the stretch that found it first; see `Finding`."""
+    return Finding(name=name, text=PARAMETER_TEXT[name], since_ns=since_ns, found_ns=found_ns, stretch_s=stretch_s)
+
+
+def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bool, read: bool) -> str:
+    if findings:
+        found = ", ".join(
+            f"{one.text} ({one.name}) since {_clock(one.since_ns)}, found {_clock(one.found_ns)} in "
+            f"{one.stretch_s:.0f} s of data"
+            for one in findings
+        )
+        # Never more sure than can be.
+        sure = "above 99.9 %" if isolation.confidence > 0.9995 else f"{100 * isolation.confidence:.1f} %"
+        text = f"changed: {found}; confidence {sure}"
+    elif detected:
+        text = "something has changed; too little data yet to say what"
+    else:
+        text = "nothing has changed" if read else "no parameter could be read"
+    if isolation.outside:
+        text += "; outside the model: something has changed that no parameter describes, or a sensor is at fault"
+    return text
+
+
+def _clock(time_ns: int) -> str:
+    return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%H:%M:%S}"
 
 
 def _worst(part: tuple[FloatArray, FloatArray], whole: tuple[FloatArray, FloatArray]) -> float:

@@ -151,8 +151,10 @@ def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
     """
     readings = diagnosis.evaluable
     known = [PARAMETERS.index(reading.name) for reading in readings]
-    unbalance = next((reading.vector for reading in readings if reading.vector is not None), None)
-    values = np.array([to_scale(reading.name, reading.change or 0.0) for reading in readings], dtype=np.float64)
+    unbalance = diagnosis.unbalance if any(reading.name == "e" for reading in readings) else None
+    values = np.array(
+        [to_scale(reading.name, reading.relative_change or 0.0) for reading in readings], dtype=np.float64
+    )
     slopes = np.array([slope(reading.name, value) for reading, value in zip(readings, values, strict=True)])
     scale = np.outer(slopes, slopes)
     covariance = diagnosis.full_covariance / scale

@@ -9,7 +9,6 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
-from models.diagnosis.readings import EquationReading
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import RotorwatchError, WireError
 from models.ingest import Gate
@@ -17,6 +16,7 @@ from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.keys import MachineKeys
 from models.signals.wire import decode_block
+from rotorwatch.records.windows import Equation as EquationReading
 from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
 
@@ -142,7 +142,9 @@ def _panel(
     target = "R[n,disc]" if isinstance(equation, SynchronousEquation) else equation.target.name
     over = "angle" if synchronous else "lag"
     if trained is None:
-        reading = EquationReading(equation.number, equation.title, reason="no trained network")
+        reading = EquationReading(
+            equation=equation.number, title=equation.title, evaluable=False, reason="no trained network"
+        )
     else:
         reading = read_equation(trained, window, machine)
     if trained is None or reading.reason:

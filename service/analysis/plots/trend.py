@@ -16,7 +16,7 @@ from models.signals.block import FloatArray
 from models.signals.keys import PREFIX, MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import HealthState, Report
-from service.monitor.conversion import machine_hash
+from service.monitor.reports import machine_hash
 from service.recordings.replay.choice import choose_machine
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource

@@ -12,13 +12,14 @@ from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, U
 from service.analysis.snapshots.choice import chosen_pairs, figures, product_unit
 from service.analysis.snapshots.measured import MeasuredCorrelations, measured_correlations
 from service.analysis.snapshots.prediction import Prediction
-from service.analysis.snapshots.statement import Speaker, heading, no_window, theory
+from service.analysis.snapshots.statement import heading, no_window, theory
+from service.monitor.reports import Identity
 
 __all__ = ["correlation_snapshot"]
 
 
 def correlation_snapshot(
-    identity: Speaker,
+    identity: Identity,
     machine: MachineFile,
     window: WindowStatistics | None,
     prediction: Prediction,
@@ -31,7 +32,7 @@ def correlation_snapshot(
 
     Parameters
     ----------
-    identity : Speaker
+    identity : Identity
     machine : MachineFile
     window : WindowStatistics or None
         The latest full window.

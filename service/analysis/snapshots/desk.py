@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from models.commissioning.installed import Installed
-from models.diagnosis.readings import ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
+from rotorwatch.records.windows import Parameter
 from service.analysis.snapshots.correlation import correlation_snapshot
 from service.analysis.snapshots.orbit import orbit_snapshot
 from service.analysis.snapshots.prediction import NO_PARAMETERS, Prediction, predict
 from service.analysis.snapshots.spectrum import spectrum_snapshot
-from service.analysis.snapshots.statement import Speaker
+from service.monitor.reports import Identity
 
 __all__ = ["LatestData", "SnapshotDesk"]
 
@@ -31,7 +31,7 @@ class LatestData:
         The latest full window.
     filled : float
         Fraction of a full window that is there now.
-    parameters : tuple of ParameterReading
+    parameters : tuple of Parameter
         Readings of that window by the diagnostician that decides; empty if it was not evaluated.
     why_not : str
         Why it was not evaluated.
@@ -41,7 +41,7 @@ class LatestData:
 
     window: WindowStatistics | None = None
     filled: float = 0.0
-    parameters: tuple[ParameterReading, ...] = ()
+    parameters: tuple[Parameter, ...] = ()
     why_not: str = ""
     blocks: tuple[SampleBlock, ...] = ()
 
@@ -54,10 +54,10 @@ class SnapshotDesk:
     Parameters
     ----------
     installed : Installed
-    identity : Speaker
+    identity : Identity
     """
 
-    def __init__(self, installed: Installed, identity: Speaker) -> None:
+    def __init__(self, installed: Installed, identity: Identity) -> None:
         self._machine, self._identity = installed.machine, identity
         self._known: Machine | None = installed.known
         self._lock = threading.Lock()

@@ -7,7 +7,6 @@ from typing import Literal
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.readings import ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, MachineFile
 from models.physics.lyapunov import synchronous_response
@@ -16,11 +15,13 @@ from models.physics.parameters import RotorParameters, changed
 from models.signals.block import SampleBlock
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
+from rotorwatch.records.windows import Parameter
 from service.analysis.snapshots.choice import figures, orbit_pairs
 from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
 from service.analysis.snapshots.path import NewestPath, newest_path
 from service.analysis.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
-from service.analysis.snapshots.statement import Speaker, heading, no_window, theory
+from service.analysis.snapshots.statement import heading, no_window, theory
+from service.monitor.reports import Identity
 
 __all__ = ["orbit_snapshot"]
 
@@ -49,11 +50,11 @@ class _Vectors:
 
 
 def orbit_snapshot(
-    identity: Speaker,
+    identity: Identity,
     machine: MachineFile,
     known: Machine | None,
     window: WindowStatistics | None,
-    readings: Iterable[ParameterReading],
+    readings: Iterable[Parameter],
     why_not: str,
     filled: float,
     blocks: tuple[SampleBlock, ...] = (),
@@ -64,13 +65,13 @@ def orbit_snapshot(
 
     Parameters
     ----------
-    identity : Speaker
+    identity : Identity
     machine : MachineFile
     known : Machine or None
         The machine with all its parameters.
     window : WindowStatistics or None
         The latest full window; its ellipses are those of all its data.
-    readings : iterable of ParameterReading
+    readings : iterable of Parameter
         Of that window; empty if it was not evaluated.
     why_not : str
         Why it was not evaluated.

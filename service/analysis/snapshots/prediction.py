@@ -16,13 +16,13 @@ import numpy as np
 
 from models.diagnosis.likelihood.bins import group_bins
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.readings import ParameterReading
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.matrices import system_A
 from models.physics.parameters import PARAMETERS, RotorParameters, changed
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import Parameter
 from service.analysis.snapshots.excitation import Excitation, excitation_of
 
 __all__ = ["NOTHING_READ", "NO_PARAMETERS", "Prediction", "predict", "read_changes"]
@@ -182,7 +182,7 @@ class Prediction:
 
 
 def predict(
-    known: Machine | None, window: WindowStatistics, readings: Iterable[ParameterReading], why_not: str = ""
+    known: Machine | None, window: WindowStatistics, readings: Iterable[Parameter], why_not: str = ""
 ) -> Prediction:
     """Theory for a window; what stands against it is stated in it, never raised.
 
@@ -191,7 +191,7 @@ def predict(
     known : Machine or None
         The machine with all its parameters.
     window : WindowStatistics
-    readings : iterable of ParameterReading
+    readings : iterable of Parameter
         Of this window, by the diagnostician that decides; empty if it was not evaluated.
     why_not : str
         Why it was not evaluated.
@@ -208,7 +208,7 @@ def predict(
     return Prediction(known, excitation, changes, "", estimated_reason)
 
 
-def read_changes(readings: Iterable[ParameterReading]) -> dict[str, float]:
+def read_changes(readings: Iterable[Parameter]) -> dict[str, float]:
     """Relative changes of the parameters that were read; a total loss is one of 99 %, for nothing stands without."""
-    read = {reading.name: reading.change for reading in readings if reading.change is not None}
+    read = {reading.name: reading.relative_change for reading in readings if reading.relative_change is not None}
     return {name: max(read[name], -0.99) for name in PARAMETERS if name in read}

@@ -16,7 +16,8 @@ from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, Spectrum
 from service.analysis.snapshots.choice import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
 from service.analysis.snapshots.excitation import LEFT_OUT_BINS
 from service.analysis.snapshots.prediction import Prediction
-from service.analysis.snapshots.statement import Speaker, heading, no_window, theory
+from service.analysis.snapshots.statement import heading, no_window, theory
+from service.monitor.reports import Identity
 
 __all__ = ["MOST_LINES", "spectrum_snapshot"]
 
@@ -38,7 +39,7 @@ class _Spectra:
 
 
 def spectrum_snapshot(
-    identity: Speaker,
+    identity: Identity,
     machine: MachineFile,
     window: WindowStatistics | None,
     prediction: Prediction,
@@ -53,7 +54,7 @@ def spectrum_snapshot(
 
     Parameters
     ----------
-    identity : Speaker
+    identity : Identity
     machine : MachineFile
     window : WindowStatistics or None
         The latest full window.

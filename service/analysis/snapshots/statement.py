@@ -1,58 +1,31 @@
 """Parts that all snapshots have in common: whose they are, of which window, and what the predictions are of."""
 
 from collections.abc import Mapping
-from typing import Protocol, TypedDict
 
 import numpy as np
 
 from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from rotorwatch.records.snapshots import PredictedChange, Theory
+from service.monitor.reports import Identity
 
-__all__ = ["Heading", "Speaker", "heading", "no_window", "theory"]
-
-
-class Speaker(Protocol):
-    """Who speaks: the machine and the exact files its monitor runs on."""
-
-    @property
-    def site(self) -> str:
-        """Site of the machine."""
-
-    @property
-    def machine(self) -> str:
-        """Name of the machine."""
-
-    @property
-    def bundle(self) -> str | None:
-        """Identity of what was trained and commissioned; None without."""
-
-    @property
-    def machine_hash(self) -> str:
-        """Changes with the machine file's content."""
+__all__ = ["Heading", "heading", "no_window", "theory"]
 
 
-class Heading(TypedDict):
+class Heading(Identity):
     """First fields of every snapshot."""
 
-    site: str
-    machine: str
-    bundle: str | None
-    machine_hash: str
     start_ns: int | None
     end_ns: int | None
     filled: float
     speed_rad_s: float | None
 
 
-def heading(identity: Speaker, window: WindowStatistics | None, filled: float) -> Heading:
+def heading(identity: Identity, window: WindowStatistics | None, filled: float) -> Heading:
     """Whose snapshot this is, and of which window."""
     speed = np.nan if window is None else window.speed_rad_s
     return {
-        "site": identity.site,
-        "machine": identity.machine,
-        "bundle": identity.bundle,
-        "machine_hash": identity.machine_hash,
+        **identity,
         "start_ns": None if window is None else window.start_ns,
         "end_ns": None if window is None else window.end_ns,
         "filled": filled,

@@ -171,7 +171,7 @@ def machine_families(machines: Sequence[Observed]) -> Iterator[Metric]:
     )
     for machine in machines:
         identity, tally = machine.worker.identity, machine.worker.tally
-        info.add_metric(machine.place, {"bundle": identity.bundle or "", "machine_hash": identity.machine_hash})
+        info.add_metric(machine.place, {"bundle": identity["bundle"] or "", "machine_hash": identity["machine_hash"]})
         steps.add_metric(machine.place, tally.blocks, tally.step_s)
     yield info
     yield steps

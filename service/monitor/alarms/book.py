@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from pydantic import TypeAdapter
 
 from models.alarm_names import ALARM_TEXT, MODEL, of_the_machine
-from models.diagnosis.verdict.sequential import SequentialVerdict
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from rotorwatch.records.windows import Verdict
 from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence, Shelf
 from service.monitor.alarms.life_cycle import Happening, follow, owed_after
 from service.monitor.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
@@ -87,34 +87,36 @@ class AlarmBook:
 
     # What the data say
 
-    def found(self, verdict: SequentialVerdict, suspect: str, end_ns: int) -> None:
+    def found(self, verdict: Verdict, unexplained: str, suspect: str, end_ns: int) -> None:
         """Judge what the sequential test has found at the end of a hop; without clean data alarms stay where they are.
 
         Parameters
         ----------
-        verdict : SequentialVerdict
+        verdict : Verdict
+        unexplained : str
+            Why nothing can be said of parameters; empty if something can.
         suspect : str
             What explains data outside the model best; empty if nothing does.
         end_ns : int
             End of the hop.
         """
-        named = {finding.name for finding in verdict.findings}
-        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.isolation.confidence)
+        named = {finding.name for finding in verdict.changed}
+        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.confidence)
         for reading in verdict.current:
-            if reading.change is not None and reading.standard_error is not None:
+            if reading.relative_change is not None and reading.standard_error is not None:
                 self.update(
                     reading.name,
-                    reading.change,
+                    reading.relative_change,
                     reading.standard_error,
                     end_ns,
                     named=reading.name in named,
-                    low_confidence=verdict.isolation.outside,
+                    low_confidence=verdict.outside_model,
                     evidence=evidence,
-                    note="" if reading.vector is None else reading.vector.sentence,
+                    note="" if reading.vector is None else reading.vector.text,
                 )
-        if verdict.current or verdict.unexplained:
-            note = verdict.unexplained or (f"best explained by: {suspect}" if suspect else "")
-            outside = verdict.isolation.outside
+        if verdict.current or unexplained:
+            note = unexplained or (f"best explained by: {suspect}" if suspect else "")
+            outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
     def update(

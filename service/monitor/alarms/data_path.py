@@ -1,10 +1,11 @@
 """Alarms that say nothing of the machine: on the stream, its clock, the sensors, and the monitor itself."""
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
-from models.diagnosis.sensors.finding import FAULT_KINDS, SensorFinding
+from models.diagnosis.sensors.finding import FAULT_KINDS
 from models.diagnosis.window import WindowStatistics
 from models.ingest import Verdict
 from models.machine import MachineFile
+from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.alarm import Evidence
 from service.monitor.alarms.book import AlarmBook
 
@@ -68,7 +69,7 @@ class DataPathAlarms:
         for name in (GAP, CLOCK, FAULT, OVERLOADED):
             self._book.update_state(name, False, end_ns)
 
-    def sensors(self, findings: tuple[SensorFinding, ...], statistics: WindowStatistics) -> None:
+    def sensors(self, findings: tuple[SensorFault, ...], statistics: WindowStatistics) -> None:
         """One alarm for each kind of fault, with a sentence for each channel it is found in."""
         said: dict[str, list[str]] = {}
         for found in findings:

@@ -12,11 +12,10 @@ from models.commissioning.installed import Installed
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.replays import OfflineSummary, ReplayProgress
-from service.monitor import conversion
-from service.monitor.alarm_conversion import Identity, alarm_cloud_event
+from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
-from service.monitor.reports import MonitorReport
+from service.monitor.reports import Identity, MonitorReport
 from service.recordings.replay.control import Control
 from service.recordings.replay.source import RecordingSource
 
@@ -25,10 +24,7 @@ __all__ = ["OfflineReplay", "result_lines"]
 
 def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -> list[str]:
     """JSON lines of what one block brought: topic and message, in the order of their data time, report before alarm."""
-    timed = [
-        (window.end_ns, 0, keys.report, conversion.report(identity, window).model_dump_json())
-        for window in report.windows
-    ]
+    timed = [(window.end_ns, 0, keys.report, window.model_dump_json()) for window in report.windows]
     timed += [
         (event.time_ns, 1, keys.alarm_event, alarm_cloud_event(identity, event).model_dump_json())
         for event in report.events
@@ -71,12 +67,7 @@ class OfflineReplay:
         self._from_ns = span.start_ns if from_ns is None else from_ns
         self._to_ns = span.end_ns + 1 if to_ns is None else to_ns
         self._monitor = MachineMonitor(installed)
-        self.identity = Identity(
-            site=machine.site,
-            machine=machine.name,
-            bundle=installed.identity,
-            machine_hash=conversion.machine_hash(machine),
-        )
+        self.identity = self._monitor.identity
         self._digest = hashlib.sha256()
         self._windows = self._alarms = self._messages = 0
         self._data_s = 0.0
@@ -166,15 +157,12 @@ class OfflineReplay:
         health = self._monitor.health()
         quality = health.quality
         return OfflineSummary(
-            site=self.identity.site,
-            machine=self.identity.machine,
-            bundle=self.identity.bundle,
-            machine_hash=self.identity.machine_hash,
+            **self.identity,
             windows=self._windows,
             alarms=self._alarms,
             raised=tuple(alarm.name for alarm in health.alarms if alarm.raised),
-            blocks=quality.accepted,
-            refused_blocks=dict(quality.refused),
+            blocks=quality.accepted_blocks,
+            refused_blocks=quality.refused_blocks,
             last_refusal=quality.last_refusal,
             gaps=quality.gaps,
             missing_s=quality.missing_s,
