@@ -156,15 +156,29 @@ def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
 
 
 class ChannelDescriptor(BaseModel):
-    """Columns, rate and number format of one machine's stream, as served on the ``descriptor`` key."""
+    """Columns, rate and number format of one machine's stream, as served on the ``descriptor`` key.
 
-    model_config = _STRICT
+    Publishers and recordings may be of a later version: fields that are not known here are passed over.
+    """
+
+    model_config = ConfigDict(frozen=True)
 
     site: str
     machine: str
     rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
     dtype: Literal["float32", "float64"]
     channels: tuple[Channel, ...] = Field(min_length=1, max_length=64)
+
+    @field_validator("channels", mode="before")
+    @classmethod
+    def _known_fields(cls, channels: object) -> object:
+        """In a machine file, where channels stand too, an unknown field is a mistake."""
+        if not isinstance(channels, list):
+            return channels
+        known = Channel.model_fields
+        return [
+            {name: one[name] for name in one if name in known} if isinstance(one, dict) else one for one in channels
+        ]
 
     @model_validator(mode="after")
     def _unique(self) -> Self:

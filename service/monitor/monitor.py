@@ -39,19 +39,12 @@ from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import Operation
 from service.monitor.evaluation import Evaluation, evaluator_for
-from service.monitor.reports import Identity, MachineHealth, MonitorReport, MonitorState, counted, identity_of
+from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
 
 __all__ = ["MachineMonitor"]
 
 _RPM = 30 / np.pi
 _NEWEST_SAMPLES = 20_000
-
-
-class _Heading(Identity):
-    start_ns: int
-    end_ns: int
-    state: HealthState
-    filled: float
 
 
 class MachineMonitor:
@@ -464,7 +457,7 @@ class MachineMonitor:
             shapes=evaluation.shapes,
         )
 
-    def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> _Heading:
+    def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> WindowHeading:
         """First fields of a report."""
         filled = self._window.filled
         return {**self.identity, "start_ns": start_ns, "end_ns": end_ns, "state": state, "filled": filled}

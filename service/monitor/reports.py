@@ -17,6 +17,7 @@ __all__ = [
     "MonitorReport",
     "MonitorState",
     "Tally",
+    "WindowHeading",
     "counted",
     "identity_of",
     "machine_hash",
@@ -30,6 +31,15 @@ class Identity(TypedDict):
     machine: str
     bundle: str | None
     machine_hash: str
+
+
+class WindowHeading(Identity):
+    """What every report on a window begins with."""
+
+    start_ns: int
+    end_ns: int
+    state: HealthState
+    filled: float
 
 
 def identity_of(installed: Installed) -> Identity:
