@@ -5,7 +5,7 @@ Written against ASGI itself, so that event streams pass through piece by piece.
 
 from collections.abc import Awaitable, Callable
 
-from fastapi import Request
+from fastapi import Request, Response
 from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import MutableHeaders
 from starlette.exceptions import HTTPException
@@ -103,19 +103,10 @@ class AccessMiddleware:
 
         async def refuse(refusal: HTTPException) -> None:
             request.state.audit = AuditNote(reason=refusal.detail)
-            answer = problem_answer(request, refusal.status_code, refusal.detail)
-            answer.headers.update(refusal.headers or {})
-            if refusal.status_code == _UNAUTHENTICATED:
-                for challenge in challenges(request):
-                    answer.headers.append("WWW-Authenticate", challenge)
-            await answer(scope, receive, watched)
+            await _refusal(request, refusal)(scope, receive, watched)
 
         try:
-            caller = await self._admit(request)
-            visit.actor = caller.name
-            length = request.headers.get("content-length", "0")
-            if length.isdecimal() and (len(length) > _LONGEST_NUMBER or int(length) > self._body_bytes):
-                raise self._too_large()
+            caller = await self._admitted(request, visit)
         except HTTPException as refusal:
             await refuse(refusal)
             return
@@ -124,6 +115,14 @@ class AccessMiddleware:
         await self._app(scope, measured, watched)
         if not answered and received > self._body_bytes:
             await refuse(self._too_large())
+
+    async def _admitted(self, request: Request, visit: Visit) -> Caller:
+        caller = await self._admit(request)
+        visit.actor = caller.name
+        length = request.headers.get("content-length", "0")
+        if length.isdecimal() and (len(length) > _LONGEST_NUMBER or int(length) > self._body_bytes):
+            raise self._too_large()
+        return caller
 
     def _too_large(self) -> HTTPException:
         return HTTPException(_TOO_LARGE, f"the request body is too large, expected at most {self._body_bytes} bytes")
@@ -153,3 +152,12 @@ class AccessMiddleware:
         elif visit.method in SAFE_METHODS:
             return
         await run_in_threadpool(self._trail.finish, visit, status, note)
+
+
+def _refusal(request: Request, refusal: HTTPException) -> Response:
+    answer = problem_answer(request, refusal.status_code, refusal.detail)
+    answer.headers.update(refusal.headers or {})
+    if refusal.status_code == _UNAUTHENTICATED:
+        for challenge in challenges(request):
+            answer.headers.append("WWW-Authenticate", challenge)
+    return answer

@@ -12,7 +12,8 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from rotorwatch.records.monitor import Readiness
-from service.analysis.snapshots.desk import LatestData, SnapshotDesk
+from service.analysis.snapshots.desk import SnapshotDesk
+from service.analysis.snapshots.statement import LatestData
 from service.api.routes.recordings import RecordingIndex
 from service.api.routes.replays import ReplayDesk
 from service.api.routes.service import MeasuredView

@@ -123,7 +123,7 @@ class MachineStore:
             rows = connection.execute(query).all()
         return Checkpoint(CheckpointHead(*head), tuple((row.end_ns, row.moments) for row in rows))
 
-    def events(
+    def events(  # noqa: PLR0913  # each narrows the query
         self,
         *,
         after: int | None = None,

@@ -14,7 +14,7 @@ __all__ = ["detectable_changes", "health", "machine_description"]
 _REPLAYED = "a replay is announced on this machine's own keys: what is replayed is not evaluated"
 
 
-def health(
+def health(  # noqa: PLR0913  # what the worker counts
     identity: Identity,
     record: MachineHealth,
     stream: StreamStatus,

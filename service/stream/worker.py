@@ -15,7 +15,8 @@ from models.commissioning.installed import Installed
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
-from service.analysis.snapshots.desk import LatestData, SnapshotDesk
+from service.analysis.snapshots.desk import SnapshotDesk
+from service.analysis.snapshots.statement import LatestData
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion

@@ -12,7 +12,8 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot
-from service.analysis.snapshots.desk import LatestData, SnapshotDesk
+from service.analysis.snapshots.desk import SnapshotDesk
+from service.analysis.snapshots.statement import LatestData
 from service.monitor.reports import Identity
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, stream

@@ -8,7 +8,7 @@ import pytest
 from models.machine import Machine
 from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import SampleBlock
-from service.analysis.snapshots.desk import LatestData
+from service.analysis.snapshots.statement import LatestData
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream

@@ -19,10 +19,10 @@ from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from service.analysis.snapshots import desk as desk_module
 from service.analysis.snapshots.choice import SnapshotError
-from service.analysis.snapshots.desk import LatestData
 from service.analysis.snapshots.path import MOST_REVOLUTIONS
 from service.analysis.snapshots.prediction import Prediction, predict
 from service.analysis.snapshots.revolutions import NewestBlocks
+from service.analysis.snapshots.statement import LatestData
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (

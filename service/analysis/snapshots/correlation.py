@@ -4,26 +4,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from models.diagnosis.window import WindowStatistics
-from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
 from service.analysis.snapshots.choice import chosen_pairs, figures, product_unit
 from service.analysis.snapshots.measured import MeasuredCorrelations, measured_correlations
 from service.analysis.snapshots.prediction import Prediction
-from service.analysis.snapshots.statement import heading, no_window, theory
-from service.monitor.reports import Identity
+from service.analysis.snapshots.statement import LatestData, Subject, heading, no_window, theory
 
 __all__ = ["correlation_snapshot"]
 
 
 def correlation_snapshot(
-    identity: Identity,
-    machine: MachineFile,
-    window: WindowStatistics | None,
+    subject: Subject,
+    data: LatestData,
     prediction: Prediction,
-    filled: float,
     first: Sequence[str] = (),
     second: Sequence[str] = (),
     units: Units = "channel",
@@ -32,14 +27,10 @@ def correlation_snapshot(
 
     Parameters
     ----------
-    identity : Identity
-    machine : MachineFile
-    window : WindowStatistics or None
-        The latest full window.
+    subject : Subject
+    data : LatestData
     prediction : Prediction
-        Theory for it.
-    filled : float
-        Fraction of a full window that is there now.
+        Theory for the latest window.
     first, second : sequence of str
         Channels by name: the references, and as many responses; without `second` every channel with itself, without
         both a few pairs (`service.analysis.snapshots.choice.chosen_pairs`).
@@ -51,17 +42,18 @@ def correlation_snapshot(
     SnapshotError
         If there is no such channel.
     """
+    machine, window = subject.machine, data.window
     pairs = chosen_pairs(machine, first, second)
     stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
     if window is None:
         return CorrelationSnapshot(
-            **heading(identity, window, filled),
+            **heading(subject, data),
             lags_s=(),
             method="samples",
             band_hz=None,
             pairs=(),
             theory=stated,
-            reason=no_window(machine, filled),
+            reason=no_window(machine, data),
         )
     states = tuple(dict.fromkeys(state_name(channel) for pair in pairs for channel in pair))
     columns = [window.states.index(state) for state in states]
@@ -69,7 +61,7 @@ def correlation_snapshot(
     measured = measured_correlations(machine, window, [(columns[i], columns[j]) for i, j in places])
     nominal, estimated = prediction.correlations(states, places, measured.lags_s, measured.band_hz)
     return CorrelationSnapshot(
-        **heading(identity, window, filled),
+        **heading(subject, data),
         lags_s=tuple(measured.lags_s.tolist()),
         method="samples" if measured.band_hz is None else "spectrum",
         band_hz=measured.band_hz,

@@ -1,6 +1,5 @@
 """Orbits of the latest window at running speed, and the newest revolutions as measured."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,20 +7,17 @@ import numpy as np
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
-from models.machine import Machine, MachineFile
+from models.machine import Machine
 from models.physics.lyapunov import synchronous_response
 from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import RotorParameters, changed
-from models.signals.block import SampleBlock
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
-from rotorwatch.records.windows import Parameter
 from service.analysis.snapshots.choice import figures, orbit_pairs
 from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
 from service.analysis.snapshots.path import NewestPath, newest_path
 from service.analysis.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
-from service.analysis.snapshots.statement import heading, no_window, theory
-from service.monitor.reports import Identity
+from service.analysis.snapshots.statement import LatestData, Subject, heading, no_window, theory
 
 __all__ = ["orbit_snapshot"]
 
@@ -50,14 +46,8 @@ class _Vectors:
 
 
 def orbit_snapshot(
-    identity: Identity,
-    machine: MachineFile,
-    known: Machine | None,
-    window: WindowStatistics | None,
-    readings: Iterable[Parameter],
-    why_not: str,
-    filled: float,
-    blocks: tuple[SampleBlock, ...] = (),
+    subject: Subject,
+    data: LatestData,
     revolutions: int = 0,
     units: Units = "channel",
 ) -> OrbitSnapshot:
@@ -65,20 +55,8 @@ def orbit_snapshot(
 
     Parameters
     ----------
-    identity : Identity
-    machine : MachineFile
-    known : Machine or None
-        The machine with all its parameters.
-    window : WindowStatistics or None
-        The latest full window; its ellipses are those of all its data.
-    readings : iterable of Parameter
-        Of that window; empty if it was not evaluated.
-    why_not : str
-        Why it was not evaluated.
-    filled : float
-        Fraction of a full window that is there now.
-    blocks : tuple of SampleBlock
-        The newest accepted blocks, without a gap.
+    subject : Subject
+    data : LatestData
     revolutions : int
         Whole revolutions to be shown as measured; none with 0.
     units : str
@@ -89,11 +67,12 @@ def orbit_snapshot(
     SnapshotError
         If `revolutions` is negative or too large.
     """
+    machine, known, window = subject.machine, subject.known, data.window
     places = orbit_pairs(machine.sensors)
-    path = newest_path(machine, blocks, revolutions, None if window is None else window.speed_rad_s)
-    changes = read_changes(readings)
+    path = newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
+    changes = read_changes(data.parameters)
     lacking = NO_PARAMETERS if known is None else ""
-    estimated_reason = lacking or ("" if changes else why_not or NOTHING_READ)
+    estimated_reason = lacking or ("" if changes else data.why_not or NOTHING_READ)
     vectors = None if window is None else _vectors(window)
     if not places:
         there = ", ".join(channel.name for channel in machine.sensors if channel.quantity == "displacement") or "none"
@@ -102,14 +81,14 @@ def orbit_snapshot(
             f"displacements: {there}"
         )
     elif window is None:
-        reason = no_window(machine, filled)
+        reason = no_window(machine, data)
     else:
         reason = _NO_SPEED if vectors is None else ""
     rotors = (
         None if known is None else known.rotor,
         None if known is None or estimated_reason else changed(known.rotor, changes),
     )
-    head = heading(identity, window, filled)
+    head = heading(subject, data)
     return OrbitSnapshot(
         **head,
         speed_source="unknown" if window is None else window.speed_source,

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
@@ -16,8 +15,7 @@ from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, Spectrum
 from service.analysis.snapshots.choice import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
 from service.analysis.snapshots.excitation import LEFT_OUT_BINS
 from service.analysis.snapshots.prediction import Prediction
-from service.analysis.snapshots.statement import heading, no_window, theory
-from service.monitor.reports import Identity
+from service.analysis.snapshots.statement import LatestData, Subject, heading, no_window, theory
 
 __all__ = ["MOST_LINES", "spectrum_snapshot"]
 
@@ -38,12 +36,10 @@ class _Spectra:
     estimated: ComplexArray | None
 
 
-def spectrum_snapshot(
-    identity: Identity,
-    machine: MachineFile,
-    window: WindowStatistics | None,
+def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
+    subject: Subject,
+    data: LatestData,
     prediction: Prediction,
-    filled: float,
     channels: Sequence[str] = (),
     first: Sequence[str] = (),
     second: Sequence[str] = (),
@@ -54,14 +50,10 @@ def spectrum_snapshot(
 
     Parameters
     ----------
-    identity : Identity
-    machine : MachineFile
-    window : WindowStatistics or None
-        The latest full window.
+    subject : Subject
+    data : LatestData
     prediction : Prediction
-        Theory for it.
-    filled : float
-        Fraction of a full window that is there now.
+        Theory for the latest window.
     channels : sequence of str
         By name; without names all displacements, or all of the first quantity that is measured.
     first, second : sequence of str
@@ -76,11 +68,12 @@ def spectrum_snapshot(
     SnapshotError
         If there is no such channel, or the band holds no line.
     """
+    machine, window = subject.machine, data.window
     chosen = chosen_channels(machine, channels)
     pairs = chosen_pairs(machine, first, second) if first or second else ()
     within = _checked(machine, band_hz)
     stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
-    head = heading(identity, window, filled)
+    head = heading(subject, data)
     if window is None:
         return SpectrumSnapshot(
             **head,
@@ -95,7 +88,7 @@ def spectrum_snapshot(
             densities=(),
             cross=(),
             theory=stated,
-            reason=no_window(machine, filled),
+            reason=no_window(machine, data),
         )
     lines = (window.frequencies_hz >= within[0] - 1e-9) & (window.frequencies_hz <= within[1] + 1e-9)
     frequencies_hz = window.frequencies_hz[lines]

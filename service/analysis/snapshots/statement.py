@@ -1,15 +1,60 @@
 """Parts that all snapshots have in common: whose they are, of which window, and what the predictions are of."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from models.diagnosis.window import WindowStatistics
-from models.machine import MachineFile
+from models.machine import Machine, MachineFile
+from models.signals.block import SampleBlock
 from rotorwatch.records.snapshots import PredictedChange, Theory
+from rotorwatch.records.windows import Parameter
 from service.monitor.reports import Identity
 
-__all__ = ["Heading", "heading", "no_window", "theory"]
+__all__ = ["Heading", "LatestData", "Subject", "heading", "no_window", "theory"]
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """The machine that a snapshot is of.
+
+    Attributes
+    ----------
+    identity : Identity
+    machine : MachineFile
+    known : Machine or None
+        The machine with all its parameters.
+    """
+
+    identity: Identity
+    machine: MachineFile
+    known: Machine | None
+
+
+@dataclass(frozen=True, slots=True)
+class LatestData:
+    """What a monitor holds at one moment; nothing in it is changed afterwards.
+
+    Attributes
+    ----------
+    window : WindowStatistics or None
+        The latest full window.
+    filled : float
+        Fraction of a full window that is there now.
+    parameters : tuple of Parameter
+        Readings of that window by the diagnostician that decides; empty if it was not evaluated.
+    why_not : str
+        Why it was not evaluated.
+    blocks : tuple of SampleBlock
+        The newest blocks, without a gap.
+    """
+
+    window: WindowStatistics | None = None
+    filled: float = 0.0
+    parameters: tuple[Parameter, ...] = ()
+    why_not: str = ""
+    blocks: tuple[SampleBlock, ...] = ()
 
 
 class Heading(Identity):
@@ -21,23 +66,24 @@ class Heading(Identity):
     speed_rad_s: float | None
 
 
-def heading(identity: Identity, window: WindowStatistics | None, filled: float) -> Heading:
+def heading(subject: Subject, data: LatestData) -> Heading:
     """Whose snapshot this is, and of which window."""
+    window = data.window
     speed = np.nan if window is None else window.speed_rad_s
     return {
-        **identity,
+        **subject.identity,
         "start_ns": None if window is None else window.start_ns,
         "end_ns": None if window is None else window.end_ns,
-        "filled": filled,
+        "filled": data.filled,
         "speed_rad_s": float(speed) if np.isfinite(speed) else None,
     }
 
 
-def no_window(machine: MachineFile, filled: float) -> str:
+def no_window(machine: MachineFile, data: LatestData) -> str:
     """Why nothing can be shown before the first window is full."""
     return (
         f"{machine.site}/{machine.name}: no window of {machine.window.length_s:g} s is full yet, "
-        f"{filled:.0%} of one is there"
+        f"{data.filled:.0%} of one is there"
     )
 
 

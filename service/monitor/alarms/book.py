@@ -119,7 +119,7 @@ class AlarmBook:
             outside = verdict.outside_model
             self.update_state(MODEL, outside, end_ns, note, evidence=evidence)
 
-    def update(
+    def update(  # noqa: PLR0913  # what one reading says
         self,
         parameter: str,
         change: float,
