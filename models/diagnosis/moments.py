@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.fft import next_fast_len
 
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.pairs import MotionPair, motion_pairs, pair_powers
@@ -262,7 +263,7 @@ def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
     if longest == 0:
         own = a[plan.preamble :]
         return np.asarray((own.T @ own)[np.newaxis], dtype=np.float64)
-    size = _fast_length(longest + max(2 * longest, 256))
+    size = next_fast_len(longest + max(2 * longest, 256), real=True)
     block = size - longest
     count = -(-plan.hop // block)
     padded = np.zeros((n, longest + count * block))
@@ -289,19 +290,3 @@ def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:
         piece = a[start : start + plan.segment] * taper[:, None]
         spectra[number] = np.fft.rfft(piece, axis=0)[plan.bins] * scale
     return spectra
-
-
-def _fast_length(n: int) -> int:
-    """Smallest 2^a 3^b 5^c ≥ n."""
-    best = 1 << (n - 1).bit_length()
-    five = 1
-    while five < best:
-        three = five
-        while three < best:
-            two = three
-            while two < n:
-                two *= 2
-            best = min(best, two)
-            three *= 3
-        five *= 5
-    return best
