@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from models.errors import MachineFileError, RecordingError, RotorwatchError
-from models.signals.link import NAMESPACE_PATTERN, LinkSettings
 from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes, one_blas_thread
 
-if TYPE_CHECKING:  # these import numpy and pyarrow, which --help must not wait for
+if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
+    from models.signals.link import LinkSettings
     from rotorwatch.records.replays import OfflineSummary
     from service.recordings.replay.control import Control
     from service.recordings.replay.source import RecordingSource
@@ -34,7 +34,7 @@ NamespaceOption = Annotated[
 ]
 
 
-def in_namespace(link: LinkSettings, namespace: str | None) -> LinkSettings:
+def in_namespace(link: "LinkSettings", namespace: str | None) -> "LinkSettings":
     """Link settings with the namespace of the command line, if there is one.
 
     Raises
@@ -316,13 +316,17 @@ def _prefix(prefix: str | None, first: Path) -> str:
 
 
 def _check_prefix(option: str, prefix: str) -> None:
+    from models.signals.link import NAMESPACE_PATTERN  # noqa: PLC0415  # keeps --help quick
+
     if not re.fullmatch(NAMESPACE_PATTERN, prefix):
         raise MachineFileError(
             f"{option} is {prefix!r}, expected letters, digits, '_', '-' and '.', in parts separated by '/'"
         )
 
 
-def _link(connect: list[str] | None, listen: list[str] | None) -> LinkSettings:
+def _link(connect: list[str] | None, listen: list[str] | None) -> "LinkSettings":
+    from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
+
     if listen:
         return LinkSettings(mode="peer", listen=tuple(listen), connect=tuple(connect or ()))
     return LinkSettings(mode="client", connect=tuple(connect or (ENDPOINT,)))
