@@ -34,43 +34,6 @@ class HealthState(StrEnum):
 State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
 
 
-_MisfitZ = Annotated[
-    Number,
-    Field(
-        description="distance of the window from what the model can explain, standard deviations; null without a test",
-        examples=[0.4],
-    ),
-]
-
-
-_Suspect = Annotated[
-    str, Field(description="what explains data outside the model best, if one thing does; else empty", examples=[""])
-]
-
-
-_Opinions = Annotated[tuple[Opinion, ...], Field(description="what the other diagnosticians read in the window")]
-
-
-_Verdict = Annotated[Verdict | None, Field(description="what has changed; null if the window was not evaluated")]
-
-
-_Detectable = Annotated[tuple[Detectable, ...], Field(description="what would have been found in this window")]
-
-
-_Sensors = Annotated[
-    tuple[SensorFault, ...],
-    Field(
-        description="faults of sensors in the window; with any of them nothing is said of the machine", examples=[()]
-    ),
-]
-
-
-_Shapes = Annotated[
-    tuple[Shape, ...],
-    Field(description="where no equation can be evaluated: whether each channel is as it was", examples=[()]),
-]
-
-
 class Report(BaseModel):
     """One evaluation of the sliding window."""
 
@@ -83,17 +46,33 @@ class Report(BaseModel):
     state: State
     filled: float = Field(description="fraction of a full window", examples=[1.0])
     speed_rad_s: Number = Field(default=None, description="mean speed in the window", examples=[138.23])
-    misfit_z: _MisfitZ = None
-    suspect: _Suspect = ""
-    verdict: _Verdict = None
+    misfit_z: Number = Field(
+        default=None,
+        description="distance of the window from what the model can explain, standard deviations; null without a test",
+        examples=[0.4],
+    )
+    suspect: str = Field(
+        default="",
+        description="what explains data outside the model best, if one thing does; else empty",
+        examples=[""],
+    )
+    verdict: Verdict | None = Field(default=None, description="what has changed; null if the window was not evaluated")
     parameters: tuple[Parameter, ...] = Field(
         default=(), description="readings of the whole window by the diagnostician that decides"
     )
-    opinions: _Opinions = ()
+    opinions: tuple[Opinion, ...] = Field(default=(), description="what the other diagnosticians read in the window")
     equations: tuple[Equation, ...] = Field(default=(), description="the networks' residuals, equation by equation")
-    detectable: _Detectable = ()
-    sensors: _Sensors = ()
-    shapes: _Shapes = ()
+    detectable: tuple[Detectable, ...] = Field(default=(), description="what would have been found in this window")
+    sensors: tuple[SensorFault, ...] = Field(
+        default=(),
+        description="faults of sensors in the window; with any of them nothing is said of the machine",
+        examples=[()],
+    )
+    shapes: tuple[Shape, ...] = Field(
+        default=(),
+        description="where no equation can be evaluated: whether each channel is as it was",
+        examples=[()],
+    )
     reason: Reason = ""
     bundle: BundleIdentity
     machine_hash: MachineHash
@@ -154,7 +133,7 @@ class StreamStatus(BaseModel):
 
 
 class Health(BaseModel):
-    """Where a machine stands: state, latest window, alarms, quality of the data."""
+    """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
 
     model_config = JSON
 
@@ -171,20 +150,7 @@ class Health(BaseModel):
         examples=[""],
     )
     filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
-    window_start_ns: int | None = Field(
-        description="oldest data of the latest window", examples=[EXAMPLE_NS - 60_000_000_000]
-    )
-    window_end_ns: int | None = Field(description="end of the latest window", examples=[EXAMPLE_NS])
-    speed_rad_s: float | None = Field(description="mean speed in the latest window", examples=[138.23])
-    misfit_z: _MisfitZ
-    suspect: _Suspect
-    verdict: _Verdict
-    parameters: tuple[Parameter, ...] = Field(description="parameters in the latest window")
-    opinions: _Opinions
-    equations: tuple[Equation, ...] = Field(description="equations in the latest window")
-    detectable: _Detectable
-    sensors: _Sensors
-    shapes: _Shapes
+    report: Report | None = Field(description="the latest window; null before the first hop")
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
     quality: Quality = Field(description="what came in")
     stream: StreamStatus = Field(description="what is known about the publisher")

@@ -136,7 +136,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 
     @app.get(f"{PLACE}/health", responses=responses(Health, 404, 422), **common)
     def health(site: SiteName, machine: MachineName) -> Health:
-        """Where a machine stands: state, parameters with intervals, equations, alarms, quality of the data."""
+        """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
         return found_machine(service, site, machine).health()
 
     @app.get(f"{PLACE}/detectable", responses=responses(DetectableChanges, 404, 422), **common)

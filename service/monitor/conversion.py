@@ -27,7 +27,6 @@ def health(  # noqa: PLR0913  # what the worker counts
     restart: str = "",
 ) -> Health:
     """Convert a machine's health; silence is the state of a machine without a raised alarm, and is said of any."""
-    latest = record.latest
     silence = ""
     if stream.silent:
         since_ns = stream.silent_since_ns
@@ -42,18 +41,7 @@ def health(  # noqa: PLR0913  # what the worker counts
         state=HealthState.NO_DATA if stream.silent and not record.state.alarmed else record.state,
         reason="; ".join(filter(None, (_REPLAYED if stream.replay_announced else "", silence, record.reason))),
         filled=record.filled,
-        window_start_ns=None if latest is None else latest.start_ns,
-        window_end_ns=None if latest is None else latest.end_ns,
-        speed_rad_s=None if latest is None else latest.speed_rad_s,
-        misfit_z=None if latest is None else latest.misfit_z,
-        suspect="" if latest is None else latest.suspect,
-        verdict=None if latest is None else latest.verdict,
-        parameters=() if latest is None else latest.parameters,
-        opinions=() if latest is None else latest.opinions,
-        equations=() if latest is None else latest.equations,
-        detectable=() if latest is None else latest.detectable,
-        sensors=() if latest is None else latest.sensors,
-        shapes=() if latest is None else latest.shapes,
+        report=record.latest,
         alarms=alarm_entries(record.alarms),
         quality=quality.model_copy(update=lost),
         stream=stream,

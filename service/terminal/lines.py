@@ -121,7 +121,7 @@ def health_line(health: Health) -> str:
     >>> health_line(Health.model_validate(example(Health)))
     '00:03:25  demo/lab  state is alert'
     """
-    at = "--:--:--" if health.window_end_ns is None else _clock(health.window_end_ns)
+    at = "--:--:--" if health.report is None else _clock(health.report.end_ns)
     why = f": {health.reason}" if health.reason else ""
     return f"{at}  {health.site}/{health.machine}  state is {health.state}{why}"
 

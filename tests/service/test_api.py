@@ -56,18 +56,20 @@ def test_health_names_the_fault_with_its_interval(http: httpx.Client) -> None:
     health = answered(http.get(f"{PLACE}/health"), Health)
     assert health.state == "alert"
     assert health.filled == 1.0
-    assert health.window_end_ns is not None
-    assert health.window_start_ns == health.window_end_ns - 12 * HOP_NS
-    assert [parameter.name for parameter in health.parameters] == list(PARAMETERS)
-    k_by = health.parameters[0]
+    report = health.report
+    assert report is not None
+    assert report == next(iter(answered(http.get(f"{PLACE}/reports?limit=1"), ReportList).reports))
+    assert report.start_ns == report.end_ns - 12 * HOP_NS
+    assert [parameter.name for parameter in report.parameters] == list(PARAMETERS)
+    k_by = report.parameters[0]
     assert k_by.text == "bearing stiffness, horizontal"
     assert k_by.interval_95 is not None
     assert k_by.interval_95[0] < -0.33 < k_by.interval_95[1] + 0.02
-    assert [equation.equation for equation in health.equations] == ["28", "29", "30", "31"]
-    for equation in health.equations:
+    assert [equation.equation for equation in report.equations] == ["28", "29", "30", "31"]
+    for equation in report.equations:
         assert equation.evaluable == (equation.msd is not None)
         assert equation.evaluable != bool(equation.reason)
-    assert any(equation.evaluable for equation in health.equations)
+    assert any(equation.evaluable for equation in report.equations)
     assert [alarm.name for alarm in health.alarms if alarm.raised] == ["k_by"]
     assert health.quality.accepted_blocks == 920
     assert health.quality.gaps == health.quality.queue_dropped_blocks == health.quality.link_missed_blocks == 0
@@ -96,8 +98,9 @@ def test_readings_over_time(http: httpx.Client) -> None:
     every = answered(http.get(f"{PLACE}/readings?name=k_by"), ReadingList)
     assert (len(every.readings), every.buckets, every.next_after) == (6, (), None)
     health = answered(http.get(f"{PLACE}/health"), Health)
-    assert every.readings[-1].value == health.parameters[0].relative_change
-    assert every.readings[-1].standard_error == health.parameters[0].standard_error
+    assert health.report is not None
+    k_by = health.report.parameters[0]
+    assert (every.readings[-1].value, every.readings[-1].standard_error) == (k_by.relative_change, k_by.standard_error)
     first = answered(http.get(f"{PLACE}/readings?name=k_by&limit=4"), ReadingList)
     second = answered(http.get(f"{PLACE}/readings?name=k_by&limit=4&after={first.next_after}"), ReadingList)
     assert first.readings + second.readings == every.readings
@@ -183,7 +186,8 @@ def test_one_alarm_and_its_version(http: httpx.Client) -> None:
 
 def test_health_says_what_changed_since_when_and_who_agrees(http: httpx.Client) -> None:
     health = answered(http.get(f"{PLACE}/health"), Health)
-    verdict = health.verdict
+    assert health.report is not None
+    verdict = health.report.verdict
     assert verdict is not None
     (found,) = verdict.changed
     assert (found.name, found.text) == ("k_by", "bearing stiffness, horizontal")
@@ -192,8 +196,8 @@ def test_health_says_what_changed_since_when_and_who_agrees(http: httpx.Client) 
     assert not verdict.outside_model
     assert verdict.confidence > 0.99
     assert verdict.text.startswith("changed: bearing stiffness, horizontal (k_by) since 00:00:")
-    assert health.opinions
-    for opinion in health.opinions:
+    assert health.report.opinions
+    for opinion in health.report.opinions:
         k_by = next(one for one in opinion.agreement if one.name == "k_by")
         assert k_by.between == ("likelihood", opinion.by)
         assert k_by.verdict == "agree"
@@ -223,9 +227,10 @@ def test_correlations_beside_theory(http: httpx.Client) -> None:
     # A third of a bearing's stiffness is missing: only theory with the estimated parameters fits.
     assert pair.estimated_z < 3 < pair.nominal_z
     health = answered(http.get(f"{PLACE}/health"), Health)
-    assert (found.start_ns, found.end_ns) == (health.window_start_ns, health.window_end_ns)
+    assert health.report is not None
+    assert (found.start_ns, found.end_ns) == (health.report.start_ns, health.report.end_ns)
     changes = {one.name: one.relative_change for one in found.theory.changes}
-    assert changes["k_by"] == pytest.approx(health.parameters[0].relative_change, rel=1e-5)
+    assert changes["k_by"] == pytest.approx(health.report.parameters[0].relative_change, rel=1e-5)
 
 
 def test_spectra_and_orbits(http: httpx.Client) -> None:

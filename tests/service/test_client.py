@@ -64,7 +64,7 @@ def test_what_there_is(plant: Client, seen: tuple[Runtime, MachineWorker]) -> No
     (machine,) = plant.machines()
     assert machine == plant.machine(PLACE) == worker.description()
     assert plant.configuration(PLACE).machine_hash == worker.identity["machine_hash"]
-    assert plant.health(PLACE).parameters == worker.health().parameters != ()
+    assert plant.health(PLACE).report == worker.health().report is not None
     assert plant.detectable(PLACE, -0.05) == worker.detectable(-0.05)
 
 

@@ -281,5 +281,5 @@ def test_lines_for_terminals() -> None:
     )
     health = Health.model_validate(example(Health))
     assert health_line(health) == "00:03:25  demo/lab  state is alert"
-    unseen = health.model_copy(update={"window_end_ns": None, "state": "no-data", "reason": "silence"})
+    unseen = health.model_copy(update={"report": None, "state": "no-data", "reason": "silence"})
     assert health_line(unseen) == "--:--:--  demo/lab  state is no-data: silence"

@@ -107,7 +107,7 @@ def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_noth
             assert silent.stream.silent_since_ns == stream[-1].end_ns
             assert silent.reason.startswith("no data since 2026-01-01T00:0")
             assert [alarm.name for alarm in silent.alarms if alarm.raised and alarm.name != STREAM_LOST] == ["c_bz"]
-            assert silent.parameters == published[-1].parameters
+            assert silent.report == published[-1]
             said = [Health.model_validate_json(text).state.value for text in topics.texts("/health")]
             assert "danger" in said
             # News only: a service does not repeat itself because a block came in or a second went by.

@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 from models.diagnosis.readings import Z95
 from rotorwatch.records.alarms import Alarm, Severity
-from rotorwatch.records.health import Health
+from rotorwatch.records.health import Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
 __all__ = ["front_page"]
@@ -44,13 +44,16 @@ def _machine(health: Health) -> str:
     raised = {alarm.name: alarm.severity for alarm in health.alarms if alarm.raised}
     silent = ' <span class="no-data">no data</span>' if health.stream.silent and health.state != "no-data" else ""
     reason = f"<p>{html.escape(health.reason)}</p>" if health.reason else ""
-    suspect = f" Best explained by: {html.escape(health.suspect)}." if health.suspect else ""
-    verdict = f"<p>{html.escape(health.verdict.text)}.{suspect}</p>" if health.verdict else ""
+    report, said = health.report, ""
+    if report is not None and report.verdict is not None:
+        suspect = f" Best explained by: {html.escape(report.suspect)}." if report.suspect else ""
+        said = f"<p>{html.escape(report.verdict.text)}.{suspect}</p>"
+    window = "" if report is None else _table(report, raised) + _shapes(report)
     return (
         f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span>{silent}</h2>'
-        f"{reason}{verdict}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
+        f"{reason}{said}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
         f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>"
-        f"{_alarms(health)}{_table(health, raised)}{_shapes(health)}"
+        f"{_alarms(health)}{window}"
     )
 
 
@@ -95,35 +98,35 @@ def _clock(time_ns: int) -> str:
     return datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _shapes(health: Health) -> str:
+def _shapes(report: Report) -> str:
     """What is said channel by channel where no equation can be evaluated."""
-    if not health.shapes:
+    if not report.shapes:
         return ""
-    items = "".join(f"<li>{html.escape(shape.text)}" for shape in health.shapes)
+    items = "".join(f"<li>{html.escape(shape.text)}" for shape in report.shapes)
     return f"<p>Each channel beside its own healthy form; no part of the machine can be named:</p><ul>{items}</ul>"
 
 
-def _table(health: Health, raised: dict[str, Severity]) -> str:
+def _table(report: Report, raised: dict[str, Severity]) -> str:
     """Who reads what of each parameter, and what would have been noticed."""
-    verdict = health.verdict
-    if verdict is None or not any(one.relative_change is not None for one in health.parameters):
+    verdict = report.verdict
+    if verdict is None or not any(one.relative_change is not None for one in report.parameters):
         return ""
-    by = next(one.by for one in health.parameters)
+    by = next(one.by for one in report.parameters)
     readings = {parameter.name: parameter for parameter in (() if verdict.settled else verdict.current)}
-    limits = {found.name: found for found in health.detectable}
-    heads = "".join(f"<th>{html.escape(opinion.by)}" for opinion in health.opinions)
+    limits = {found.name: found for found in report.detectable}
+    heads = "".join(f"<th>{html.escape(opinion.by)}" for opinion in report.opinions)
     rows = ""
-    for stated in health.parameters:
+    for stated in report.parameters:
         parameter, alarm = readings.get(stated.name, stated), raised.get(stated.name, "")
         marked = ' class="raised"' if alarm else ""
-        others = "".join(_other(opinion, stated.name) for opinion in health.opinions)
+        others = "".join(_other(opinion, stated.name) for opinion in report.opinions)
         found = limits.get(stated.name)
         least = "" if found is None else f"{found.loss:+.1%} / {found.gain:+.1%}"
         rows += (
             f"<tr{marked}><td>{html.escape(stated.text)} ({html.escape(stated.name)}){_reading(parameter, verdict)}"
             f'{others}<td class="number">{least}<td>{alarm}</tr>'
         )
-    beside = "; the others read the whole window beside it" if health.opinions else ""
+    beside = "; the others read the whole window beside it" if report.opinions else ""
     since = "" if verdict.settled else " While the window straddles a change, only the data since then are read."
     return (
         f"<table><tr><th>parameter<th>relative change<th>95 % interval{heads}<th>noticed from<th>alarm</tr>{rows}"
