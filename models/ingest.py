@@ -28,7 +28,7 @@ from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 
-__all__ = ["EARLIER_COURSES", "Course", "Gate", "Reason", "Verdict"]
+__all__ = ["EARLIER_COURSES", "Admission", "Course", "Gate", "Reason"]
 
 EARLIER_COURSES = 64
 """Courses that are remembered, so that repetitions of their blocks are known as such."""
@@ -57,7 +57,7 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Admission:
     """What became of a block.
 
     Attributes
@@ -176,7 +176,7 @@ class Gate:
             return False
         return self.form(block, schema_hash) is None
 
-    def judge(self, block: SampleBlock, schema_hash: str = "") -> Verdict:
+    def judge(self, block: SampleBlock, schema_hash: str = "") -> Admission:
         """Accept or refuse a block.
 
         Parameters
@@ -214,10 +214,10 @@ class Gate:
         self._refused = deque(refused, maxlen=EARLIER_COURSES)
         self._candidate = candidates[-1] if candidates else None
 
-    def _refuse(self, reason: Reason, text: str) -> Verdict:
-        return Verdict(reason, f"{self._name}: {text}")
+    def _refuse(self, reason: Reason, text: str) -> Admission:
+        return Admission(reason, f"{self._name}: {text}")
 
-    def form(self, block: SampleBlock, schema_hash: str = "") -> Verdict | None:  # noqa: PLR0911  # one return per reason
+    def form(self, block: SampleBlock, schema_hash: str = "") -> Admission | None:  # noqa: PLR0911  # one return per reason
         """Refuse a block whose form is wrong, whatever its time."""
         settings, n_samples = self._settings, block.samples.shape[0]
         if schema_hash and schema_hash != self._schema_hash:
@@ -258,12 +258,12 @@ class Gate:
             )
         return None
 
-    def _place(self, block: SampleBlock) -> Verdict:  # noqa: PLR0911  # one return per case of the table
+    def _place(self, block: SampleBlock) -> Admission:  # noqa: PLR0911  # one return per case of the table
         """Accept a well-formed block if its time and sequence make sense."""
         expected = self._expected
         if expected is None:
             self._follow(block)
-            return Verdict()
+            return Admission()
         late_ns = block.start_ns - expected.start_ns
         if any(course.covers(block) for course in self._earlier):
             return self._refuse(
@@ -283,7 +283,7 @@ class Gate:
                 )
             restarted = block.run != expected.run
             self._follow(block)
-            return Verdict(text=f"{self._name}: the publisher restarted") if restarted else Verdict()
+            return Admission(text=f"{self._name}: the publisher restarted") if restarted else Admission()
         late_s = late_ns / 1e9
         if late_ns < 0:
             same_run = block.run == expected.run
@@ -317,9 +317,9 @@ class Gate:
         missed = block.sequence - expected.sequence if block.run == expected.run else 0
         blocks = f" ({missed} blocks)" if missed > 0 else ""
         self._follow(block)
-        return Verdict(text=f"{self._name}: {what}{late_s:.6g} s of data are missing{blocks}", gap_s=late_s)
+        return Admission(text=f"{self._name}: {what}{late_s:.6g} s of data are missing{blocks}", gap_s=late_s)
 
-    def _resynchronise(self, block: SampleBlock, reason: Reason, text: str) -> Verdict:
+    def _resynchronise(self, block: SampleBlock, reason: Reason, text: str) -> Admission:
         """Refuse, unless enough consecutive blocks agree that this is where the stream is now."""
         candidate = self._candidate
         if candidate is not None and candidate.covers(block):
@@ -346,7 +346,7 @@ class Gate:
             text = f"the publisher restarted, {abs(step_s):.6g} s {'earlier' if step_s < 0 else 'later'} in data time"
         else:
             text = f"the stream's clock stepped by {step_s:.6g} s; following it"
-        return Verdict(text=f"{self._name}: {text}", clock_step_s=step_s, new_run=new_run)
+        return Admission(text=f"{self._name}: {text}", clock_step_s=step_s, new_run=new_run)
 
     def _follow(self, block: SampleBlock) -> None:
         expected = self._expected

@@ -20,7 +20,7 @@ from service.api.routes.service import MeasuredView
 from service.delivery.event_feed import EventFeed
 from service.history.audit import AuditLog
 from service.history.machine import MachineStore
-from service.monitor.alarms.operation import Operation
+from service.monitor.alarms.operation import OperatorAction
 from service.monitor.reports import Identity
 
 __all__ = [
@@ -90,7 +90,7 @@ class MachineView(Protocol):
     def detectable(self, change: float | None) -> DetectableChanges:
         """Return what would be found on the machine as it runs now."""
 
-    def operate(self, operation: Operation) -> tuple[AlarmCloudEvent, ...]:
+    def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, and say what happened.
 
         Raises

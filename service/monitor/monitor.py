@@ -28,7 +28,7 @@ from models.diagnosis.verdict.sequential import SequentialSettings, SequentialSt
 from models.diagnosis.verdict.stretch import Stretch, stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
-from models.ingest import Gate, Reason, Verdict
+from models.ingest import Admission, Gate, Reason
 from models.senders import Senders
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
@@ -37,7 +37,7 @@ from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import AlarmEvent, Evidence
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
-from service.monitor.alarms.operation import Operation
+from service.monitor.alarms.operation import OperatorAction
 from service.monitor.evaluation import Evaluation, evaluator_for
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
 
@@ -119,13 +119,13 @@ class MachineMonitor:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
             name = f"{self.machine.site}/{self.machine.name}"
-            return (MonitorReport(self._count(Verdict(Reason.MALFORMED, f"{name}: {error}"))),)
+            return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{name}: {error}"))),)
         misshapen = self._gate.form(block, schema_hash)
         if misshapen is not None:  # before anything is made of its run and number
             return (MonitorReport(self._count(misshapen)),)
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
-            verdict = Verdict(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
+            verdict = Admission(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
             return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
@@ -189,7 +189,7 @@ class MachineMonitor:
         length_s = float(block.samples.shape[0] / block.rate_hz)
         return MonitorReport(verdict, tuple(windows), self._alarms.take(), length_s, fault)
 
-    def _hops(self, block: SampleBlock, verdict: Verdict, dropped: int) -> Iterable[int]:
+    def _hops(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
         """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
         if not verdict.continuous:
             self._window.gap()
@@ -264,7 +264,7 @@ class MachineMonitor:
         """Number the next alarm event will have."""
         return self._alarms.next_sequence
 
-    def operate(self, operation: Operation, time_ns: int) -> tuple[AlarmEvent, ...]:
+    def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Do what an operator asks for, see `AlarmBook.operate`."""
         self._reached_ns = time_ns
         self._alarms.operate(operation, time_ns)
@@ -353,7 +353,7 @@ class MachineMonitor:
             self._end_ns,
         )
 
-    def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Verdict:
+    def _judged(self, block: SampleBlock, schema_hash: str, dropped: int) -> Admission:
         """What the gate says; of the data that another monitor had before this one it knows nothing."""
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
@@ -362,10 +362,10 @@ class MachineMonitor:
             late_s = (block.start_ns - self._end_ns) / 1e9
             if abs(late_s) > ingest.max_jump_s:
                 text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
-                verdict = Verdict(text=text, clock_step_s=late_s, new_run=block.sequence == 0)
+                verdict = Admission(text=text, clock_step_s=late_s, new_run=block.sequence == 0)
             elif late_s > ingest.time_tolerance_s:
                 text = f"{name}: {late_s:.6g} s of data are missing over the restart"
-                verdict = Verdict(text=text, gap_s=late_s)
+                verdict = Admission(text=text, gap_s=late_s)
         if dropped and verdict.gap_s > 0:
             text = (
                 f"{self.machine.site}/{self.machine.name}: {dropped} blocks ({verdict.gap_s:.6g} s of data) were "
@@ -374,7 +374,7 @@ class MachineMonitor:
             verdict = replace(verdict, text=text)
         return self._count(verdict)
 
-    def _count(self, verdict: Verdict) -> Verdict:
+    def _count(self, verdict: Admission) -> Admission:
         self._quality = counted(self._quality, verdict)
         return verdict
 

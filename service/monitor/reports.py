@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TypedDict
 
 from models.commissioning.installed import Installed
-from models.ingest import Verdict
+from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.health import HealthState, Quality, Report
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
@@ -59,7 +59,7 @@ def machine_hash(machine: MachineFile) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def counted(quality: Quality, verdict: Verdict) -> Quality:
+def counted(quality: Quality, verdict: Admission) -> Quality:
     """What has come in, with one more block."""
     if verdict.reason is not None:
         refused = {**quality.refused_blocks}
@@ -80,7 +80,7 @@ class MonitorReport:
 
     Attributes
     ----------
-    verdict : Verdict
+    verdict : Admission
         Accepted or refused, and why.
     windows : tuple of Report
         One per hop that the block completed.
@@ -92,7 +92,7 @@ class MonitorReport:
         A defect of the monitor that came to light with the block; what it cost is said in `windows` and `events`.
     """
 
-    verdict: Verdict
+    verdict: Admission
     windows: tuple[Report, ...] = ()
     events: tuple[AlarmEvent, ...] = ()
     data_s: float = 0.0

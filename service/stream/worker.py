@@ -23,7 +23,7 @@ from service.monitor import conversion
 from service.monitor.alarm_conversion import alarm_log_page, alarm_states
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import NO_ALARMS
-from service.monitor.alarms.operation import NotInTime, Operation
+from service.monitor.alarms.operation import NotInTime, OperatorAction
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
@@ -266,7 +266,7 @@ class MachineWorker:
         """Identity, stream, keys, and the present state."""
         return conversion.machine_description(self.identity, self.machine, self.health().state)
 
-    def operate(self, operation: Operation) -> tuple[AlarmCloudEvent, ...]:
+    def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
         """Do what an operator asks for, on the machine's thread, and say what happened.
 
         Raises

@@ -20,7 +20,7 @@ from models.diagnosis.verdict.sequential import SequentialState, finding
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError
-from models.ingest import Gate, Reason, Verdict
+from models.ingest import Admission, Gate, Reason
 from models.physics.parameters import PARAMETERS
 from models.signals.block import SampleBlock
 from service.monitor.monitor import MachineMonitor
@@ -237,7 +237,7 @@ def test_a_gate_in_the_middle_of_a_stepped_clock_goes_on() -> None:
         assert len(expected) == 1 or verdicts == expected
         expected = verdicts
     assert sum(one.clock_step_s != 0 for one in expected) == 1
-    assert expected[-3] == Verdict()
+    assert expected[-3] == Admission()
     assert [one.reason for one in expected[-2:]] == [Reason.OVERLAP, Reason.OVERLAP]
 
 

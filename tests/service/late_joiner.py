@@ -65,7 +65,7 @@ def follow(connect: str, path: Path) -> None:
 def monitor(listen: str, history: str) -> None:
     """Run the service; its alarm is taken out of service and put back again and again."""
     from rotorwatch.records.operations import OperationKind  # noqa: PLC0415  # followers need none of this
-    from service.monitor.alarms.operation import Operation  # noqa: PLC0415  # followers need none of this
+    from service.monitor.alarms.operation import OperatorAction  # noqa: PLC0415  # followers need none of this
     from service.runtime import running  # noqa: PLC0415
     from service.settings.service import HistorySettings, HttpSettings, LogSettings, MachineEntry, ServiceSettings  # noqa: PLC0415
     from service.terminal.logs import configure_logging  # noqa: PLC0415
@@ -104,7 +104,7 @@ def monitor(listen: str, history: str) -> None:
         threading.Thread(target=wait_for_line, daemon=True).start()
         while not enough.wait(_PAUSE_S):
             kind: OperationKind = "return-to-service" if state() == "out-of-service" else "remove-from-service"
-            worker.operate(Operation(kind, ALARM, "test", "as often as it goes"))
+            worker.operate(OperatorAction(kind, ALARM, "test", "as often as it goes"))
         say(f"idle after {worker.alarms().sequence}")
         sys.stdin.readline()
 

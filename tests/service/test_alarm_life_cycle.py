@@ -14,7 +14,13 @@ from rotorwatch.records.alarms import AlarmState, EventKind
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.life_cycle import OWED, REFUSED, STAYS, TABLE, Cell, Happening, follow
-from service.monitor.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
+from service.monitor.alarms.operation import (
+    HAPPENINGS,
+    OperationConflict,
+    OperationRefused,
+    OperatorAction,
+    UnknownAlarm,
+)
 
 ROOT = Path(__file__).parents[2]
 S = 10**9
@@ -100,8 +106,8 @@ def state_of(book: AlarmBook, name: str = "k_by") -> AlarmState:
     return next(alarm.state for alarm in book.alarms if alarm.name == name)
 
 
-def act(kind: str, name: str = "k_by", **more: object) -> Operation:
-    return Operation(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
+def act(kind: str, name: str = "k_by", **more: object) -> OperatorAction:
+    return OperatorAction(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
 
 
 def test_acknowledged_then_cleared_is_normal_and_cleared_then_acknowledged_too() -> None:

@@ -26,7 +26,7 @@ from service.history.retention import Retention
 from service.history.store import Store
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook
-from service.monitor.alarms.operation import Operation
+from service.monitor.alarms.operation import OperatorAction
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, identity_of
 from service.settings.service import QueueSettings
@@ -59,8 +59,8 @@ def block(number: int, start_ns: int = START_NS, run: int = 1, sequence: int | N
     return SampleBlock(start_ns + number * BLOCK_NS, place, run, lab.rate_hz, samples.astype(np.float32))
 
 
-def order(kind: str, name: str, **more: object) -> Operation:
-    return Operation(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
+def order(kind: str, name: str, **more: object) -> OperatorAction:
+    return OperatorAction(kind, name, "anna", **{"reason": "told so", **more})  # type: ignore[arg-type]
 
 
 def named(events: tuple[AlarmEvent, ...]) -> list[tuple[str, str]]:

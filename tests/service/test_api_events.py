@@ -20,7 +20,7 @@ from service.access.scopes import Scope
 from service.delivery import event_feed
 from service.delivery.event_feed import CursorError, cursor_text, parsed_cursor
 from service.history.errors import StoreError
-from service.monitor.alarms.operation import Operation
+from service.monitor.alarms.operation import OperatorAction
 from service.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import MachineEntry
@@ -52,7 +52,7 @@ def happen(worker: MachineWorker, count: int = 1) -> None:
     """Bring about alarm events."""
     for _ in range(count):
         kind: Any = "unshelve" if worker.history.last_sequence() % 2 == 0 else "shelve"
-        worker.operate(Operation(kind, "k_by", actor="anna", reason="x"))
+        worker.operate(OperatorAction(kind, "k_by", actor="anna", reason="x"))
 
 
 @dataclass(slots=True)

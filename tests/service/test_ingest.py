@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.ingest import Gate, Reason, Verdict
+from models.ingest import Admission, Gate, Reason
 from models.machine import load_machine
 from models.signals.block import SampleBlock
 
@@ -22,19 +22,19 @@ def block(number: int, *, sequence: int | None = None, run: int = 1, shift_ns: i
     return SampleBlock(start_ns, number if sequence is None else sequence, run, 2000.0, samples)
 
 
-def judge(*blocks: SampleBlock) -> list[Verdict]:
+def judge(*blocks: SampleBlock) -> list[Admission]:
     gate = Gate(MACHINE)
     return [gate.judge(each) for each in blocks]
 
 
 def test_contiguous_blocks_are_accepted_silently() -> None:
     verdicts = judge(*(block(number) for number in range(5)))
-    assert verdicts == [Verdict()] * 5
+    assert verdicts == [Admission()] * 5
     assert all(verdict.continuous for verdict in verdicts)
 
 
 def test_jitter_within_the_tolerance_is_no_gap() -> None:
-    assert judge(block(0), block(1, shift_ns=150_000), block(2))[1:] == [Verdict(), Verdict()]
+    assert judge(block(0), block(1, shift_ns=150_000), block(2))[1:] == [Admission(), Admission()]
 
 
 def not_finite(value: float) -> SampleBlock:
@@ -66,7 +66,7 @@ def test_a_bad_block_is_refused_with_a_reason_and_the_next_good_one_accepted(
     assert refused.reason is reason
     assert refused.text.startswith("demo/lab: ")
     assert re.search(says, refused.text)
-    assert after == Verdict()
+    assert after == Admission()
 
 
 def test_another_channel_descriptor_is_refused() -> None:
@@ -146,4 +146,4 @@ def test_repeated_history_of_the_same_run_never_moves_the_clock() -> None:
     blocks = [block(n) for n in range(30)]
     verdicts = judge(*blocks, *blocks, block(30))
     assert all(verdict.reason is Reason.OVERLAP for verdict in verdicts[30:60])
-    assert verdicts[60] == Verdict()
+    assert verdicts[60] == Admission()

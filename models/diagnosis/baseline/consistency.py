@@ -12,7 +12,7 @@ from models.diagnosis.baseline.rows import Row
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["Agreement", "LeftOut", "allowance_of", "left_out"]
+__all__ = ["HeldOutReading", "LeftOut", "allowance_of", "left_out"]
 
 _FOLDS = 6
 _FEWEST_OTHERS = 2
@@ -20,7 +20,7 @@ _BEYOND = 2.0  # standard deviations of a mean beyond which it is taken for more
 
 
 @dataclass(frozen=True, slots=True)
-class Agreement:
+class HeldOutReading:
     """One parameter of one healthy window, read against the relation that the other conditions teach.
 
     Attributes
@@ -52,7 +52,7 @@ class LeftOut:
         Number of the window, from 0.
     condition : str
         What it belongs to.
-    agreements : tuple of Agreement
+    agreements : tuple of HeldOutReading
         One for each of the row's own parameters.
     misfit : float
         χ² of what is left per degree of freedom.
@@ -62,7 +62,7 @@ class LeftOut:
     row: str
     window: int
     condition: str
-    agreements: tuple[Agreement, ...]
+    agreements: tuple[HeldOutReading, ...]
     misfit: float
     degrees_of_freedom: int
 
@@ -120,7 +120,7 @@ def _left_out(row: Row, number: int, condition: str, change: RowChange, uncertai
         window=number,
         condition=condition,
         agreements=tuple(
-            Agreement(own.parameter, float(value), float(error))
+            HeldOutReading(own.parameter, float(value), float(error))
             for own, value, error in zip(row.own, change.change, errors, strict=True)
         ),
         misfit=change.chi2 / change.degrees_of_freedom,

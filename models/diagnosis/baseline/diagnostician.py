@@ -23,8 +23,8 @@ from models.diagnosis.baseline.rows import ROWS, Row, parameters_of
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
     ForceRow,
-    Rotation,
     SynchronousState,
+    SynchronousVectors,
     relative_force,
     rotation_of,
     slopes,
@@ -246,7 +246,9 @@ class BaselineDiagnostician:
             )
         return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, float(along @ shared @ along))
 
-    def _rotations(self, coordinates: tuple[str, ...], window: WindowStatistics) -> tuple[Rotation, Rotation]:
+    def _rotations(
+        self, coordinates: tuple[str, ...], window: WindowStatistics
+    ) -> tuple[SynchronousVectors, SynchronousVectors]:
         now = rotation_of(window, coordinates)
         if not self._baseline.rotations:
             raise EstimationError("the baseline has no phase reference and no speed found in the vibration")

@@ -12,7 +12,7 @@ from models.diagnosis.baseline.kinematics import not_measured, state_of
 from models.diagnosis.baseline.lag_moments import LagMoments, RowWindow, row_window, shared_covariance
 from models.diagnosis.baseline.relation import Contribution, Relation, lags_of, learn_row
 from models.diagnosis.baseline.rows import ROWS, Row
-from models.diagnosis.baseline.unbalance import Rotation, rotation_of, rotations_by_speed
+from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
@@ -35,7 +35,7 @@ class Baseline:
         Why there is no relation; empty where there is one.
     covariance : ndarray, shape (n, n)
         Of the coefficients of all rows one after the other; zero where there is no relation.
-    rotations : tuple of Rotation
+    rotations : tuple of SynchronousVectors
         Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
     duration_s : float
         Healthy data.
@@ -46,7 +46,7 @@ class Baseline:
     relations: tuple[Relation | None, ...]
     reasons: tuple[str, ...]
     covariance: FloatArray
-    rotations: tuple[Rotation, ...]
+    rotations: tuple[SynchronousVectors, ...]
     duration_s: float
     consistency: tuple[LeftOut, ...] = ()
 

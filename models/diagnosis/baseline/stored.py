@@ -9,11 +9,11 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from models.diagnosis.baseline.consistency import Agreement, LeftOut
+from models.diagnosis.baseline.consistency import HeldOutReading, LeftOut
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import Baseline
 from models.diagnosis.baseline.relation import Relation
-from models.diagnosis.baseline.unbalance import Rotation
+from models.diagnosis.baseline.unbalance import SynchronousVectors
 from models.signals.block import FloatArray
 
 __all__ = ["BaselineRecord", "RelationRecord", "RotationRecord"]
@@ -155,7 +155,9 @@ class BaselineRecord(BaseModel):
             reasons=self.reasons,
             covariance=_array(self.covariance),
             rotations=tuple(
-                Rotation(one.coordinates, _array(one.vectors), _array(one.covariance), one.speed_rad_s, one.absolute)
+                SynchronousVectors(
+                    one.coordinates, _array(one.vectors), _array(one.covariance), one.speed_rad_s, one.absolute
+                )
                 for one in self.rotations
             ),
             duration_s=self.duration_s,
@@ -165,7 +167,7 @@ class BaselineRecord(BaseModel):
                     window=one.window,
                     condition=one.condition,
                     agreements=tuple(
-                        Agreement(each.parameter, each.change, each.standard_error) for each in one.agreements
+                        HeldOutReading(each.parameter, each.change, each.standard_error) for each in one.agreements
                     ),
                     misfit=one.misfit,
                     degrees_of_freedom=one.degrees_of_freedom,
@@ -208,7 +210,7 @@ def _restored(one: RelationRecord) -> Relation:
     )
 
 
-def _rotation(one: Rotation) -> RotationRecord:
+def _rotation(one: SynchronousVectors) -> RotationRecord:
     return RotationRecord(
         coordinates=one.coordinates,
         vectors=tuple(one.vectors.tolist()),

@@ -20,8 +20,8 @@ from models.signals.block import FloatArray
 __all__ = [
     "SPEED_TOLERANCE",
     "ForceRow",
-    "Rotation",
     "SynchronousState",
+    "SynchronousVectors",
     "relative_force",
     "rotation_of",
     "rotations_by_speed",
@@ -35,7 +35,7 @@ _NEIGHBOURS = (2, 8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rotation:
+class SynchronousVectors:
     """Synchronous vectors of one window, or of a baseline at one speed.
 
     Attributes
@@ -57,13 +57,13 @@ class Rotation:
     speed_rad_s: float
     absolute: bool = True
 
-    def of(self, coordinates: tuple[str, ...]) -> "Rotation":
+    def of(self, coordinates: tuple[str, ...]) -> "SynchronousVectors":
         """The same of some of the coordinates."""
         n = len(self.coordinates)
         keep = [self.coordinates.index(name) for name in coordinates]
         keep = [*keep, *(n + number for number in keep)]
         covariance = self.covariance[np.ix_(keep, keep)]
-        return Rotation(coordinates, self.vectors[keep], covariance, self.speed_rad_s, self.absolute)
+        return SynchronousVectors(coordinates, self.vectors[keep], covariance, self.speed_rad_s, self.absolute)
 
     @property
     def largest(self) -> str:
@@ -71,14 +71,14 @@ class Rotation:
         n = len(self.coordinates)
         return self.coordinates[int(np.argmax(np.hypot(self.vectors[:n], self.vectors[n:])))]
 
-    def turned(self, coordinate: str) -> "Rotation":
+    def turned(self, coordinate: str) -> "SynchronousVectors":
         """The same from the angle at which a coordinate is largest."""
         n, at = len(self.coordinates), self.coordinates.index(coordinate)
         angle = np.arctan2(self.vectors[n + at], self.vectors[at])
         c, s = np.cos(angle) * np.eye(n), np.sin(angle) * np.eye(n)
         turn = np.block([[c, s], [-s, c]])
         covariance = turn @ self.covariance @ turn.T
-        return Rotation(self.coordinates, turn @ self.vectors, covariance, self.speed_rad_s, absolute=False)
+        return SynchronousVectors(self.coordinates, turn @ self.vectors, covariance, self.speed_rad_s, absolute=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +120,7 @@ class SynchronousState:
     healthy: FloatArray
 
 
-def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Rotation | None:
+def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> SynchronousVectors | None:
     """Synchronous vectors of a window with their covariance; None without a coordinate or a steady speed.
 
     Where the speed was estimated from the vibration, angles to the shaft are not known.
@@ -149,7 +149,7 @@ def rotation_of(window: WindowStatistics, coordinates: tuple[str, ...]) -> Rotat
     # q = a - jb with the phase of cos θ: the density of q is that of the transform
     covariance = np.block([[density.real, -density.imag], [density.imag, density.real]])
     absolute = window.synchronous is not None
-    return Rotation(coordinates, np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s, absolute)
+    return SynchronousVectors(coordinates, np.concatenate([q.real, q.imag]), covariance, window.speed_rad_s, absolute)
 
 
 def _synchronous(window: WindowStatistics) -> ComplexArray | None:
@@ -160,20 +160,20 @@ def _synchronous(window: WindowStatistics) -> ComplexArray | None:
     return np.asarray(seen.mean(axis=0), dtype=np.complex128) if seen.size else None
 
 
-def rotations_by_speed(found: Sequence[Rotation]) -> tuple[Rotation, ...]:
+def rotations_by_speed(found: Sequence[SynchronousVectors]) -> tuple[SynchronousVectors, ...]:
     """One rotation for each distinct speed, slowest first: the mean of those within 3 % of the slowest among them."""
     if not all(one.absolute for one in found):
         reference = found[0].largest
         found = [one.turned(reference) for one in found]
     left = sorted(found, key=lambda one: one.speed_rad_s)
-    groups: list[list[Rotation]] = []
+    groups: list[list[SynchronousVectors]] = []
     for one in left:
         if groups and one.speed_rad_s / groups[-1][0].speed_rad_s - 1 <= SPEED_TOLERANCE:
             groups[-1].append(one)
         else:
             groups.append([one])
     return tuple(
-        Rotation(
+        SynchronousVectors(
             coordinates=near[0].coordinates,
             vectors=np.mean([one.vectors for one in near], axis=0),
             covariance=np.sum([one.covariance for one in near], axis=0) / len(near) ** 2,
@@ -184,7 +184,9 @@ def rotations_by_speed(found: Sequence[Rotation]) -> tuple[Rotation, ...]:
     )
 
 
-def relative_force(rows: Sequence[ForceRow], state: SynchronousState, now: Rotation, healthy: Rotation) -> FloatArray:
+def relative_force(
+    rows: Sequence[ForceRow], state: SynchronousState, now: SynchronousVectors, healthy: SynchronousVectors
+) -> FloatArray:
     """Unbalance force over the healthy one, less one: real parts row by row, then imaginary parts."""
     speeds = now.speed_rad_s, healthy.speed_rad_s
     forces = _forces(rows, state.coefficients, state.change, now.coordinates, state.now, speeds[0])
@@ -221,7 +223,7 @@ def _forces(
 
 
 def slopes(
-    rows: Sequence[ForceRow], state: SynchronousState, now: Rotation, healthy: Rotation
+    rows: Sequence[ForceRow], state: SynchronousState, now: SynchronousVectors, healthy: SynchronousVectors
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Derivatives of `relative_force` to coefficients, change, now and healthy, by central differences."""
     parts = [state.coefficients, state.change, state.now, state.healthy]

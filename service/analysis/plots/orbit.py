@@ -7,7 +7,7 @@ import numpy as np
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from service.analysis.plots.stretches import RecordedStream, Stretch
+from service.analysis.plots.stretches import Excerpt, RecordedStream
 from service.analysis.snapshots.choice import orbit_pairs
 from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
 from service.analysis.snapshots.revolutions import pulses
@@ -150,12 +150,12 @@ def read_orbits(stream: RecordedStream, revolutions: int) -> Orbits:
     return orbits_of(found[-1], pairs, revolutions)
 
 
-def orbits_of(stretch: Stretch, pairs: list[tuple[Channel, Channel]], revolutions: int) -> Orbits:
+def orbits_of(stretch: Excerpt, pairs: list[tuple[Channel, Channel]], revolutions: int) -> Orbits:
     """Orbits of the latest revolutions of a stretch.
 
     Parameters
     ----------
-    stretch : Stretch
+    stretch : Excerpt
         Its columns are the channels of `pairs`, one pair after the other.
     pairs : list of (Channel, Channel)
         y and z of each place.

@@ -10,7 +10,7 @@ from scipy.signal import welch
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
-from service.analysis.plots.stretches import RecordedStream, Stretch, begins_again
+from service.analysis.plots.stretches import Excerpt, RecordedStream, begins_again
 
 __all__ = [
     "Scaling",
@@ -244,12 +244,12 @@ def read_waterfall(
     )
 
 
-def summed_power(stretch: Stretch, segment: int, scaling: Scaling) -> tuple[FloatArray, int]:
+def summed_power(stretch: Excerpt, segment: int, scaling: Scaling) -> tuple[FloatArray, int]:
     """Power of Hann-windowed segments that overlap by half, each about its mean, summed.
 
     Parameters
     ----------
-    stretch : Stretch
+    stretch : Excerpt
         At least one segment long.
     segment : int
         Samples of a segment.

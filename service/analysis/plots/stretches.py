@@ -13,14 +13,14 @@ from models.signals.keys import MachineKeys
 from models.signals.wire import decode_block
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["RecordedStream", "Stretch", "begins_again"]
+__all__ = ["Excerpt", "RecordedStream", "begins_again"]
 
 _TOLERANCE_S = 2e-4
 _RATE_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class Excerpt:
     """Consecutive samples of some channels, in the units of the channels.
 
     Attributes
@@ -123,7 +123,7 @@ class RecordedStream:
 
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
-    ) -> Iterator[Stretch]:
+    ) -> Iterator[Excerpt]:
         """Samples of some channels, cut at gaps and after `longest_s`; what is left before a gap is shorter.
 
         Blocks that cannot be decoded, have other channels or a sample that is not finite are left out, which is a gap.
@@ -159,22 +159,22 @@ class RecordedStream:
         if count:
             yield self._stretch(start_ns, np.concatenate(pending), angle is not None)
 
-    def latest(self, channels: Sequence[Channel], length_s: float) -> list[Stretch]:
+    def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
         """The newest `length_s` of data before `to_ns`, in pieces if there are gaps."""
         span = self._source.span(self._keys)
         end_ns = self.to_ns if self.to_ns <= span.end_ns else span.newest_ns
-        found: list[Stretch] = []
+        found: list[Excerpt] = []
         for stretch in self.stretches(channels, from_ns=max(self.from_ns, end_ns - round(length_s * 1e9))):
             if found and begins_again(found[-1].end_ns, stretch.start_ns):
                 found.clear()
             found.append(stretch)
         return found
 
-    def _stretch(self, start_ns: int, rows: FloatArray, with_angle: bool) -> Stretch:
+    def _stretch(self, start_ns: int, rows: FloatArray, with_angle: bool) -> Excerpt:
         rate_hz = self.descriptor.rate_hz
         if with_angle:
-            return Stretch(start_ns, rate_hz, rows[:, :-1], rows[:, -1])
-        return Stretch(start_ns, rate_hz, rows, None)
+            return Excerpt(start_ns, rate_hz, rows[:, :-1], rows[:, -1])
+        return Excerpt(start_ns, rate_hz, rows, None)
 
     def _blocks(self, from_ns: int | None, used: list[int]) -> Iterator[tuple[SampleBlock, bool]]:
         """Usable blocks, and whether each continues the one before it."""

@@ -17,7 +17,13 @@ from service.access.scopes import Caller
 from service.api.views import PLACE, AlarmName, MachineName, MachineView, ServiceView, SiteName, found_machine
 from service.monitor.alarm_conversion import alarm_entries
 from service.monitor.alarms.alarm import Alarm as AlarmRecord
-from service.monitor.alarms.operation import NotInTime, Operation, OperationConflict, OperationRefused, UnknownAlarm
+from service.monitor.alarms.operation import (
+    NotInTime,
+    OperationConflict,
+    OperationRefused,
+    OperatorAction,
+    UnknownAlarm,
+)
 
 __all__ = ["add_operation_routes"]
 
@@ -111,7 +117,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
             raise HTTPException(
                 428, "say how you saw the alarm: header If-Match with its ETag, or expected_state in the body"
             )
-        operation = Operation(
+        operation = OperatorAction(
             kind=kind,
             alarm=name,
             actor=caller.name,

@@ -20,7 +20,13 @@ from rotorwatch.records.alarms import AlarmState, EventKind, Severity
 from rotorwatch.records.windows import Verdict
 from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence, Shelf
 from service.monitor.alarms.life_cycle import Happening, follow, owed_after
-from service.monitor.alarms.operation import HAPPENINGS, Operation, OperationConflict, OperationRefused, UnknownAlarm
+from service.monitor.alarms.operation import (
+    HAPPENINGS,
+    OperationConflict,
+    OperationRefused,
+    OperatorAction,
+    UnknownAlarm,
+)
 
 __all__ = ["NO_ALARMS", "AlarmBook"]
 
@@ -260,12 +266,12 @@ class AlarmBook:
                 shelf=None if shelf is None else replace(shelf, until_ns=shelf.until_ns + step_ns),
             )
 
-    def operate(self, operation: Operation, time_ns: int) -> tuple[AlarmEvent, ...]:
+    def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Do what an operator asks for.
 
         Parameters
         ----------
-        operation : Operation
+        operation : OperatorAction
         time_ns : int
             Data time that has been reached.
 
@@ -349,7 +355,7 @@ class AlarmBook:
             return speed_rpm < rule.below_rpm
         return rule.above_rpm is not None and speed_rpm > rule.above_rpm
 
-    def _must_be_as_seen(self, alarm: Alarm, operation: Operation) -> None:
+    def _must_be_as_seen(self, alarm: Alarm, operation: OperatorAction) -> None:
         state, version = operation.expected_state, operation.expected_version
         if (state is not None and state != alarm.state) or (version is not None and version != alarm.version):
             seen = f"state {state}" if state is not None else f"version {version}"
@@ -358,7 +364,7 @@ class AlarmBook:
                 "look again"
             )
 
-    def _shelf(self, operation: Operation, time_ns: int) -> Shelf:
+    def _shelf(self, operation: OperatorAction, time_ns: int) -> Shelf:
         longest_s = self._settings.longest_shelf_s
         duration_s = longest_s if operation.duration_s is None else operation.duration_s
         if not 0 < duration_s <= longest_s:

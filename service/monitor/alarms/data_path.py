@@ -3,7 +3,7 @@
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
 from models.diagnosis.sensors.finding import FAULT_KINDS
 from models.diagnosis.window import WindowStatistics
-from models.ingest import Verdict
+from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.alarm import Evidence
@@ -29,12 +29,12 @@ class DataPathAlarms:
         self._silence_ns = round(self._silence_s * 1e9)
         self._unseen_blocks, self._unseen_s = 0, 0.0
 
-    def accepted(self, verdict: Verdict, start_ns: int, dropped: int) -> None:
+    def accepted(self, verdict: Admission, start_ns: int, dropped: int) -> None:
         """A block was accepted.
 
         Parameters
         ----------
-        verdict : Verdict
+        verdict : Admission
             Of the gate.
         start_ns : int
             Its beginning.

@@ -10,9 +10,9 @@ from service.monitor.alarms.life_cycle import Happening
 __all__ = [
     "HAPPENINGS",
     "NotInTime",
-    "Operation",
     "OperationConflict",
     "OperationRefused",
+    "OperatorAction",
     "UnknownAlarm",
 ]
 
@@ -44,7 +44,7 @@ class NotInTime(RotorwatchError):  # noqa: N818
 
 
 @dataclass(frozen=True, slots=True)
-class Operation:
+class OperatorAction:
     """Something an operator wants done to an alarm.
 
     Attributes
