@@ -36,7 +36,7 @@ from service.api.server import HttpError, HttpServer
 from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.metrics.requests import RequestCounts, RequestMeter
-from service.delivery.webhooks.desk import WebhookDesk
+from service.delivery.webhooks.webhooks import Webhooks
 from service.history.audit import AuditLog
 from service.history.errors import StoreError
 from service.history.store import Store
@@ -78,7 +78,7 @@ class Runtime:
         self._pulses: list[Pulse] = []
         self._history_open = False
         # What is heard in a namespace is a replay, of which nobody must be told.
-        self.webhooks = WebhookDesk(() if settings.link.namespace else settings.webhooks)
+        self.webhooks = Webhooks(() if settings.link.namespace else settings.webhooks)
         self._requests = RequestCounts()
         self.metrics = Metrics(self, self._requests)
         self.store = Store(settings.history.database, settings.history.retention)

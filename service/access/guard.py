@@ -30,9 +30,9 @@ from starlette.exceptions import HTTPException
 
 from models.errors import RotorwatchError
 from service.access.audit import AuditLog, AuditTrail, Visit
+from service.access.credentials import address_of, key_of, network_of, presented_text, unauthenticated
 from service.access.middleware import VISIT, AccessMiddleware
 from service.access.origin import SAFE_METHODS, check_body_type, check_origin
-from service.access.presented import address_of, key_of, network_of, presented_text, unauthenticated
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import Requirement, requires
 from service.access.routes import PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes

@@ -13,8 +13,8 @@ from starlette.types import ASGIApp, Message, Receive, Send
 from starlette.types import Scope as AsgiScope
 
 from service.access.audit import AuditNote, AuditTrail, Visit
+from service.access.credentials import address_of, challenges, network_of
 from service.access.origin import SAFE_METHODS
-from service.access.presented import address_of, challenges, network_of
 from service.access.problems import problem_answer
 from service.access.requirement import CALLER
 from service.access.scopes import Caller

@@ -8,7 +8,7 @@ from fastapi.security.base import SecurityBase
 from starlette.exceptions import HTTPException
 
 from service.access.audit import AuditNote
-from service.access.presented import BEARER, NEEDED
+from service.access.credentials import BEARER, NEEDED
 from service.access.scopes import Caller, Scope
 
 __all__ = ["CALLER", "Requirement", "caller_of", "requires"]

@@ -28,7 +28,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
 from rotorwatch.records.monitor import Problem
-from service.access.presented import network_of
+from service.access.credentials import network_of
 from service.settings.service import HttpSettings
 from service.terminal.logs import Limiter, logger
 

@@ -12,8 +12,8 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from rotorwatch.records.monitor import Readiness
-from service.analysis.snapshots.desk import SnapshotDesk
-from service.analysis.snapshots.statement import LatestData
+from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import MachineSnapshots
 from service.api.routes.recordings import RecordingIndex
 from service.api.routes.replays import ReplayDesk
 from service.api.routes.service import MeasuredView
@@ -71,7 +71,7 @@ class MachineView(Protocol):
         """What is kept of the machine."""
 
     @property
-    def snapshots(self) -> SnapshotDesk:
+    def snapshots(self) -> MachineSnapshots:
         """Makes snapshots of what the monitor holds."""
 
     @property

@@ -185,8 +185,8 @@ class _Offline:
 
 def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") -> None:
     from rotorwatch.records.replays import ReplayLine  # noqa: PLC0415
-    from service.recordings.replay.choice import choose_machine  # noqa: PLC0415  # keeps --help quick
     from service.recordings.replay.console import show  # noqa: PLC0415
+    from service.recordings.replay.machine import choose_machine  # noqa: PLC0415  # keeps --help quick
     from service.recordings.replay.offline import OfflineReplay  # noqa: PLC0415
 
     as_json = request.progress == "json"

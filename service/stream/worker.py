@@ -15,8 +15,8 @@ from models.commissioning.installed import Installed
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
-from service.analysis.snapshots.desk import SnapshotDesk
-from service.analysis.snapshots.statement import LatestData
+from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion
@@ -106,7 +106,7 @@ class MachineWorker:
         )
         self.history = history
         self.identity = identity_of(installed)
-        self.snapshots = SnapshotDesk(installed, self.identity)
+        self.snapshots = MachineSnapshots(installed, self.identity)
         self.latest = LatestData()
         self.errors = 0
         self.last_error = ""

@@ -12,8 +12,8 @@ from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot
-from service.analysis.snapshots.desk import SnapshotDesk
-from service.analysis.snapshots.statement import LatestData
+from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import MachineSnapshots
 from service.monitor.reports import Identity
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, stream
@@ -25,9 +25,9 @@ __all__ = [
     "SEED",
     "S",
     "by_plane",
-    "desk_of",
     "latest",
     "numbers",
+    "snapshots_of",
     "synthetic",
     "window_of",
 ]
@@ -39,8 +39,8 @@ K_BY = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
 NAMES = [channel.name for channel in LAB.sensors]
 
 
-def desk_of(machine: MachineFile) -> SnapshotDesk:
-    return SnapshotDesk(
+def snapshots_of(machine: MachineFile) -> MachineSnapshots:
+    return MachineSnapshots(
         Installed(machine), Identity(site="demo", machine="lab", bundle=None, machine_hash="9a0c41d27be8")
     )
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.errors import MachineFileError
-from service.access.presented import network_of
+from service.access.credentials import network_of
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.scopes import ANONYMOUS, Scope
 from service.access.tokens import masked, new_token, parse_token, token_is_valid

@@ -11,8 +11,8 @@ from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, read_recording
 from models.signals.wire import decode_block
 from rotorwatch.records.replays import ReplayLine, ReplayProgress
+from service.analysis.plots.excerpts import RecordedStream
 from service.analysis.plots.spectrum import read_spectrum, read_waterfall
-from service.analysis.plots.stretches import RecordedStream
 from service.commands.replay import summary_lines
 from service.recordings.replay.control import Control
 from service.recordings.replay.data_time import data_start_ns

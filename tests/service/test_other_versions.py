@@ -17,7 +17,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
-from service.analysis.plots.stretches import RecordedStream
+from service.analysis.plots.excerpts import RecordedStream
 from service.analysis.plots.trend import read_trend
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.monitor.descriptor import descriptor_mismatch

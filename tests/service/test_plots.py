@@ -17,10 +17,10 @@ from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Report
 from service.analysis.plots.correlation import correlations_of, latest_window
+from service.analysis.plots.excerpts import RecordedStream
 from service.analysis.plots.orbit import read_orbits
 from service.analysis.plots.spectrum import read_spectrum, read_waterfall, shown_as
 from service.analysis.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
-from service.analysis.plots.stretches import RecordedStream
 from service.analysis.plots.style import Look
 from service.analysis.plots.trend import read_trend, trend_machine, trend_of
 from service.recordings.replay.offline import OfflineReplay

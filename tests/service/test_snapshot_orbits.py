@@ -8,11 +8,11 @@ import pytest
 from models.machine import Machine
 from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import SampleBlock
-from service.analysis.snapshots.statement import LatestData
+from service.analysis.snapshots.heading import LatestData
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
-from tests.service.snapshotting import SECONDS, SEED, desk_of, latest, numbers, synthetic, window_of
+from tests.service.snapshotting import SECONDS, SEED, latest, numbers, snapshots_of, synthetic, window_of
 
 
 @cache
@@ -25,7 +25,7 @@ def quiet(machine: Machine = LAB) -> tuple[SampleBlock, ...]:
 
 def test_the_orbit_of_a_known_unbalance() -> None:
     data = LatestData(window_of(LAB, quiet()), 1.0, (), "not asked", quiet()[-20:])
-    snapshot = desk_of(LAB).orbits(data, 8)
+    snapshot = snapshots_of(LAB).orbits(data, 8)
     assert (snapshot.reason, snapshot.path_reason, snapshot.revolutions) == ("", "", 8)
     assert snapshot.speed_source == "phase reference"
     W, rotor = LAB.operation.speed_rad_s, LAB.rotor
@@ -69,7 +69,7 @@ def test_errors_of_an_orbit_are_the_scatter_of_many() -> None:
     data = latest()
     assert data.window is not None
     assert data.window.hop_synchronous is not None
-    snapshot = desk_of(LAB).orbits(data)
+    snapshot = snapshots_of(LAB).orbits(data)
     for orbit in snapshot.orbits:
         assert orbit.nominal is not None
         assert orbit.estimated is not None
@@ -100,7 +100,7 @@ def test_a_shaft_that_turns_backwards() -> None:
     channels["z1"] = channels["z1"].model_copy(update={"unit": "mil"})
     machine = NOTHING.model_copy(update={"sensors": tuple(channels.values())})
     data = LatestData(window_of(machine, stream_), 1.0, (), "", tuple(stream_[-10:]))
-    snapshot = desk_of(machine).orbits(data, 3)
+    snapshot = snapshots_of(machine).orbits(data, 3)
     assert snapshot.speed_rad_s == pytest.approx(-2 * np.pi * 25, rel=1e-3)
     orbit = snapshot.orbits[0]
     assert orbit.ellipse is not None
@@ -117,7 +117,7 @@ def test_a_shaft_that_turns_backwards() -> None:
 def test_without_a_phase_reference_size_and_sense_remain() -> None:
     machine = Machine.model_validate(LAB.model_dump() | {"sensors": [c for c in LAB.sensors if c.name != "theta"]})
     data = LatestData(window_of(machine, stream(SECONDS, SEED)), 1.0, (), "", stream(SECONDS, SEED)[-20:])
-    blind, seeing = desk_of(machine).orbits(data, 4), desk_of(LAB).orbits(latest())
+    blind, seeing = snapshots_of(machine).orbits(data, 4), snapshots_of(LAB).orbits(latest())
     assert blind.speed_source == "estimated"
     assert blind.speed_rad_s == pytest.approx(LAB.operation.speed_rad_s, rel=1e-3)
     for one, other in zip(blind.orbits, seeing.orbits, strict=True):
@@ -132,5 +132,5 @@ def test_without_a_phase_reference_size_and_sense_remain() -> None:
     assert blind.revolutions == 4
     assert blind.pulses_s == ()
     assert blind.path_reason.startswith("the shaft angle is not measured")
-    snapshot = desk_of(machine).correlations(data)
+    snapshot = snapshots_of(machine).correlations(data)
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)

@@ -17,12 +17,12 @@ from models.signals.block import SampleBlock
 from models.signals.channels import state_name
 from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
-from service.analysis.snapshots import desk as desk_module
-from service.analysis.snapshots.choice import SnapshotError
+from service.analysis.snapshots import machine as machine_module
+from service.analysis.snapshots.channels import SnapshotError
+from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.path import MOST_REVOLUTIONS
 from service.analysis.snapshots.prediction import Prediction, predict
 from service.analysis.snapshots.revolutions import NewestBlocks
-from service.analysis.snapshots.statement import LatestData
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (
@@ -31,9 +31,9 @@ from tests.service.snapshotting import (
     SECONDS,
     SEED,
     by_plane,
-    desk_of,
     latest,
     numbers,
+    snapshots_of,
     synthetic,
     window_of,
 )
@@ -41,7 +41,7 @@ from tests.service.snapshotting import (
 
 @pytest.mark.parametrize("lagged", [True, False])
 def test_theory_is_within_the_errors_of_a_healthy_machine(lagged: bool) -> None:
-    snapshot = desk_of(LAB).correlations(latest(lagged=lagged))
+    snapshot = snapshots_of(LAB).correlations(latest(lagged=lagged))
     assert (snapshot.reason, snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", "", "")
     assert snapshot.method == ("samples" if lagged else "spectrum")
     assert len(snapshot.lags_s) == 126
@@ -61,7 +61,7 @@ def test_theory_is_within_the_errors_of_a_healthy_machine(lagged: bool) -> None:
 
 @pytest.mark.parametrize("lagged", [True, False])
 def test_a_fault_parts_the_nominal_prediction_from_what_is_measured(lagged: bool) -> None:
-    snapshot = desk_of(LAB).correlations(latest(K_BY, lagged=lagged))
+    snapshot = snapshots_of(LAB).correlations(latest(K_BY, lagged=lagged))
     changes = {change.name: change.relative_change for change in snapshot.theory.changes}
     assert changes["k_by"] == pytest.approx(-0.3, abs=0.02)
     for pair in by_plane(snapshot, "y"):
@@ -86,7 +86,7 @@ def test_predicted_correlations_are_those_of_the_ljapunov_equation(faults: tuple
     covariance = stationary_covariance(A, expanded_B(sources))
     names = [channel.name for channel in LAB.sensors if channel.name != "theta"]
     first, second = (list(column) for column in zip(*[(one, other) for one in names for other in names], strict=True))
-    snapshot = desk_of(LAB).correlations(data, first, second, units="SI")
+    snapshot = snapshots_of(LAB).correlations(data, first, second, units="SI")
     row = {channel.name: STATE_INDEX[state_name(channel)] for channel in LAB.sensors if channel.name != "theta"}
     exact = np.stack([correlation(A, covariance, lag_s) for lag_s in snapshot.lags_s])
     rms = np.sqrt(np.diag(covariance))
@@ -99,8 +99,8 @@ def test_predicted_correlations_are_those_of_the_ljapunov_equation(faults: tuple
 
 def test_correlations_from_spectra_lack_what_lies_outside_the_band() -> None:
     """At lag zero by as much as is stated, at no lag by more than a few per cent; their errors are of the same size."""
-    desk = desk_of(LAB)
-    whole, band = (desk.correlations(latest(lagged=lagged)) for lagged in (True, False))
+    made = snapshots_of(LAB)
+    whole, band = (made.correlations(latest(lagged=lagged)) for lagged in (True, False))
     assert whole.lags_s == band.lags_s
     assert whole.band_hz is None
     assert band.band_hz == pytest.approx((2.9, 150.1))
@@ -119,9 +119,9 @@ def test_short_segments_weaken_no_correlation() -> None:
     """Segments of half a second, lags up to a quarter of them: the taper alone would take a third away."""
     window = LAB.window.model_copy(update={"segment_s": 0.5})
     machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:2], "window": window})
-    desk = desk_of(machine)
+    made = snapshots_of(machine)
     whole, band = (
-        desk.correlations(LatestData(window_of(machine, stream(SECONDS, SEED), lagged=lagged), 1.0))
+        made.correlations(LatestData(window_of(machine, stream(SECONDS, SEED), lagged=lagged), 1.0))
         for lagged in (True, False)
     )
     late = np.array(whole.lags_s) > 0.08
@@ -141,7 +141,7 @@ def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
         smooth = np.apply_along_axis(np.convolve, 0, white, np.hanning(40), "same")
         blocks_ = synthetic({"y1": smooth[:, 0], "z1": smooth[:, 0] + smooth[:, 1]})
         window = window_of(machine, blocks_[:710], lagged=False)
-        (pair,) = desk_of(NOTHING).correlations(LatestData(window, 1.0), ["y1"], ["z1"]).pairs
+        (pair,) = snapshots_of(NOTHING).correlations(LatestData(window, 1.0), ["y1"], ["z1"]).pairs
         values.append(numbers(pair.measured))
         errors.append(numbers(pair.standard_error))
     ratio = np.std(values, axis=0, ddof=1) / np.mean(errors, axis=0)
@@ -149,7 +149,7 @@ def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
 
 
 def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> None:
-    snapshot = desk_of(LAB).spectra(latest(K_BY), [name for name in NAMES if name != "theta"])
+    snapshot = snapshots_of(LAB).spectra(latest(K_BY), [name for name in NAMES if name != "theta"])
     assert snapshot.degrees_of_freedom is not None
     assert snapshot.interval_95 is not None
     assert snapshot.left_out_hz is not None
@@ -175,8 +175,8 @@ def test_densities_scatter_around_theory_as_their_degrees_of_freedom_say() -> No
 
 
 def test_units_of_densities() -> None:
-    desk, data = desk_of(LAB), latest()
-    own, si = (desk.spectra(data, ["y1", "y1_dot"], ["y1"], ["y1_dot"], units=units) for units in ("channel", "SI"))
+    made, data = snapshots_of(LAB), latest()
+    own, si = (made.spectra(data, ["y1", "y1_dot"], ["y1"], ["y1_dot"], units=units) for units in ("channel", "SI"))
     assert [density.unit for density in own.densities] == ["um^2/Hz", "(mm/s)^2/Hz"]
     assert [density.unit for density in si.densities] == ["m^2/Hz", "(m/s)^2/Hz"]
     assert numbers(own.densities[0].measured) == pytest.approx(1e12 * numbers(si.densities[0].measured), rel=1e-5)
@@ -193,7 +193,9 @@ def test_coherence_and_phase_of_a_delayed_channel() -> None:
     white = rng.standard_normal((round(71 * LAB.rate_hz), 2))
     stream_ = synthetic({"y1": white[:, 0], "z1": np.roll(white[:, 0], 2), "y2": white[:, 1]})
     machine = NOTHING.model_copy(update={"sensors": tuple(c for c in LAB.sensors if c.name in ("y1", "z1", "y2"))})
-    snapshot = desk_of(machine).spectra(LatestData(window_of(machine, stream_), 1.0), (), ["y1", "y1"], ["z1", "y2"])
+    snapshot = snapshots_of(machine).spectra(
+        LatestData(window_of(machine, stream_), 1.0), (), ["y1", "y1"], ["z1", "y2"]
+    )
     late, foreign = snapshot.cross
     frequencies_hz = np.array(snapshot.frequencies_hz)
     assert numbers(late.phase_deg) == pytest.approx(-360 * frequencies_hz * 2 / LAB.rate_hz, abs=1.0)
@@ -211,7 +213,7 @@ def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
     machine = NOTHING.model_copy(update={"sensors": LAB.sensors[:1], "window": window})
     rng = np.random.default_rng(4)
     stream_ = synthetic({"y1": rng.standard_normal(round(71 * LAB.rate_hz))})
-    snapshot = desk_of(machine).spectra(LatestData(window_of(machine, stream_), 1.0))
+    snapshot = snapshots_of(machine).spectra(LatestData(window_of(machine, stream_), 1.0))
     assert snapshot.averaged_lines == 3
     assert snapshot.line_spacing_hz == pytest.approx(0.6)
     assert len(snapshot.frequencies_hz) == 828
@@ -222,8 +224,8 @@ def test_a_wide_band_is_averaged_into_fewer_lines() -> None:
 
 
 def test_a_part_of_the_band() -> None:
-    desk = desk_of(LAB)
-    part, whole = desk.spectra(latest(), ["y2"], band_hz=(25.0, 35.0)), desk.spectra(latest(), ["y2"])
+    made = snapshots_of(LAB)
+    part, whole = made.spectra(latest(), ["y2"], band_hz=(25.0, 35.0)), made.spectra(latest(), ["y2"])
     assert (part.frequencies_hz[0], part.frequencies_hz[-1]) == (25.0, 35.0)
     at = whole.frequencies_hz.index(25.0)
     count = len(part.frequencies_hz)
@@ -234,14 +236,18 @@ def test_a_part_of_the_band() -> None:
     with pytest.raises(
         SnapshotError, match=r"demo/lab: band is 200 to 300 Hz, expected at least 0\.4 Hz within 3 to 150"
     ):
-        desk.spectra(latest(), ["y2"], band_hz=(200.0, 300.0))
+        made.spectra(latest(), ["y2"], band_hz=(200.0, 300.0))
 
 
 def test_nothing_is_known_of_the_machine() -> None:
     reason = "the machine's parameters are not known, so there is no theory to predict from"
-    data, desk = LatestData(latest().window, 1.0, (), "", stream(SECONDS, SEED)[-20:]), desk_of(NOTHING)
-    correlations, spectra, orbits = desk.correlations(data), desk.spectra(data, (), ["y1"]), desk.orbits(data, 2)
-    known = desk_of(LAB).correlations(latest())
+    data, made = LatestData(latest().window, 1.0, (), "", stream(SECONDS, SEED)[-20:]), snapshots_of(NOTHING)
+    correlations, spectra, orbits = (
+        made.correlations(data),
+        made.spectra(data, (), ["y1"]),
+        made.orbits(data, 2),
+    )
+    known = snapshots_of(LAB).correlations(latest())
     assert [pair.measured for pair in correlations.pairs] == [pair.measured for pair in known.pairs]
     for snapshot in (correlations, spectra, orbits):
         assert (snapshot.reason, snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == (
@@ -258,19 +264,19 @@ def test_nothing_is_known_of_the_machine() -> None:
 def test_a_window_that_was_not_evaluated_is_predicted_as_nominal() -> None:
     why = "demo/lab: gain of y1 is 20 % lower than when it was commissioned"
     data = LatestData(latest().window, 1.0, (), why)
-    snapshot = desk_of(LAB).correlations(data)
+    snapshot = snapshots_of(LAB).correlations(data)
     assert (snapshot.theory.nominal_reason, snapshot.theory.estimated_reason) == ("", why)
     assert snapshot.theory.changes == ()
     assert all(pair.estimated is None and pair.estimated_z is None for pair in snapshot.pairs)
     assert all(pair.nominal_z is not None and pair.nominal_z < 2.5 for pair in snapshot.pairs)
-    unsaid = desk_of(LAB).spectra(LatestData(latest().window, 1.0))
+    unsaid = snapshots_of(LAB).spectra(LatestData(latest().window, 1.0))
     assert unsaid.theory.estimated_reason == "no parameter was read in this window"
 
 
 def test_before_the_first_window() -> None:
     data = LatestData(None, 0.25, (), "", stream(SECONDS, SEED)[:20])
-    desk = desk_of(LAB)
-    correlations, spectra, orbits = desk.correlations(data), desk.spectra(data), desk.orbits(data, 35)
+    made = snapshots_of(LAB)
+    correlations, spectra, orbits = made.correlations(data), made.spectra(data), made.orbits(data, 35)
     for snapshot in (correlations, spectra, orbits):
         assert snapshot.reason == "demo/lab: no window of 60 s is full yet, 25% of one is there"
         assert (snapshot.start_ns, snapshot.end_ns, snapshot.speed_rad_s) == (None, None, None)
@@ -286,13 +292,14 @@ def test_a_channel_that_does_not_move() -> None:
         for b in stream(SECONDS, SEED)
     ]
     data = LatestData(window_of(LAB, stream_), 1.0, (), "y1 is stuck")
-    snapshot = desk_of(LAB).correlations(data)
+    snapshot = snapshots_of(LAB).correlations(data)
     assert snapshot.theory.nominal_reason.startswith("demo/lab: no fluctuation in y1")
     assert snapshot.theory.estimated_reason == "y1 is stuck"
     assert set(snapshot.pairs[0].measured) <= {0.0, -0.0}
     assert snapshot.pairs[0].nominal is None
     assert (
-        json.loads(desk_of(LAB).spectra(data, (), ["y1"], ["y2"]).model_dump_json())["cross"][0]["coherence"][0] is None
+        json.loads(snapshots_of(LAB).spectra(data, (), ["y1"], ["y2"]).model_dump_json())["cross"][0]["coherence"][0]
+        is None
     )
 
 
@@ -307,29 +314,29 @@ def test_a_channel_that_does_not_move() -> None:
     ],
 )
 def test_channels_that_are_not_there(first: list[str], second: list[str], message: str) -> None:
-    desk = desk_of(LAB)
+    made = snapshots_of(LAB)
     with pytest.raises(SnapshotError, match=message):
-        desk.correlations(latest(), first, second)
+        made.correlations(latest(), first, second)
     with pytest.raises(SnapshotError, match=message):
-        desk.spectra(latest(), (), first, second)
+        made.spectra(latest(), (), first, second)
 
 
 def test_channels_by_name_and_a_choice_without_displacements() -> None:
-    desk = desk_of(LAB)
-    assert [(p.first, p.second) for p in desk.correlations(latest(), ["z2", "y1"]).pairs] == [
+    made = snapshots_of(LAB)
+    assert [(p.first, p.second) for p in made.correlations(latest(), ["z2", "y1"]).pairs] == [
         ("z2", "z2"),
         ("y1", "y1"),
     ]
     with pytest.raises(SnapshotError, match="channel is 'q'"):
-        desk.spectra(latest(), ["q"])
+        made.spectra(latest(), ["q"])
     with pytest.raises(SnapshotError, match=f"revolutions is 65, expected 0 to {MOST_REVOLUTIONS}"):
-        desk.orbits(latest(), 65)
+        made.orbits(latest(), 65)
     rates = NOTHING.model_copy(update={"sensors": tuple(c for c in LAB.sensors if c.quantity == "velocity")})
     data = LatestData(window_of(rates, stream(SECONDS, SEED)), 1.0)
-    snapshot = desk_of(rates).spectra(data)
+    snapshot = snapshots_of(rates).spectra(data)
     assert [density.channel for density in snapshot.densities] == ["y1_dot", "z1_dot", "y2_dot", "z2_dot"]
     assert (snapshot.rotation_hz, snapshot.left_out_hz) == (None, None)
-    orbits = desk_of(rates).orbits(data)
+    orbits = snapshots_of(rates).orbits(data)
     assert orbits.orbits == ()
     assert orbits.reason.endswith("measured displacements: none")
 
@@ -341,13 +348,13 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
         asked.append(window)
         return predict(known, window, *rest)  # type: ignore[arg-type]  # handed on as they came
 
-    monkeypatch.setattr(desk_module, "predict", counted)
-    desk = desk_of(LAB)
-    first = desk.correlations(latest())
-    desk.spectra(latest())
-    assert desk.correlations(latest()) == first
+    monkeypatch.setattr(machine_module, "predict", counted)
+    made = snapshots_of(LAB)
+    first = made.correlations(latest())
+    made.spectra(latest())
+    assert made.correlations(latest()) == first
     assert len(asked) == 1
-    desk.correlations(latest(K_BY))
+    made.correlations(latest(K_BY))
     assert len(asked) == 2
 
 
@@ -355,11 +362,11 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
 def test_snapshots_as_json(model: type[BaseModel]) -> None:
     """Every field has an example; what is written is read again; no number is anything but a number."""
     model.model_validate(example(model))
-    desk = desk_of(LAB)
+    lab = snapshots_of(LAB)
     made: dict[type[BaseModel], Callable[[LatestData], BaseModel]] = {
-        CorrelationSnapshot: desk.correlations,
-        SpectrumSnapshot: lambda data: desk.spectra(data, (), ["y1"], ["y2"]),
-        OrbitSnapshot: lambda data: desk.orbits(data, 8),
+        CorrelationSnapshot: lab.correlations,
+        SpectrumSnapshot: lambda data: lab.spectra(data, (), ["y1"], ["y2"]),
+        OrbitSnapshot: lambda data: lab.orbits(data, 8),
     }
     for data in (latest(), LatestData()):
         snapshot = made[model](data)
@@ -382,10 +389,10 @@ def test_the_newest_blocks_are_kept_without_a_gap() -> None:
 
 
 def test_too_few_revolutions_are_said() -> None:
-    desk, stream_ = desk_of(LAB), stream(SECONDS, SEED)
-    few = desk.orbits(LatestData(None, 0.0, (), "", stream_[-2:]), 20)
+    made, stream_ = snapshots_of(LAB), stream(SECONDS, SEED)
+    few = made.orbits(LatestData(None, 0.0, (), "", stream_[-2:]), 20)
     assert few.revolutions in (3, 4)
     assert few.path_reason == f"{few.revolutions} of 20 revolutions: there are 0.2 s of samples without a gap at most"
-    none = desk.orbits(LatestData(None, 0.0, (), "", ()), 20)
+    none = made.orbits(LatestData(None, 0.0, (), "", ()), 20)
     assert (none.revolutions, none.path_reason) == (0, "no samples have come in")
     assert all(orbit.path is None for orbit in none.orbits)

@@ -7,8 +7,8 @@ import numpy as np
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from service.analysis.plots.stretches import Excerpt, RecordedStream
-from service.analysis.snapshots.choice import orbit_pairs
+from service.analysis.plots.excerpts import Excerpt, RecordedStream
+from service.analysis.snapshots.channels import orbit_pairs
 from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
 from service.analysis.snapshots.revolutions import pulses
 

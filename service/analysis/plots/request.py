@@ -11,15 +11,15 @@ from models.signals.channels import Channel
 from models.signals.keys import MachineKeys
 from service.analysis.plots.correlation import correlations_of, latest_window
 from service.analysis.plots.correlation_figure import paint_correlations
+from service.analysis.plots.excerpts import RecordedStream
 from service.analysis.plots.orbit import read_orbits
 from service.analysis.plots.orbit_figure import paint_orbits
 from service.analysis.plots.spectrum import Scaling, read_spectrum, read_waterfall
 from service.analysis.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
-from service.analysis.plots.stretches import RecordedStream
 from service.analysis.plots.style import Look
 from service.analysis.plots.trend import read_trend, recorded_alarms, trend_machine
 from service.analysis.plots.trend_figure import paint_trend
-from service.recordings.replay.choice import choose_machine
+from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.source import RecordingSource, parse_moment
 
 __all__ = ["Lines", "Paint", "Recorded", "correlation", "orbit", "recorded", "spectrum", "trend", "waterfall"]

@@ -10,7 +10,7 @@ from scipy.signal import welch
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
-from service.analysis.plots.stretches import Excerpt, RecordedStream, begins_again
+from service.analysis.plots.excerpts import Excerpt, RecordedStream, begins_again
 
 __all__ = [
     "Scaling",

@@ -17,7 +17,7 @@ from models.signals.keys import PREFIX, MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.reports import machine_hash
-from service.recordings.replay.choice import choose_machine
+from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 

@@ -7,10 +7,10 @@ import numpy as np
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
-from service.analysis.snapshots.choice import chosen_pairs, figures, product_unit
+from service.analysis.snapshots.channels import chosen_pairs, figures, product_unit
+from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 from service.analysis.snapshots.measured import MeasuredCorrelations, measured_correlations
 from service.analysis.snapshots.prediction import Prediction
-from service.analysis.snapshots.statement import LatestData, Subject, heading, no_window, theory
 
 __all__ = ["correlation_snapshot"]
 
@@ -33,7 +33,7 @@ def correlation_snapshot(
         Theory for the latest window.
     first, second : sequence of str
         Channels by name: the references, and as many responses; without `second` every channel with itself, without
-        both a few pairs (`service.analysis.snapshots.choice.chosen_pairs`).
+        both a few pairs (`service.analysis.snapshots.channels.chosen_pairs`).
     units : str
         ``channel`` or ``SI``.
 

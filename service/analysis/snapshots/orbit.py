@@ -13,11 +13,11 @@ from models.physics.matrices import STATE_INDEX
 from models.physics.parameters import RotorParameters, changed
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
-from service.analysis.snapshots.choice import figures, orbit_pairs
+from service.analysis.snapshots.channels import figures, orbit_pairs
 from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
+from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 from service.analysis.snapshots.path import NewestPath, newest_path
 from service.analysis.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
-from service.analysis.snapshots.statement import LatestData, Subject, heading, no_window, theory
 
 __all__ = ["orbit_snapshot"]
 

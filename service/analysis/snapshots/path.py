@@ -7,7 +7,7 @@ import numpy as np
 from models.machine import MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel
-from service.analysis.snapshots.choice import SnapshotError
+from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.revolutions import pulses
 
 __all__ = ["MOST_REVOLUTIONS", "NewestPath", "newest_path"]

@@ -12,10 +12,10 @@ from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, SpectrumSnapshot, Units
-from service.analysis.snapshots.choice import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
+from service.analysis.snapshots.channels import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
 from service.analysis.snapshots.excitation import LEFT_OUT_BINS
+from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 from service.analysis.snapshots.prediction import Prediction
-from service.analysis.snapshots.statement import LatestData, Subject, heading, no_window, theory
 
 __all__ = ["MOST_LINES", "spectrum_snapshot"]
 

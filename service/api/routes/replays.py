@@ -27,8 +27,8 @@ from rotorwatch.records.replays import (
 from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
 from service.api.routes.recordings import RecordingIndex, found_recording
-from service.recordings.replay.choice import is_shipped_bundle, is_shipped_machine
 from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
+from service.recordings.replay.machine import is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
 
 __all__ = ["ReplayDesk", "add_replay_routes"]

@@ -9,7 +9,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from rotorwatch.records.monitor import WebhookList
 from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
-from service.delivery.webhooks.desk import WebhookDesk
+from service.delivery.webhooks.webhooks import Webhooks
 
 __all__ = ["MeasuredView", "MetricsText", "add_service_routes"]
 
@@ -35,7 +35,7 @@ class MeasuredView(Protocol):
         """The metrics."""
 
     @property
-    def webhooks(self) -> WebhookDesk:
+    def webhooks(self) -> Webhooks:
         """Who is told of alarm events."""
 
 

@@ -7,7 +7,7 @@ from fastapi import FastAPI, HTTPException, Query
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.access.guard import Guard
 from service.access.problems import responses
-from service.analysis.snapshots.choice import SnapshotError
+from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.path import MOST_REVOLUTIONS
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 

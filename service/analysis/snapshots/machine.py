@@ -7,18 +7,18 @@ from models.commissioning.installed import Installed
 from models.diagnosis.window import WindowStatistics
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.analysis.snapshots.correlation import correlation_snapshot
+from service.analysis.snapshots.heading import LatestData, Subject
 from service.analysis.snapshots.orbit import orbit_snapshot
 from service.analysis.snapshots.prediction import NO_PARAMETERS, Prediction, predict
 from service.analysis.snapshots.spectrum import spectrum_snapshot
-from service.analysis.snapshots.statement import LatestData, Subject
 from service.monitor.reports import Identity
 
-__all__ = ["SnapshotDesk"]
+__all__ = ["MachineSnapshots"]
 
 _NO_WINDOW = "there is no window yet"
 
 
-class SnapshotDesk:
+class MachineSnapshots:
     """Makes snapshots of one machine; any thread may ask.
 
     The theory of a window takes longer than all the rest, and is kept until another window comes.
