@@ -1,12 +1,15 @@
-"""Names of all alarms a machine can have, and what they mean in words."""
+"""All alarms a machine can have: one row per alarm."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Literal
 
 from models.physics.parameters import PARAMETER_TEXT
+from rotorwatch.records.sensor_faults import FaultKind
 
 __all__ = [
-    "ALARM_TEXT",
+    "ALARMS",
     "CLOCK",
     "CONFLICT",
     "DATA",
@@ -17,9 +20,9 @@ __all__ = [
     "PHASE_REFERENCE",
     "SHAPE",
     "STREAM_LOST",
-    "alarm_text",
+    "AlarmKind",
+    "alarm_kind",
     "data_alarm",
-    "of_the_machine",
 ]
 
 MODEL = "model"
@@ -39,41 +42,69 @@ DATA = "data-"
 
 GAP, CLOCK, CONFLICT, PHASE_REFERENCE = "data-gap", "data-clock", "data-conflict", "data-phase-reference"
 
-ALARM_TEXT: Mapping[str, str] = MappingProxyType(
-    {
-        **PARAMETER_TEXT,
-        MODEL: "outside the model",
-        SHAPE: "vibration changed",
-        STREAM_LOST: "stream lost",
-        FAULT: "fault in the monitor",
-        OVERLOADED: "monitor overloaded",
-        GAP: "data health, gap",
-        CLOCK: "data health, clock",
-        CONFLICT: "data health, conflict of publishers",
-        PHASE_REFERENCE: "data health, phase reference",
-        "data-stuck": "data health, sensor stuck",
-        "data-clipped": "data health, sensor clipped",
-        "data-offset": "data health, offset",
-        "data-gain": "data health, gain",
-        "data-delay": "data health, delay",
-        "data-swapped": "data health, channels swapped",
-        "data-incoherent": "data health, sensors contradict each other",
-        "data-noise": "data health, noise level",
-    }
-)
-"""Every alarm, by its name, in words."""
 
-
-def alarm_text(name: str) -> str:
-    """An alarm in words; one that has none is told by its name rather than not at all."""
-    return ALARM_TEXT.get(name, name)
-
-
-def data_alarm(kind: str) -> str:
+def data_alarm(kind: FaultKind) -> str:
     """Name of the alarm for one kind of fault of a sensor."""
     return DATA + kind
 
 
-def of_the_machine(name: str) -> bool:
-    """Whether an alarm says something of the machine; what is wrong with the data or the monitor is none of it."""
-    return not name.startswith(DATA) and name not in {STREAM_LOST, FAULT, OVERLOADED}
+@dataclass(frozen=True, slots=True)
+class AlarmKind:
+    """What is to be known of an alarm beside its name.
+
+    Attributes
+    ----------
+    text : str
+        What it is about, in words.
+    about : {"machine", "data", "monitor"}
+        What is wrong while it is raised. What is wrong with the data or the monitor says nothing of the machine.
+    cleared : str
+        What is so again once it has cleared.
+    raised : str
+        What is so while it is raised, where nothing more is known of it.
+    """
+
+    text: str
+    about: Literal["machine", "data", "monitor"]
+    cleared: str
+    raised: str = ""
+
+
+ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
+    {
+        **{name: AlarmKind(text, "machine", "within its limits") for name, text in PARAMETER_TEXT.items()},
+        MODEL: AlarmKind(
+            "outside the model",
+            "machine",
+            "the model describes the machine again",
+            "something has changed that no parameter describes, or a sensor is at fault",
+        ),
+        SHAPE: AlarmKind(
+            "vibration changed",
+            "machine",
+            "the vibration is as it was",
+            "a channel's vibration is no longer as on the healthy machine",
+        ),
+        STREAM_LOST: AlarmKind("stream lost", "data", "data come again"),
+        FAULT: AlarmKind("fault in the monitor", "monitor", "the monitor works again"),
+        OVERLOADED: AlarmKind("monitor overloaded", "monitor", "the monitor keeps up again"),
+        GAP: AlarmKind("data health, gap", "data", "the data are without gaps again"),
+        CLOCK: AlarmKind("data health, clock", "data", "the clock of the data runs steadily again"),
+        CONFLICT: AlarmKind(
+            "data health, conflict of publishers", "data", "one publisher sends, and does not contradict itself"
+        ),
+        PHASE_REFERENCE: AlarmKind("data health, phase reference", "data", "the phase reference is there again"),
+        **{
+            data_alarm(kind): AlarmKind(
+                f"data health, {kind.text}", "data", f"data health, {kind.text}: nothing of it is seen any more"
+            )
+            for kind in FaultKind
+        },
+    }
+)
+"""Every alarm, by its name."""
+
+
+def alarm_kind(name: str) -> AlarmKind:
+    """What is to be known of an alarm; one without a row is told by its name rather than not at all."""
+    return ALARMS.get(name) or AlarmKind(name, "machine", f"{name}: nothing of it is seen any more")

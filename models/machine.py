@@ -16,7 +16,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from models.alarm_names import ALARM_TEXT
+from models.alarm_names import ALARMS
 from models.errors import MachineFileError
 from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.parameters import PARAMETERS, KnownRotor, RotorParameters
@@ -165,10 +165,10 @@ class AlarmLimits(BaseModel):
 
 
 def _known_alarms(field: str, names: Iterable[str]) -> None:
-    unknown = sorted(set(names) - set(ALARM_TEXT))
+    unknown = sorted(set(names) - set(ALARMS))
     if unknown:
-        hint = did_you_mean(unknown[0], ALARM_TEXT)
-        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARM_TEXT)}{hint}")
+        hint = did_you_mean(unknown[0], ALARMS)
+        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARMS)}{hint}")
 
 
 class SuppressRule(BaseModel):

@@ -114,6 +114,7 @@ class Evidence(BaseModel):
     start_ns: int = Field(description="oldest data", examples=[EXAMPLE_NS - 20_000_000_000])
     end_ns: int = Field(description="end of the newest data", examples=[EXAMPLE_NS])
     confidence: Number = Field(
+        default=None,
         description="probability that what is named changed and nothing else; null where none is computed",
         examples=[0.996],
     )

@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from rotorwatch.records.fields import EXAMPLE_NS, JSON, Number, Reason
+from rotorwatch.records.sensor_faults import FaultKind
 
 __all__ = [
     "Agreement",
@@ -189,16 +190,13 @@ class SensorFault(BaseModel):
     model_config = JSON
 
     states: tuple[str, ...] = Field(description="what the channels in question measure", examples=[("y1",)])
-    kind: str = Field(
-        description="stuck, clipped, offset, gain, delay, swapped, incoherent or noise", examples=["gain"]
-    )
+    kind: FaultKind = Field(description="what is wrong with it", examples=["gain"])
     text: str = Field(
         description="channels, value found and what was expected, in a sentence",
         examples=["gain of y1 is 20 % lower than when it was commissioned"],
     )
     value: Number = Field(
-        description="stuck: s; clipped: part of the samples; offset: SI; gain: relative; delay: s; noise: its rms over "
-        "that of the channel (rad for the shaft angle); otherwise the share of motion that the sensors have in common",
+        description="; ".join(f"{kind}: {kind.measure}" for kind in FaultKind),
         examples=[-0.2],
     )
     z: Number = Field(default=None, description="in standard errors; null where no chance is involved", examples=[41.0])

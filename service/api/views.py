@@ -6,7 +6,7 @@ from typing import Annotated, Protocol
 from fastapi import HTTPException, Path, Query
 from pydantic import AfterValidator
 
-from models.alarm_names import ALARM_TEXT
+from models.alarm_names import ALARMS
 from models.machine import MachineFile
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
@@ -47,12 +47,12 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
 def _known_alarm(name: str) -> str:
-    if name not in ALARM_TEXT:
-        raise ValueError(f"no alarm {name[:64]!r}; there are: {', '.join(ALARM_TEXT)}")
+    if name not in ALARMS:
+        raise ValueError(f"no alarm {name[:64]!r}; there are: {', '.join(ALARMS)}")
     return name
 
 
-AlarmName = Annotated[str, AfterValidator(_known_alarm), Query(json_schema_extra={"enum": list(ALARM_TEXT)})]
+AlarmName = Annotated[str, AfterValidator(_known_alarm), Query(json_schema_extra={"enum": list(ALARMS)})]
 
 
 class MachineView(Protocol):

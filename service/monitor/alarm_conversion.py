@@ -4,15 +4,13 @@ import json
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, timedelta
 
-from models.alarm_names import alarm_text
+from models.alarm_names import alarm_kind
 from models.diagnosis.readings import interval_95
 from rotorwatch import __version__
 from rotorwatch.records.alarms import Alarm as AlarmJson
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, AlarmStates
-from rotorwatch.records.alarms import Evidence as EvidenceJson
-from rotorwatch.records.alarms import Shelf as ShelfJson
 from rotorwatch.records.fields import finite
-from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.reports import Identity
 
 __all__ = [
@@ -66,7 +64,7 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
         interval_95=_interval(alarm),
         low_confidence=alarm.low_confidence,
         note=alarm.note,
-        evidence=_evidence(alarm.evidence),
+        evidence=alarm.evidence,
         actor=event.actor,
         reason=event.reason,
         program_version=__version__,
@@ -85,10 +83,9 @@ def alarm_cloud_event(identity: Identity, event: AlarmEvent) -> AlarmCloudEvent:
 
 
 def _alarm(alarm: Alarm) -> AlarmJson:
-    shelf = alarm.shelf
     return AlarmJson(
         name=alarm.name,
-        text=alarm_text(alarm.name),
+        text=alarm_kind(alarm.name).text,
         state=alarm.state,
         pending=alarm.beyond_ns is not None,
         clearing=alarm.small_ns is not None,
@@ -103,10 +100,8 @@ def _alarm(alarm: Alarm) -> AlarmJson:
         interval_95=_interval(alarm),
         low_confidence=alarm.low_confidence,
         note=alarm.note,
-        evidence=_evidence(alarm.evidence),
-        shelf=None
-        if shelf is None
-        else ShelfJson(until_ns=shelf.until_ns, one_shot=shelf.one_shot, by=shelf.by, reason=shelf.reason),
+        evidence=alarm.evidence,
+        shelf=alarm.shelf,
         suppressed_by=alarm.suppressed_by,
         out_of_service_by=alarm.out_of_service_by,
         out_of_service_reason=alarm.out_of_service_reason,
@@ -117,12 +112,6 @@ def _alarm(alarm: Alarm) -> AlarmJson:
 def _interval(alarm: Alarm) -> tuple[float, float] | None:
     change, error = finite(alarm.change), finite(alarm.standard_error)
     return None if change is None or error is None else interval_95(change, error, least=-1.0)
-
-
-def _evidence(evidence: Evidence | None) -> EvidenceJson | None:
-    if evidence is None:
-        return None
-    return EvidenceJson(start_ns=evidence.start_ns, end_ns=evidence.end_ns, confidence=evidence.confidence)
 
 
 def rfc3339(time_ns: int) -> str:

@@ -32,9 +32,9 @@ from models.ingest import Admission, Gate, Reason
 from models.senders import Senders
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
-from rotorwatch.records.alarms import Severity
+from rotorwatch.records.alarms import Evidence, Severity
 from rotorwatch.records.health import HealthState, Quality, Report
-from service.monitor.alarms.alarm import AlarmEvent, Evidence
+from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
@@ -435,7 +435,7 @@ class MachineMonitor:
         if not unexplained and not evaluation.deciding.evaluable:
             reason = _why_nothing(evaluation.deciding)
         if evaluation.shapes:
-            evidence = Evidence(statistics.start_ns, end_ns)
+            evidence = Evidence(start_ns=statistics.start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
         outside = verdict.outside_model
         state = self._state(_calm_state(evaluation, outside=outside))

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from models.alarm_names import ALARMS
 from models.machine import AlarmSettings
 from rotorwatch.records.alarms import AlarmState, EventKind
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
@@ -41,6 +42,12 @@ SETTINGS = AlarmSettings.model_validate(
 
 def written(cell: Cell) -> str:
     return " / ".join(cell) if isinstance(cell, tuple) else str(cell)
+
+
+def test_the_documentation_tells_what_every_alarm_says() -> None:
+    text = (ROOT / "docs/alarms.md").read_text(encoding="utf-8").partition("## Kinds")[2].partition("##")[0]
+    first = [line.split("|")[1] for line in text.splitlines() if line.startswith("| `")]
+    assert {name for cell in first for name in re.findall("`(.*?)`", cell)} == set(ALARMS)
 
 
 def test_the_documentation_shows_the_table() -> None:

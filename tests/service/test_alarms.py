@@ -5,15 +5,22 @@ found to have changed, ``_`` not evaluated.
 Events: ``^`` raised, ``!`` escalated, ``v`` cleared.
 """
 
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from models.alarm_names import MODEL, STREAM_LOST
-from models.machine import AlarmSettings
+from models.diagnosis.window import WindowStatistics
+from models.machine import AlarmSettings, load_machine
 from rotorwatch.records.alarms import Severity
+from rotorwatch.records.sensor_faults import FaultKind
+from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
+from service.monitor.alarms.data_path import DataPathAlarms
 
 CHANGES = {".": 0.01, "o": 0.08, "x": -0.2, "?": -0.2, "X": 0.6}
 MARKS = {"raised": "^", "escalated": "!", "cleared": "v"}
@@ -137,3 +144,15 @@ def test_what_was_never_seen_makes_no_alarm() -> None:
     book = AlarmBook(SETTINGS)
     assert not book.update_state("data-gap", False, 0)
     assert book.alarms == ()
+
+
+@pytest.mark.parametrize("kind", FaultKind)
+def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> None:
+    """One that does not would make the machine not evaluable, and tell nobody."""
+    machine = load_machine("lab").model_copy(update={"alarms": AlarmSettings(on_delay_s=0)})
+    book = AlarmBook(machine.alarms)
+    fault = SensorFault(states=("y1",), kind=kind, text="y1 is at fault", value=1.0)
+    DataPathAlarms(book, machine).sensors((fault,), cast("WindowStatistics", SimpleNamespace(start_ns=0, end_ns=10**9)))
+    (event,) = book.take()
+    assert event.text == f"ALERT: data health, {kind.text}: y1 is at fault"
+    assert book.severity is None

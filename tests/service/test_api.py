@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import httpx
 import pytest
 
-from models.alarm_names import ALARM_TEXT
+from models.alarm_names import ALARMS
 from models.machine import Machine, load_machine
 from models.physics.parameters import PARAMETERS
 from rotorwatch.records.alarms import Alarm, AlarmStates
@@ -145,7 +145,7 @@ def test_alarms_and_their_events(http: httpx.Client) -> None:
     (active,) = answered(http.get(f"{PLACE}/alarms"), AlarmStates).alarms
     assert (active.name, active.state, active.severity, active.occurrence) == ("k_by", "unacknowledged", "alert", 1)
     everything = answered(http.get(f"{PLACE}/alarms?all=true"), AlarmStates).alarms
-    assert {*PARAMETERS} <= {alarm.name for alarm in everything} <= set(ALARM_TEXT)
+    assert {*PARAMETERS} <= {alarm.name for alarm in everything} <= set(ALARMS)
     assert [alarm.name for alarm in everything if alarm.state != "normal"] == ["k_by"]
     (event,) = answered(http.get(f"{PLACE}/alarms/events"), AlarmEventList).events
     assert event.type == "org.rotorwatch.alarm.raised"

@@ -13,7 +13,7 @@ import pytest
 import structlog
 import zenoh
 
-from models.alarm_names import CONFLICT, STREAM_LOST, of_the_machine
+from models.alarm_names import CONFLICT, STREAM_LOST, alarm_kind
 from models.commissioning.installed import install
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
@@ -131,7 +131,7 @@ def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
     health = monitor.health()
     assert dict(health.quality.refused_blocks)["conflict"] == 14
     assert CONFLICT in raised(monitor)
-    assert {name for name in raised(monitor) if of_the_machine(name)} == set()
+    assert {name for name in raised(monitor) if alarm_kind(name).about == "machine"} == set()
 
 
 def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:

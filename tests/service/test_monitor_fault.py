@@ -13,11 +13,11 @@ from models.commissioning.installed import install
 from models.machine import Machine
 from models.signals.arrow import write_arrow
 from models.signals.wire import ARROW_ENCODING, encode_block
-from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.alarms import EventKind, Evidence
 from rotorwatch.records.health import HealthState
 from service.history.errors import StoreError
 from service.history.records import Checkpoint, Step
-from service.monitor.alarms.alarm import AlarmEvent, Evidence
+from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.evaluation import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
@@ -266,7 +266,7 @@ def test_an_event_without_words_goes_out_and_holds_up_no_other(
     with bench(tmp_path) as at:
         at.put(block(0))
         book = at.worker._monitor._alarms
-        poison = Evidence(0, 1, "not a number") if kind == "gap" else None  # type: ignore[arg-type]  # a defect
+        poison = Evidence.model_construct(start_ns=0, end_ns=1, confidence="not a number") if kind == "gap" else None  # type: ignore[arg-type]
         at.worker.inbox.call(
             lambda: told.append(book.update_state(f"data-{kind}", True, START_NS, evidence=poison, at_once=True))
         )

@@ -17,6 +17,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from rotorwatch.records.windows import SensorFault
 from service.analysis.plots.excerpts import RecordedStream
 from service.analysis.plots.trend import read_trend
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
@@ -127,6 +128,13 @@ def test_fields_added_later_change_nothing_in_what_is_read() -> None:
 def test_a_client_reads_answers_of_a_later_version(model: Any) -> None:
     answer = {**example(model), "added_later": 1}
     assert understood(model, json.dumps(answer), "here") == model.model_validate(example(model))
+
+
+def test_a_kind_of_fault_that_only_a_later_version_has_is_told_by_its_name() -> None:
+    fault = example(SensorFault) | {"kind": "wobbling"}
+    report = Report.model_validate_json(json.dumps(example(Report) | {"sensors": [fault]}))
+    assert report.sensors[0].kind == "wobbling"
+    assert json.loads(report.model_dump_json())["sensors"] == [fault]
 
 
 def test_recordings_of_a_later_version_are_exported_and_plotted(of_later: Path) -> None:

@@ -14,6 +14,7 @@ from models.diagnosis.sensors.phase import phase_faults
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.channels import Channel
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["sensor_findings"]
@@ -69,7 +70,7 @@ def sensor_findings(
             f"{naming.name(second)} and {naming.name(first)} measure one motion but share only {reading.shared:.2f} of "
             "it, expected nearly 1: noise, a loose sensor, or a wrong channel"
         )
-        findings.append(SensorFault(states=(first, second), kind="incoherent", text=text, value=reading.shared))
+        findings.append(SensorFault(states=(first, second), kind=FaultKind.INCOHERENT, text=text, value=reading.shared))
     bad = implicated(findings)
     findings += gain_and_delay(window, readings, bands, naming, reference)
     findings += [found for found in gain_jump(window, naming) if not set(found.states) & bad]

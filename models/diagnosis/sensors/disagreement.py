@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.pairs import MotionPair
-from models.diagnosis.sensors.finding import FaultKind, Naming
+from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.kinematics import Banded, PairReading, gain_course
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["gain_and_delay"]
@@ -115,7 +116,7 @@ def _gain(
 ) -> SensorFault:
     pair = departure.reading.pair
     first, second = window.states[pair.first], window.states[pair.second]
-    guilty = _by_chain(departure, departures, "gain", moving=moving)
+    guilty = _by_chain(departure, departures, FaultKind.GAIN, moving=moving)
     if guilty is None and departure.course_z > MOST_ERRORS:
         guilty = _by_course(window, departure)
     if guilty is None and not moving:
@@ -126,7 +127,7 @@ def _gain(
     expected = "as they were on the healthy machine" if departure.known else "the same motion, 0 % apart"
     if departure.reversed:
         text = f"{naming.name(second)} moves against {naming.name(first)}: one of them is reversed"
-        return SensorFault(states=(first, second), kind="gain", text=text, value=-2.0, z=z)
+        return SensorFault(states=(first, second), kind=FaultKind.GAIN, text=text, value=-2.0, z=z)
     if guilty is not None:
         state = window.states[guilty]
         own = size if guilty == pair.second else float(1 / (1 + size) - 1)
@@ -135,13 +136,13 @@ def _gain(
         text = (
             f"{naming.name(state)}: its gain {change} (± {error:.1%}) against {naming.name(other)}, expected {expected}"
         )
-        return SensorFault(states=(state,), kind="gain", text=text, value=own, z=z)
+        return SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=own, z=z)
     change = f"came apart by {size:+.1%} within the window" if moving else f"are {size:+.1%} apart"
     text = (
         f"{naming.name(second)} and {naming.name(first)} {change} (± {error:.1%}) in gain, expected {expected}; "
         "which of them is wrong does not show"
     )
-    return SensorFault(states=(first, second), kind="gain", text=text, value=size, z=z)
+    return SensorFault(states=(first, second), kind=FaultKind.GAIN, text=text, value=size, z=z)
 
 
 def _delay(
@@ -152,7 +153,7 @@ def _delay(
     rate_hz: float,
 ) -> SensorFault:
     pair, delay = departure.reading.pair, departure.delay_s
-    guilty = _by_chain(departure, departures, "delay", moving=False)
+    guilty = _by_chain(departure, departures, FaultKind.DELAY, moving=False)
     if guilty is None:  # sensors come late, not early
         guilty = pair.second if delay > 0 else pair.first
     other = pair.first if guilty == pair.second else pair.second
@@ -162,7 +163,7 @@ def _delay(
         f"{naming.name(state)}: comes {1e3 * late:.3g} ms ({late * rate_hz:.2g} samples, ± "
         f"{1e3 * late / departure.delay_z:.2g} ms) after {naming.name(window.states[other])}, expected {expected}"
     )
-    return SensorFault(states=(state,), kind="delay", text=text, value=late, z=departure.delay_z)
+    return SensorFault(states=(state,), kind=FaultKind.DELAY, text=text, value=late, z=departure.delay_z)
 
 
 def _by_chain(
@@ -183,7 +184,7 @@ def _by_chain(
 
 
 def _size(departure: _Departure, kind: FaultKind, *, moving: bool) -> float:
-    if kind == "delay":
+    if kind == FaultKind.DELAY:
         return departure.delay_s
     return departure.course_step if moving else departure.log_gain
 

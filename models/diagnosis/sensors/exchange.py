@@ -11,6 +11,7 @@ from models.diagnosis.sensors.kinematics import Banded, banded, same
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["BROKEN", "suspect_pairs", "swapped"]
@@ -79,7 +80,7 @@ def swapped(
             else f"{naming.names(states[:2])} are swapped, or {naming.names(states[2:])}"
         )
         text = f"{either}: {pairs}, but not as they are connected (shared {then:.3f} crossed, {now:.3f} as connected)"
-        findings.append(SensorFault(states=states, kind="swapped", text=text, value=now))
+        findings.append(SensorFault(states=states, kind=FaultKind.SWAPPED, text=text, value=now))
     return findings, explained
 
 

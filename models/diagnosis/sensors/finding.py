@@ -1,17 +1,11 @@
 """What is said about a sensor, and whose data must not be used because of it."""
 
 from collections.abc import Iterable, Mapping
-from typing import Literal, get_args
 
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.windows import SensorFault
 
-__all__ = ["FAULT_KINDS", "FaultKind", "Naming", "implicated"]
-
-FaultKind = Literal["stuck", "clipped", "offset", "gain", "delay", "swapped", "incoherent", "noise"]
-
-FAULT_KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
-"""All kinds of fault."""
+__all__ = ["Naming", "implicated"]
 
 
 def implicated(findings: Iterable[SensorFault]) -> set[str]:

@@ -12,6 +12,7 @@ from models.diagnosis.pairs import motion_pairs
 from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["gain_jump"]
@@ -55,7 +56,7 @@ def gain_jump(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
                 f"{abs(value) / z:.1%}) while {naming.names(window.states[i] for i in others)} stayed as they were, "
                 "expected a machine to show in more than one channel: its gain jumped"
             )
-            findings.append(SensorFault(states=(state,), kind="gain", text=text, value=value, z=z))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.GAIN, text=text, value=value, z=z))
     return findings
 
 

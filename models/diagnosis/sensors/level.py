@@ -6,6 +6,7 @@ from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["clipped", "offset", "stuck"]
@@ -39,21 +40,21 @@ def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
         if state == "theta":
             if runs.max() >= limit:
                 text = f"{name}: the shaft angle stood still for {longest_s:.3g} s; it must turn or be left out"
-                findings.append(SensorFault(states=(state,), kind="stuck", text=text, value=longest_s))
+                findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
         elif np.any(coarse):
             quiet_s = float(coarse.sum()) * hops.n_samples / rate_hz
             text = (
                 f"{name}: shows nothing but its own steps of {naming.value(state, float(step[coarse].max()))} for "
                 f"{quiet_s:.3g} s, expected a vibration of several steps: the sensor is dead or its range far too wide"
             )
-            findings.append(SensorFault(states=(state,), kind="stuck", text=text, value=quiet_s))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=quiet_s))
         elif runs.max() >= limit:
             level = float(hops.mean[int(runs.argmax()), column])
             text = (
                 f"{name}: repeated the value {naming.value(state, level)} for {longest_s:.3g} s, "
                 f"expected to move within {STILL_S:g} s: the sensor or its line is stuck"
             )
-            findings.append(SensorFault(states=(state,), kind="stuck", text=text, value=longest_s))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.STUCK, text=text, value=longest_s))
     return findings
 
 
@@ -82,7 +83,7 @@ def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
                 f"{naming.name(state)}: cut off at {where}, {flat:.1%} of the samples stand exactly there, "
                 f"expected less than {float(allowed[:, column].max()):.1%}: the measuring range is too small"
             )
-            findings.append(SensorFault(states=(state,), kind="clipped", text=text, value=flat))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.CLIPPED, text=text, value=flat))
     return findings
 
 
@@ -111,7 +112,7 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
                 f"{name}: the mean jumped by {naming.value(state, value)} within the window ({abs(value) / own:.3g} "
                 f"times the channel's rms), expected a steady one: connector, supply or gap"
             )
-            findings.append(SensorFault(states=(state,), kind="offset", text=text, value=value, z=z))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=z))
         elif abs(drifts[column]) > max(DRIFT_PART * own, STEP_SPREADS * spread[column]) and not _shaft(
             window.states, column, drifts
         ):
@@ -122,7 +123,7 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
             )
             findings.append(
                 SensorFault(
-                    states=(state,), kind="offset", text=text, value=value, z=abs(value) / float(spread[column])
+                    states=(state,), kind=FaultKind.OFFSET, text=text, value=value, z=abs(value) / float(spread[column])
                 )
             )
         elif abs(moved[column]) > floor[column] and not _shaft(window.states, column, moved):
@@ -131,7 +132,7 @@ def offset(window: WindowStatistics, naming: Naming, reference: SensorReference 
                 f"{name}: the mean stands {naming.value(state, value)} from where it was on the healthy machine, "
                 f"expected within {naming.value(state, float(floor[column]))}"
             )
-            findings.append(SensorFault(states=(state,), kind="offset", text=text, value=value))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.OFFSET, text=text, value=value))
     return findings
 
 

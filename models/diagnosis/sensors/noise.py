@@ -26,6 +26,7 @@ from models.diagnosis.sensors.unshared import (
 )
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["noisy"]
@@ -153,7 +154,7 @@ def _of_pairs(
         findings.append(
             SensorFault(
                 states=states,
-                kind="noise",
+                kind=FaultKind.NOISE,
                 text=text,
                 value=sizes[column] / float(rms[column]),
                 z=float(rise[row].max()) / scatter,
@@ -211,7 +212,7 @@ def _of_single(
                 f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, then.line_rms)} on "
                 "the healthy machine), expected a machine to show in more than one channel: mains hum or a bad earth"
             )
-            findings.append(SensorFault(states=(state,), kind="noise", text=text, value=now.line_rms / own))
+            findings.append(SensorFault(states=(state,), kind=FaultKind.NOISE, text=text, value=now.line_rms / own))
         elif risen and now.flat > FLOOR_FLAT and size > LEAST_FLOOR * own:
             factor = float(np.exp(rise[row] / 2))
             text = (
@@ -221,7 +222,11 @@ def _of_single(
             )
             findings.append(
                 SensorFault(
-                    states=(state,), kind="noise", text=text, value=size / own, z=float(rise[row]) / _FLOOR_SCATTER
+                    states=(state,),
+                    kind=FaultKind.NOISE,
+                    text=text,
+                    value=size / own,
+                    z=float(rise[row]) / _FLOOR_SCATTER,
                 )
             )
     return findings

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.sensors.finding import FaultKind, Naming
+from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 __all__ = ["phase_faults"]
@@ -112,7 +113,7 @@ def _lost(window: WindowStatistics, name: str) -> SensorFault | None:
         f"{name}: {abs(whole).sum():.0f} whole turns {what} in {strange.size} of {hops} hops of a shaft that turns "
         f"{np.median(turns):.4g} ± {spread:.2g} times in each otherwise: pulses are missing or doubled"
     )
-    return _theta("incoherent", text, lost)
+    return _theta(FaultKind.INCOHERENT, text, lost)
 
 
 def _surroundings(window: WindowStatistics, columns: Sequence[int], at: int) -> tuple[FloatArray, FloatArray]:
@@ -163,7 +164,7 @@ def _elsewhere(
         f"{name}: turns at {own_rpm:.5g} rpm, but the rotation stands in the vibration at {rpm:.5g} rpm and not there: "
         "the angle is not this shaft's, or pulses are missing throughout"
     )
-    return _theta("incoherent", text, float(own_rpm / rpm))
+    return _theta(FaultKind.INCOHERENT, text, float(own_rpm / rpm))
 
 
 def _common(columns: Sequence[int], vectors: ComplexArray) -> _Common:
@@ -191,7 +192,9 @@ def _slip(window: WindowStatistics, common: _Common, name: str) -> SensorFault |
         f"{name}: slips against the vibration by {per_minute:+.3g} turns a minute, expected none: "
         "the angle is not this shaft's, or pulses are missing throughout"
     )
-    return _theta("incoherent", text, 1 + per_minute / (window.speed_rad_s * 30 / np.pi), abs(mean) / max(error, 1e-9))
+    return _theta(
+        FaultKind.INCOHERENT, text, 1 + per_minute / (window.speed_rad_s * 30 / np.pi), abs(mean) / max(error, 1e-9)
+    )
 
 
 def _jump(common: _Common, name: str) -> SensorFault | None:
@@ -218,7 +221,7 @@ def _jump(common: _Common, name: str) -> SensorFault | None:
         f"{name}: jumped by {np.degrees(-value):+.0f}° (± {np.degrees(float(error[0])):.1f}°) within the window: every "
         "channel's rotation turned by as much and kept its length, expected a machine to change each in its own way"
     )
-    return _theta("offset", text, -value, best)
+    return _theta(FaultKind.OFFSET, text, -value, best)
 
 
 def _turn(vectors: ComplexArray, k: int) -> tuple[FloatArray, FloatArray]:
@@ -263,4 +266,4 @@ def _jitter(window: WindowStatistics, columns: Sequence[int], vectors: ComplexAr
         f"{name}: jitters by about {np.degrees(jitter_rad):.0f}° rms: {share:.0%} of the rotation's power is still in "
         f"every channel after what is steady with the angle was taken out, expected next to nothing"
     )
-    return _theta("noise", text, jitter_rad, z)
+    return _theta(FaultKind.NOISE, text, jitter_rad, z)

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
 
-from models.alarm_names import ALARM_TEXT
+from models.alarm_names import ALARMS
 from models.errors import RotorwatchError
 from rotorwatch.records.alarms import Alarm, AlarmState, AlarmStates
 from rotorwatch.records.example import example
@@ -196,8 +196,8 @@ def _present(view: MachineView, name: str) -> Alarm:
     HTTPException
         404 if there is no such alarm.
     """
-    if name not in ALARM_TEXT:
-        raise HTTPException(404, f"no alarm {name[:64]}; there are: {', '.join(ALARM_TEXT)}")
+    if name not in ALARMS:
+        raise HTTPException(404, f"no alarm {name[:64]}; there are: {', '.join(ALARMS)}")
     for one in view.alarms(include_normal=True).alarms:
         if one.name == name:
             return one

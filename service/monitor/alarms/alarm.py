@@ -1,83 +1,13 @@
 """An alarm, what happens to it, and the sentences operators read."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
-from models.alarm_names import (
-    CLOCK,
-    CONFLICT,
-    FAULT,
-    GAP,
-    MODEL,
-    OVERLOADED,
-    PHASE_REFERENCE,
-    SHAPE,
-    STREAM_LOST,
-    alarm_text,
-)
+from models.alarm_names import alarm_kind
 from models.diagnosis.readings import Z95
 from models.physics.parameters import PARAMETER_TEXT
-from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 
-__all__ = ["Alarm", "AlarmEvent", "Evidence", "Shelf"]
-
-_CLEARED: Mapping[str, str] = MappingProxyType(
-    {
-        MODEL: "the model describes the machine again",
-        SHAPE: "the vibration is as it was",
-        STREAM_LOST: "data come again",
-        FAULT: "the monitor works again",
-        OVERLOADED: "the monitor keeps up again",
-        GAP: "the data are without gaps again",
-        CLOCK: "the clock of the data runs steadily again",
-        CONFLICT: "one publisher sends, and does not contradict itself",
-        PHASE_REFERENCE: "the phase reference is there again",
-    }
-)
-_RAISED: Mapping[str, str] = MappingProxyType(
-    {
-        MODEL: "something has changed that no parameter describes, or a sensor is at fault",
-        SHAPE: "a channel's vibration is no longer as on the healthy machine",
-    }
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """What an alarm was decided on.
-
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        The data: a window, or the stretch that decided.
-    confidence : float or None
-        Probability that what is named changed and nothing else, where one is computed.
-    """
-
-    start_ns: int
-    end_ns: int
-    confidence: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Shelf:
-    """Why an alarm is shelved, and until when.
-
-    Attributes
-    ----------
-    until_ns : int
-        Data time at which it ends at the latest.
-    one_shot : bool
-        It ends when the condition clears, if that is earlier.
-    by, reason : str
-        Who, and why.
-    """
-
-    until_ns: int
-    one_shot: bool
-    by: str
-    reason: str
+__all__ = ["Alarm", "AlarmEvent"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +17,7 @@ class Alarm:
     Attributes
     ----------
     name : str
-        One of `ALARM_TEXT`.
+        One of `ALARMS`.
     state : AlarmState
         Where it is in its life cycle.
     present : bool
@@ -191,7 +121,7 @@ class AlarmEvent:
     def text(self) -> str:
         """The event in a sentence."""
         alarm = self.alarm
-        words = alarm_text(alarm.name)
+        words = alarm_kind(alarm.name).text
         match self.kind:
             case EventKind.RAISED | EventKind.ESCALATED | EventKind.CLEARED:
                 hidden = "" if alarm.state.annunciated else f" ({alarm.state.value})"
@@ -203,11 +133,11 @@ class AlarmEvent:
 
     def _about_condition(self) -> str:
         alarm = self.alarm
-        words = alarm_text(alarm.name)
+        words = alarm_kind(alarm.name).text
         if alarm.name not in PARAMETER_TEXT:
             if self.kind is EventKind.CLEARED:
-                return f"cleared: {_CLEARED.get(alarm.name, f'{words}: nothing of it is seen any more')}"
-            said = alarm.note or _RAISED.get(alarm.name, "")
+                return f"cleared: {alarm_kind(alarm.name).cleared}"
+            said = alarm.note or alarm_kind(alarm.name).raised
             return f"{alarm.severity.upper()}: {words}" + (f": {said}" if said else "")
         what = f"{words} ({alarm.name})"
         half = Z95 * (alarm.standard_error or 0.0)
@@ -219,4 +149,4 @@ class AlarmEvent:
             case EventKind.ESCALATED:
                 return f"{alarm.severity.upper()}: {what} changed further, now {size}{reserve}"
             case _:
-                return f"cleared: {what} is back within its limits at {size}"
+                return f"cleared: {what} is back {alarm_kind(alarm.name).cleared} at {size}"

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 from pydantic import TypeAdapter
 
-from models.alarm_names import ALARM_TEXT, MODEL, of_the_machine
+from models.alarm_names import ALARMS, MODEL, alarm_kind
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
-from rotorwatch.records.alarms import AlarmState, EventKind, Severity
+from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 from rotorwatch.records.windows import Verdict
-from service.monitor.alarms.alarm import Alarm, AlarmEvent, Evidence, Shelf
+from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.life_cycle import Happening, follow, owed_after
 from service.monitor.alarms.operation import (
     HAPPENINGS,
@@ -73,7 +73,11 @@ class AlarmBook:
     @property
     def severity(self) -> Severity | None:
         """Highest severity of what is raised on the machine; what is wrong with the data is none of the machine."""
-        raised = [alarm.severity for alarm in self._alarms.values() if alarm.raised and of_the_machine(alarm.name)]
+        raised = [
+            alarm.severity
+            for alarm in self._alarms.values()
+            if alarm.raised and alarm_kind(alarm.name).about == "machine"
+        ]
         if not raised:
             return None
         return Severity.DANGER if Severity.DANGER in raised else Severity.ALERT
@@ -107,7 +111,8 @@ class AlarmBook:
             End of the hop.
         """
         named = {finding.name for finding in verdict.changed}
-        evidence = Evidence(end_ns - round(verdict.decided_s * 1e9), end_ns, verdict.confidence)
+        start_ns = end_ns - round(verdict.decided_s * 1e9)
+        evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:
             if reading.relative_change is not None and reading.standard_error is not None:
                 self.update(
@@ -263,7 +268,7 @@ class AlarmBook:
                 alarm,
                 beyond_ns=None if alarm.beyond_ns is None else time_ns,
                 small_ns=None if alarm.small_ns is None else time_ns,
-                shelf=None if shelf is None else replace(shelf, until_ns=shelf.until_ns + step_ns),
+                shelf=None if shelf is None else shelf.model_copy(update={"until_ns": shelf.until_ns + step_ns}),
             )
 
     def operate(self, operation: OperatorAction, time_ns: int) -> tuple[AlarmEvent, ...]:
@@ -284,8 +289,8 @@ class AlarmBook:
         OperationRefused
             If it is in a state in which this cannot be done, a reason is missing, or the time is too long.
         """
-        if operation.alarm not in ALARM_TEXT:
-            raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARM_TEXT)}")
+        if operation.alarm not in ALARMS:
+            raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARMS)}")
         alarm = self._known(operation.alarm, time_ns)
         self._must_be_as_seen(alarm, operation)
         happening, kind = HAPPENINGS[operation.kind]
@@ -334,7 +339,7 @@ class AlarmBook:
         except ValueError as error:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
         # Another version of the program may have known others.
-        self._alarms = {alarm.name: alarm for alarm in page.alarms if alarm.name in ALARM_TEXT}
+        self._alarms = {alarm.name: alarm for alarm in page.alarms if alarm.name in ALARMS}
         self._next_sequence = max(page.next_sequence, next_sequence or 0)
         self._untold = []
 
@@ -373,7 +378,7 @@ class AlarmBook:
                 f"{longest_s:g}"
             )
         until_ns = time_ns + round(duration_s * 1e9)
-        return Shelf(until_ns, operation.one_shot, operation.actor, operation.reason)
+        return Shelf(until_ns=until_ns, one_shot=operation.one_shot, by=operation.actor, reason=operation.reason)
 
     def _judge(
         self, alarm: Alarm, time_ns: int, *, beyond: bool, small: bool, danger: bool, at_once: bool = False

@@ -1,12 +1,12 @@
 """Alarms that say nothing of the machine: on the stream, its clock, the sensors, and the monitor itself."""
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, GAP, OVERLOADED, PHASE_REFERENCE, STREAM_LOST, data_alarm
-from models.diagnosis.sensors.finding import FAULT_KINDS
 from models.diagnosis.window import WindowStatistics
 from models.ingest import Admission
 from models.machine import MachineFile
+from rotorwatch.records.alarms import Evidence
+from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
-from service.monitor.alarms.alarm import Evidence
 from service.monitor.alarms.book import AlarmBook
 
 __all__ = ["DataPathAlarms"]
@@ -42,7 +42,7 @@ class DataPathAlarms:
             Blocks before it that the monitor itself threw away.
         """
         book, before_ns = self._book, start_ns - round(verdict.gap_s * 1e9)
-        missing, overloaded = Evidence(before_ns, start_ns), dropped > 0 and verdict.gap_s > 0
+        missing, overloaded = Evidence(start_ns=before_ns, end_ns=start_ns), dropped > 0 and verdict.gap_s > 0
         if verdict.gap_s >= self._silence_s and not overloaded:
             self._lost(before_ns)
         book.update_state(STREAM_LOST, False, self._found_again_ns(start_ns), at_once=True)
@@ -76,8 +76,8 @@ class DataPathAlarms:
             # Whatever is wrong with the shaft's angle costs the phase reference.
             name = PHASE_REFERENCE if found.states == ("theta",) else data_alarm(found.kind)
             said.setdefault(name, []).append(found.text)
-        evidence = Evidence(statistics.start_ns, statistics.end_ns)
-        for name in (PHASE_REFERENCE, *map(data_alarm, FAULT_KINDS)):
+        evidence = Evidence(start_ns=statistics.start_ns, end_ns=statistics.end_ns)
+        for name in (PHASE_REFERENCE, *map(data_alarm, FaultKind)):
             note = "; ".join(said.get(name, ()))
             self._book.update_state(name, name in said, statistics.end_ns, note, evidence=evidence)
 
@@ -99,7 +99,9 @@ class DataPathAlarms:
         """Raise the alarm on silence, at the time at which it was due: then live and replay say the same."""
         note = f"no usable data for {self._silence_s:g} s; what was raised stays raised"
         due_ns = end_ns + self._silence_ns
-        self._book.update_state(STREAM_LOST, True, due_ns, note, evidence=Evidence(end_ns, due_ns), at_once=True)
+        self._book.update_state(
+            STREAM_LOST, True, due_ns, note, evidence=Evidence(start_ns=end_ns, end_ns=due_ns), at_once=True
+        )
         self._book.suppress(None, due_ns)
 
     def _found_again_ns(self, start_ns: int) -> int:
