@@ -149,7 +149,7 @@ def test_programs_run_from_a_checkout_that_is_not_installed_and_say_their_versio
 
 def test_a_checkout_that_is_not_installed_can_be_imported(checkout: Path, others: Path, tmp_path: Path) -> None:
     code = (
-        "import importlib.metadata as m, service.runtime, service.api.asyncapi, simulator.training.command; "
+        "import importlib.metadata as m, service.runtime, simulator.training.command; "
         "print([d.name for d in m.distributions() if d.name.startswith('rotorwatch')])"
     )
     assert in_new_process(code, checkout, others, cwd=tmp_path) == "[]"

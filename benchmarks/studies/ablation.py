@@ -12,6 +12,8 @@ import numpy as np
 from benchmarks.studies import results as r
 from benchmarks.studies import variants as v
 from benchmarks.studies.opinions import LAYOUTS, changed_in
+from benchmarks.studies.paper import PAPER_EQUATIONS, PaperNetwork, mean_squared_deviation
+from benchmarks.studies.paper_training import train_paper_network
 from benchmarks.studies.results import Estimate, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from benchmarks.studies.variants import VARIANTS, Measure, Reader, Variant
@@ -19,8 +21,6 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.equations import EQUATIONS
-from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperNetwork, mean_squared_deviation
-from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
 from models.diagnosis.networks.relation_training import train_network
 from models.diagnosis.readings import Diagnostician

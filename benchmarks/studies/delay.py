@@ -13,11 +13,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from benchmarks.studies import results as r
+from benchmarks.studies.bound import cramer_rao
 from benchmarks.studies.evaluate import true_condition
 from benchmarks.studies.opinions import LAYOUTS, SEVERAL
 from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
-from models.diagnosis.likelihood.bound import cramer_rao
 from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds

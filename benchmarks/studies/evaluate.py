@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from benchmarks.studies import results as r
+from benchmarks.studies.bound import TrueCondition, cramer_rao
 from benchmarks.studies.opinions import (
     LAYOUTS,
     ONE,
@@ -23,7 +24,6 @@ from benchmarks.studies.opinions import (
 )  # fmt: skip
 from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
-from models.diagnosis.likelihood.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle

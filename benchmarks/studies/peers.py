@@ -13,12 +13,12 @@ import numpy as np
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import TITLES, changed_in, diagnosticians, named_in, opinion
 from benchmarks.studies.other_methods import FeatureVector, SubspaceModes
+from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, calibrate_paper
+from benchmarks.studies.paper_training import train_paper_network
 from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
-from models.diagnosis.networks.paper import PAPER_EQUATIONS, PaperDiagnostician, calibrate_paper
-from models.diagnosis.networks.paper_training import train_paper_network
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray

@@ -13,18 +13,18 @@ import numpy as np
 
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import TITLES, diagnosticians, named_in
-from benchmarks.studies.results import Chart, Estimate, Record, Table, Value
-from benchmarks.studies.study import Cell, Options, Over, Study
-from models.diagnosis.moments import plan_for
-from models.diagnosis.networks.bundle import Bundle, load_bundle
-from models.diagnosis.networks.paper import (
+from benchmarks.studies.paper import (
     PAPER_EQUATIONS,
     PaperDiagnostician,
     PaperHealthy,
     PaperNetwork,
     calibrate_paper,
 )
-from models.diagnosis.networks.paper_training import train_paper_network
+from benchmarks.studies.paper_training import train_paper_network
+from benchmarks.studies.results import Chart, Estimate, Record, Table, Value
+from benchmarks.studies.study import Cell, Options, Over, Study
+from models.diagnosis.moments import plan_for
+from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError

@@ -12,6 +12,10 @@ from functools import lru_cache
 
 import numpy as np
 
+from benchmarks.finite_elements.machines import ROTORS, rotor_named
+from benchmarks.finite_elements.observed import WindowSizes, machine_of, plan, sampled, windows_of
+from benchmarks.finite_elements.rotor import BeamRotor
+from benchmarks.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 from models.commissioning.identified import identify
 from models.commissioning.knowledge import KnowledgeLevel
 from models.commissioning.levels import learned_baseline
@@ -23,10 +27,6 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import ConditionRange, Machine, MachineFile, load_machine
 from models.signals.block import FloatArray
-from simulator.finite_elements.machines import ROTORS, rotor_named
-from simulator.finite_elements.observed import WindowSizes, machine_of, plan, sampled, windows_of
-from simulator.finite_elements.rotor import BeamRotor
-from simulator.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 
 SHIPPED = ("lab", "heavy", "light")

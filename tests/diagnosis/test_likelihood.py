@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.studies.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN, BinGroups, group_bins
-from models.diagnosis.likelihood.bound import TrueCondition, cramer_rao
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.motions import Motions
 from models.diagnosis.likelihood.scoring import FisherScoring

@@ -15,13 +15,13 @@ import pytest
 from models.machine import load_machine
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
-from service.api.asyncapi import asyncapi
 from service.runtime import running
 from service.stream.transport import route
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from simulator.truth import TruthRecord
+from tests.service.asyncapi import asyncapi
 from tests.service.live import LAB, ROOT, START_NS, endpoint, machine_file, open_session, settings, until
 
 PAGE = ROOT / "docs" / "asyncapi.json"

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.studies.paper import full_correlation
 from benchmarks.studies.variants import VARIANTS, as_seen, linear_fit, variant_equation
 from models.diagnosis.networks.equations import EQUATIONS
-from models.diagnosis.networks.paper import full_correlation
 from models.diagnosis.networks.relation import window_view
 from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.paper import (
+from benchmarks.studies.paper import (
     PAPER_EQUATIONS,
     full_correlation,
     phase_correlation,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.paper import (
+from benchmarks.studies.paper import (
     PAPER_EQUATIONS,
     PaperDiagnostician,
     PaperNetwork,
@@ -11,7 +11,7 @@ from models.diagnosis.networks.paper import (
     mean_squared_deviation,
     paper_rows,
 )
-from models.diagnosis.networks.paper_training import train_paper_network
+from benchmarks.studies.paper_training import train_paper_network
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine

@@ -9,6 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
+from benchmarks.finite_elements.forces import Force
+from benchmarks.finite_elements.motion import PROBES, move
+from benchmarks.finite_elements.rotor import BeamRotor, changed_rotor
 from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import MachineFile
@@ -16,9 +19,6 @@ from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage, RecordingWriter
-from simulator.finite_elements.forces import Force
-from simulator.finite_elements.motion import PROBES, move
-from simulator.finite_elements.rotor import BeamRotor, changed_rotor
 from simulator.messages import JSON_ENCODING, block_message
 
 __all__ = [
@@ -54,7 +54,7 @@ class RunCondition:
     forces : tuple of Force
     speed_rad_s : float
     changes : mapping of str to float
-        Relative changes of `simulator.finite_elements.rotor.CHANGEABLE`.
+        Relative changes of `benchmarks.finite_elements.rotor.CHANGEABLE`.
     noise_relative : float
         Sensor noise over each channel's own rms.
     noise_corner_hz : float or None

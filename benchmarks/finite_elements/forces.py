@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.finite_elements.assembly import Equations
 from models.physics.discretise import advance, discretise
 from models.physics.excitation import ColouringFilter, Source, colouring_filter
 from models.physics.lyapunov import stationary_covariance
 from models.signals.block import FloatArray
-from simulator.finite_elements.assembly import Equations
 
 __all__ = ["Force", "covariance_under", "force_samples", "forced"]
 
@@ -25,7 +25,7 @@ class Force:
     cutoff_hz : float
     rms_N : float
     share : tuple of (int, float)
-        Coordinates (`simulator.finite_elements.assembly.place`) and the part of the force there.
+        Coordinates (`benchmarks.finite_elements.assembly.place`) and the part of the force there.
     order : int
         Of the Butterworth low-pass, 1 to 4.
     hump_share, hump_hz, hump_damping : float

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from models.diagnosis.networks.paper import PaperEquation, PaperNetwork, paper_rows
+from benchmarks.studies.paper import PaperEquation, PaperNetwork, paper_rows
 from models.diagnosis.networks.relation import HIDDEN, Network
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError

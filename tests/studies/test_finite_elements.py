@@ -9,18 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.diagnosis.moments import plan_for
-from models.diagnosis.window import SlidingWindow
-from models.errors import EstimationError
-from models.physics.excitation import Source, source_spectrum
-from models.signals.channels import ChannelDescriptor
-from models.signals.recording import read_recording
-from models.signals.wire import decode_block
-from simulator.finite_elements.assembly import assemble, harmonic_response, modes, place, probed, unbalance_response
-from simulator.finite_elements.forces import Force, covariance_under
-from simulator.finite_elements.machines import ROTORS, rotor_named
-from simulator.finite_elements.motion import PROBES, move
-from simulator.finite_elements.observed import (
+from benchmarks.finite_elements.assembly import assemble, harmonic_response, modes, place, probed, unbalance_response
+from benchmarks.finite_elements.forces import Force, covariance_under
+from benchmarks.finite_elements.machines import ROTORS, rotor_named
+from benchmarks.finite_elements.motion import PROBES, move
+from benchmarks.finite_elements.observed import (
     MOTION,
     RATE_HZ,
     RunCondition,
@@ -33,8 +26,15 @@ from simulator.finite_elements.observed import (
     sampled,
     windows_of,
 )
-from simulator.finite_elements.rotor import BeamRotor, Bearing, Disc, changed_rotor
-from simulator.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc, changed_rotor
+from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+from models.diagnosis.moments import plan_for
+from models.diagnosis.window import SlidingWindow
+from models.errors import EstimationError
+from models.physics.excitation import Source, source_spectrum
+from models.signals.channels import ChannelDescriptor
+from models.signals.recording import read_recording
+from models.signals.wire import decode_block
 
 BEAM = BeamRotor(
     name="beam",

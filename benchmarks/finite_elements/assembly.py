@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.finite_elements.elements import beam_inertia, beam_mass, beam_stiffness, shear_ratio
+from benchmarks.finite_elements.rotor import BeamRotor
 from models.signals.block import FloatArray
-from simulator.finite_elements.elements import beam_inertia, beam_mass, beam_stiffness, shear_ratio
-from simulator.finite_elements.rotor import BeamRotor
 
 __all__ = [
     "Equations",

@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 
-from simulator.finite_elements.rotor import BeamRotor, Bearing, Disc
+from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc
 
 __all__ = ["ROTORS", "rotor_named"]
 

@@ -5,10 +5,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from simulator.finite_elements.assembly import assemble, place, probed, unbalance_response
-from simulator.finite_elements.forces import Force, covariance_under
-from simulator.finite_elements.observed import RunCondition
-from simulator.finite_elements.rotor import BeamRotor
+from benchmarks.finite_elements.assembly import assemble, place, probed, unbalance_response
+from benchmarks.finite_elements.forces import Force, covariance_under
+from benchmarks.finite_elements.observed import RunCondition
+from benchmarks.finite_elements.rotor import BeamRotor
 
 __all__ = ["COMMISSIONED", "SceneRange", "SourceLayout", "drawn_condition"]
 

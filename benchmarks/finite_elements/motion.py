@@ -14,9 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from models.errors import EstimationError
-from models.signals.block import FloatArray
-from simulator.finite_elements.assembly import (
+from benchmarks.finite_elements.assembly import (
     ComplexArray,
     Equations,
     assemble,
@@ -25,8 +23,10 @@ from simulator.finite_elements.assembly import (
     unbalance_force,
     unbalance_response,
 )
-from simulator.finite_elements.forces import Force, force_samples, forced
-from simulator.finite_elements.rotor import BeamRotor
+from benchmarks.finite_elements.forces import Force, force_samples, forced
+from benchmarks.finite_elements.rotor import BeamRotor
+from models.errors import EstimationError
+from models.signals.block import FloatArray
 
 __all__ = ["PROBES", "Motion", "move"]
 
