@@ -75,7 +75,6 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
 
     Parameters
     ----------
-    model : type of BaseModel
     fields : object
         What the file holds.
     place : object
@@ -97,7 +96,6 @@ def mistakes(error: ValidationError, model: type[BaseModel], fields: object = No
 
     Parameters
     ----------
-    error : ValidationError
     model : type of BaseModel
         What was expected.
     fields : object, optional

@@ -25,7 +25,6 @@ class RunSummary:
 
     Attributes
     ----------
-    blocks : int
     data_s : float
         Data seconds in these blocks.
     elapsed_s : float

@@ -75,10 +75,8 @@ class NonlinearPlant(Plant):
 
     Parameters
     ----------
-    machine : Machine
     condition : Condition
         What holds from the first sample on.
-    rng : numpy.random.Generator
 
     Raises
     ------

@@ -91,10 +91,8 @@ def publish(
 
     Parameters
     ----------
-    machine : MachineFile
     stream : iterator of (SampleBlock, tuple of TruthRecord)
         From `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for.
-    settings : PublishSettings
     stop : threading.Event, optional
         When set, publishing ends before the next block and the session closes at once.
     on_block : callable, optional

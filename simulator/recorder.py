@@ -36,7 +36,6 @@ def record(
 
     Parameters
     ----------
-    machine : MachineFile
     stream : iterator of (SampleBlock, tuple of TruthRecord)
         From `simulator.stream.blocks`.
     path : Path

@@ -29,11 +29,8 @@ class Sensor:
 
     Parameters
     ----------
-    channel : Channel
-    settings : SensorSettings
     rms_SI : float
         What ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
-    rate_hz : float
     rng : numpy.random.Generator
         Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
         change without changing the noise.
@@ -116,7 +113,6 @@ class SensorBank:
 
     Parameters
     ----------
-    machine : Machine
     sensors : Sensors
         Settings from the scenario.
     rms : ndarray, shape (12,)
@@ -153,7 +149,6 @@ class SensorBank:
 
         Parameters
         ----------
-        plant : PlantSamples
         first : int
             Sample number of the first one.
         """

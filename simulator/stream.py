@@ -39,7 +39,6 @@ def blocks(
 
     Parameters
     ----------
-    scenario : Scenario
     machine : Machine
         The original machine; its channels, rate and number format shape the blocks.
     block_s : float

@@ -42,7 +42,6 @@ class Condition:
     ----------
     relative_changes : mapping of str to float
         Every diagnosed parameter's change from the original machine.
-    speed_rpm : float
     sources : tuple of NamedSource
         Always as many and in the same order, so that the state carries over.
     excitation_level : float
@@ -85,7 +84,6 @@ def compile_timeline(scenario: Scenario, machine: Machine) -> Timeline:
 
     Parameters
     ----------
-    scenario : Scenario
     machine : Machine
         Its nominal speed holds until an event changes it; events start at the nearest sample of its rate.
     """

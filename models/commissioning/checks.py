@@ -279,7 +279,6 @@ def check_agreement(diagnoses: Sequence[Diagnosis], what: str) -> Check:
 
     Parameters
     ----------
-    diagnoses : sequence of Diagnosis
     what : str
         In words: "the parameters in the machine file".
     """

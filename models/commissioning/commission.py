@@ -39,7 +39,6 @@ class Commissioning:
 
     Attributes
     ----------
-    report : CommissioningReport
     commissioned : Commissioned or None
         None if it was refused.
     machine : Machine or None
@@ -65,7 +64,6 @@ def commission(
 
     Parameters
     ----------
-    machine : MachineFile
     recordings : sequence of HealthyRecording
         One for each file; of one steady condition each.
     entries : sequence of RecordingEntry

@@ -149,7 +149,6 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
     ----------
     directory : Path
         The bundle.
-    machine : MachineFile
     same_description : bool
         Whether channels, window and physics must be as they were.
 

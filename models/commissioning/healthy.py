@@ -82,7 +82,6 @@ def healthy_from_blocks(
     ----------
     name : str
         What the recording is called.
-    machine : MachineFile
     blocks : iterable of (SampleBlock, str)
         Blocks in their order, each with the hash of the channel descriptor that its sender named, or "".
     until_s : float, optional
@@ -129,7 +128,6 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     ----------
     path : Path
         Recording (MCAP); of several machines in it, the one with the machine file's site and name is taken.
-    machine : MachineFile
     until_s : float, optional
         Use only data from before this time after the first sample.
 

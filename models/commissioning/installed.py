@@ -20,7 +20,6 @@ class Installed:
 
     Attributes
     ----------
-    machine : MachineFile
     bundle : Bundle or None
         Trained networks.
     commissioned : Commissioned or None
@@ -52,7 +51,6 @@ def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
 
     Parameters
     ----------
-    machine : MachineFile
     bundle : str or Path, optional
         Shipped bundle by name, or directory of a trained or commissioned one.
 

@@ -25,7 +25,6 @@ class Knowledge:
 
     Attributes
     ----------
-    level : KnowledgeLevel
     text : str
         Why, in a sentence.
     """
@@ -36,10 +35,6 @@ class Knowledge:
 
 def knowledge_of(machine: MachineFile) -> Knowledge:
     """Level of knowledge that a machine file gives.
-
-    Parameters
-    ----------
-    machine : MachineFile
 
     Examples
     --------

@@ -32,7 +32,6 @@ class Line:
     ----------
     state : str
         Where it is strongest.
-    frequency_hz : float
     share : float
         Of the power of that channel's random part.
     """
@@ -43,12 +42,7 @@ class Line:
 
 
 def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
-    """Lines that are neither noise nor a multiple of the speed, strongest first.
-
-    Parameters
-    ----------
-    recording : HealthyRecording
-    """
+    """Lines that are neither noise nor a multiple of the speed, strongest first."""
     hops = recording.hops
     segments = np.concatenate([hop.segments for hop in hops]) if hops else np.empty((0, 0, 0))
     if segments.shape[0] < _FEWEST_SEGMENTS:

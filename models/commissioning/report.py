@@ -107,7 +107,6 @@ def parameter_summaries(
 
     Parameters
     ----------
-    machine : MachineFile
     diagnoses : sequence of (recording, end_ns, Diagnosis)
         Healthy windows read as later ones will be, with the shared error in each.
     compared : sequence of (recording, end_ns, Diagnosis)

@@ -8,10 +8,6 @@ _DIGITS, _MOST_DIGITS = 3, 15
 def beyond(value: float, limit: float) -> tuple[str, str]:
     """Print a value and the limit it is beyond with so many digits that it is beyond the limit as printed, too.
 
-    Parameters
-    ----------
-    value, limit : float
-
     Examples
     --------
     >>> beyond(7.4449, 5.0)

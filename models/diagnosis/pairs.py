@@ -76,7 +76,6 @@ def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tupl
     segments : ndarray, shape (n_segments, n_bins, n)
         Fourier coefficients.
     frequencies_hz : ndarray, shape (n_bins,)
-    pairs : tuple of MotionPair
 
     Returns
     -------

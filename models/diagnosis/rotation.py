@@ -67,7 +67,6 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
     ----------
     x : ndarray, shape (n_samples, n)
         All samples of the hop and what it needs before it.
-    rate_hz : float
     speed_rad_s, tolerance : float
         Expected speed and how far it may be off, relative.
 
@@ -150,7 +149,6 @@ def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> Flo
     ----------
     lines : tuple of RotationLine or None
         Of hops that follow each other, apart from gaps.
-    hop_s : float
 
     Returns
     -------

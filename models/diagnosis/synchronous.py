@@ -91,8 +91,6 @@ def hop_coefficients(plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotatio
 
     Parameters
     ----------
-    plan : Plan
-    hops : tuple of HopMoments
     rotation : Rotation
         Where its speed is nan, nothing but the mean is taken out.
     mean : ndarray, shape (n,)

@@ -90,7 +90,6 @@ class PulseTrain:
         Number of each pulse, with the missing ones counted.
     known : ndarray of bool, shape (n - 1,)
         Whether the shaft turned without doubt from this pulse to the next.
-    pulses_per_turn : int
     missing, extra : int
         Pulses that were missing and are bridged; pulses too many, which are left out.
     """
@@ -118,7 +117,6 @@ def pulse_train(times: FloatArray, pulses_per_turn: int = 1) -> PulseTrain:
     ----------
     times : ndarray, shape (n,)
         Times of the pulses, ascending, at least two.
-    pulses_per_turn : int
 
     Raises
     ------
@@ -155,7 +153,6 @@ def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> 
 
     Parameters
     ----------
-    train : PulseTrain
     at : ndarray, shape (n,)
         In the unit of the train's times.
     reverse : bool

@@ -90,7 +90,6 @@ def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert
 
     Parameters
     ----------
-    grants : sequence of Grant
     known_by : {"usernames", "cert_common_names"}
         What the names in `Grant.who` are.
     """

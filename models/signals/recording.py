@@ -285,7 +285,6 @@ def read_recording(
 
     Parameters
     ----------
-    path : Path
     keys : collection of str, optional
         Only these keys.
     from_ns, to_ns : int, optional

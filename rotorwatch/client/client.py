@@ -184,7 +184,6 @@ class Client:
 
         Parameters
         ----------
-        place : str
         after : int, optional
             -1 for the whole log. Ends with the latest event there is.
         since_ns, until_ns : int, optional

@@ -25,7 +25,6 @@ def readiness_of(
     ----------
     session_open : bool
         The Zenoh session is.
-    machines : sequence of MachineReadiness
     history_open : bool
         The database is connected and its tables are up to date.
     history_trouble : str

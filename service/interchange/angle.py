@@ -67,8 +67,6 @@ class AngleColumn:
 
     Attributes
     ----------
-    machine : MachineFile
-    pulses : PulseTrain or None
     reverse : bool
         Whether the shaft turns from z to y.
     unknown : int

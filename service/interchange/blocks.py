@@ -24,7 +24,6 @@ class Written:
 
     Attributes
     ----------
-    blocks, samples : int
     stretches : int
         Contiguous stretches.
     too_short : int
@@ -49,7 +48,6 @@ class BlockMaker:
 
     Parameters
     ----------
-    machine : MachineFile
     origin_ns : int
         Time of the first row of the file.
     """

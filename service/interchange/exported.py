@@ -95,8 +95,6 @@ class Table:
 
     Attributes
     ----------
-    schema : pyarrow.Schema
-    batches : iterator of pyarrow.RecordBatch
     rows : int
         Rows that were taken so far.
     skipped : list of str

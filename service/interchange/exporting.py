@@ -35,7 +35,6 @@ def export(
 
     Parameters
     ----------
-    selection : Selection
     what : {"stream", "reports", "alarms"}
     kind : {"parquet", "csv", "mat"}
     out : Path

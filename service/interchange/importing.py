@@ -32,16 +32,10 @@ class Imported:
 
     Attributes
     ----------
-    source : Path
-    recording : Path
-    machine : MachineFile
-    mapping : Mapping
-    clock : Clock
     read : Read
         What was met in the file.
     written : Written
         What went into the recording.
-    pulses : PulseTrain or None
     cut_rows : int
         Rows at the ends of stretches where filters are not settled.
     unknown_angle : int

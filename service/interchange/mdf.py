@@ -20,10 +20,6 @@ class MdfSource(Source):
     A channel is named by its own name where that is unique, and always ``number of its group/name``. ``time`` is the
     time column of the first channel that is asked for together with it.
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     SourceError

@@ -42,12 +42,7 @@ class WindowFilter(Protocol):
 
 
 class Overlap:
-    """Runs a filter over pieces; remembers what the next window needs.
-
-    Parameters
-    ----------
-    window_filter : WindowFilter
-    """
+    """Runs a filter over pieces; remembers what the next window needs."""
 
     def __init__(self, window_filter: WindowFilter) -> None:
         self._filter = window_filter
@@ -93,13 +88,7 @@ class Overlap:
 
 
 class Integration:
-    """Integrates the accelerometers among the columns; the others pass.
-
-    Parameters
-    ----------
-    signals : list of Signal
-    rate_hz, high_pass_hz : float
-    """
+    """Integrates the accelerometers among the columns; the others pass."""
 
     multiple = 1
 

@@ -27,7 +27,6 @@ class Signal:
         Channel of the machine.
     reference : Reference
         Where its numbers are.
-    factor, offset : float
     integrations : int
         How often it is integrated: 0, or 1 or 2 for an accelerometer.
     is_angle : bool
@@ -78,7 +77,6 @@ class Read:
     ----------
     rows : int
         Rows of the file.
-    gaps : list of Gap
     filled : int
         Rows that were put into short gaps.
     left_out : int
@@ -127,10 +125,6 @@ def pieces(source: Source, signals: Sequence[Signal], clock: Clock, mapping: Map
 
     Parameters
     ----------
-    source : Source
-    signals : sequence of Signal
-    clock : Clock
-    mapping : Mapping
     read : Read
         Is kept up to date.
 

@@ -84,7 +84,6 @@ class Source:
 
     Parameters
     ----------
-    path : Path
     columns : mapping of str to object
         What the format's library has for each column, by name.
     """

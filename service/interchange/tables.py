@@ -43,7 +43,6 @@ class CsvSource(_Table):
 
     Parameters
     ----------
-    path : Path
     form : CsvFormat
         Delimiter, decimal sign and which lines to leave out.
     time_column : str or None
@@ -155,10 +154,6 @@ class CsvSource(_Table):
 
 class ParquetSource(_Table):
     """A Parquet file, read row group by row group.
-
-    Parameters
-    ----------
-    path : Path
 
     Raises
     ------

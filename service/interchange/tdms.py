@@ -14,10 +14,6 @@ __all__ = ["TdmsSource"]
 class TdmsSource(Source):
     """A TDMS file, read piece by piece. Channels are named ``group/channel``, or ``channel`` where that is unique.
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     SourceError

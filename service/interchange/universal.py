@@ -17,10 +17,6 @@ _EVEN = 1e-6
 class UniversalSource(Source):
     """A UFF file, read whole. A data set is named by its first line where that is unique, and ``set 1``, ``set 2``, ...
 
-    Parameters
-    ----------
-    path : Path
-
     Raises
     ------
     SourceError

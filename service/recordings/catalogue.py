@@ -40,7 +40,6 @@ class Recording:
     ----------
     id : str
         ``<site>/<machine>/<file name>``, as `Catalogue.find` takes it.
-    site, machine : str
     path : Path
         The file.
     start_ns, end_ns : int

@@ -46,7 +46,6 @@ class RecorderStatus:
 
     Attributes
     ----------
-    site, machine : str
     state : str
         ``idle`` (no message yet), ``recording`` or ``failing``.
     problem : str

@@ -65,8 +65,6 @@ def decide(
     ----------
     recordings : iterable of Recording
         Of one machine; incomplete ones are left alone, and so are those with names of somebody else's making.
-    marks : sequence of AlarmMark
-    settings : RecordingSettings
     now_ns : int
         Present time, nanoseconds since 1970-01-01 UTC.
     """

@@ -25,7 +25,6 @@ def print_report(report: CommissioningReport, console: Console | None = None) ->
 
     Parameters
     ----------
-    report : CommissioningReport
     console : rich.console.Console, optional
         The terminal without it. 80 columns suffice.
     """

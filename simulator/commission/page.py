@@ -72,7 +72,6 @@ def write_report(
     ----------
     directory : Path
         Made if it is not there.
-    report : CommissioningReport
     recordings : sequence of HealthyRecording
         What it was made from: for the pictures and the table of recordings.
     machine : MachineFile, optional

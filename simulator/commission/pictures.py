@@ -26,14 +26,7 @@ _COMPARED = {
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A picture and what stands below it.
-
-    Attributes
-    ----------
-    title : str
-    svg : Markup
-    caption : str
-    """
+    """A picture and what stands below it."""
 
     title: str
     svg: Markup
@@ -47,7 +40,6 @@ def pictures_of(
 
     Parameters
     ----------
-    report : CommissioningReport
     names : sequence of str
         Of the recordings, in the order in which they are numbered.
     portraits : sequence of Portrait

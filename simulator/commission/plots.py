@@ -26,7 +26,6 @@ def draw_readings(report: CommissioningReport, recordings: Sequence[str]) -> Fig
 
     Parameters
     ----------
-    report : CommissioningReport
     recordings : sequence of str
         Names, in the order in which they are numbered.
     """
@@ -79,12 +78,7 @@ def _time(reading: HealthyReading) -> int:
 
 
 def draw_budget(report: CommissioningReport) -> Figure | None:
-    """Standard errors of a window and of the commissioning against what a wished change allows; None without them.
-
-    Parameters
-    ----------
-    report : CommissioningReport
-    """
+    """Standard errors of a window and of the commissioning against what a wished change allows; None without them."""
     read = [one for one in report.parameters if one.window_error]
     if not read:
         return None

@@ -72,7 +72,6 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
     ----------
     number : int
         Its number on the page.
-    recording : HealthyRecording
     """
     hops = recording.hops
     if not hops:

@@ -52,14 +52,12 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
 
     Parameters
     ----------
-    machine : Machine
     out : Path
         Directory of the bundle.
     n_windows : int
         Simulated training windows per relation network; half as many for calibration.
     n_draws : int
         Random machines and conditions for the amortised networks.
-    seed, processes : int
 
     Raises
     ------

@@ -105,10 +105,8 @@ class Draw:
 
     Attributes
     ----------
-    machine : Machine
     seed : int
         Of the whole training or study.
-    purpose : Purpose
     stream : int
         Tells apart series of windows of the same purpose (equations, cells of a table).
     kept_nominal : tuple of str
@@ -332,7 +330,6 @@ def windows(
 
     Parameters
     ----------
-    draw : Draw
     numbers : sequence of int
         Which windows of the series.
     processes : int

@@ -42,8 +42,6 @@ class FeatureDraws:
 
     Attributes
     ----------
-    machine : Machine
-    seed : int
     conditions : int
         Conditions per batch; each gives four windows.
     mean, directions : ndarray

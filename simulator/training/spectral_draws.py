@@ -73,10 +73,6 @@ class SpectralDraws:
 
     The excitation is drawn more broadly than the diagnosis assumes: mostly one second-order low-pass for all sources,
     as in the simulator, but also other slopes and a cutoff per source, and sensor noise that differs between channels.
-
-    Parameters
-    ----------
-    machine : Machine
     """
 
     def __init__(self, machine: Machine) -> None:
@@ -110,7 +106,6 @@ class SpectralDraws:
 
         Parameters
         ----------
-        rng : numpy.random.Generator
         expected : ndarray of complex, shape (n_windows, n_bins, n, n)
             Expected cross-spectra of any linear combinations of the measured states.
         speed_rad_s : ndarray, shape (n_windows,)

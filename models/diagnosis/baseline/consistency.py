@@ -25,7 +25,6 @@ class HeldOutReading:
 
     Attributes
     ----------
-    parameter : str
     change, standard_error : float
         Relative change and its standard error, the relation's included.
     """
@@ -56,7 +55,6 @@ class LeftOut:
         One for each of the row's own parameters.
     misfit : float
         χ² of what is left per degree of freedom.
-    degrees_of_freedom : int
     """
 
     row: str
@@ -80,7 +78,6 @@ def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashabl
 
     Parameters
     ----------
-    row : Row
     parts : sequence of LagMoments
         One of each healthy window.
     conditions : sequence

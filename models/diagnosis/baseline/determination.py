@@ -25,7 +25,6 @@ def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, .
 
     Parameters
     ----------
-    baseline : Baseline
     rows : sequence of Row
         The table it was learned by.
 

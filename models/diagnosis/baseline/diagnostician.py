@@ -86,7 +86,6 @@ class BaselineDiagnostician:
 
     Parameters
     ----------
-    baseline : Baseline
     rows : sequence of Row
         The table it was learned by.
     """

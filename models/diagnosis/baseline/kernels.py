@@ -29,8 +29,6 @@ class Shape:
 
     Attributes
     ----------
-    power : int
-    width_s : float
     lead_s : float
         From the shortest lag to the first kernel's centre; what lies before it weighs less than a thousandth.
     """
@@ -97,7 +95,6 @@ def kernels(lags_s: FloatArray, lag_from_s: float, shape: Shape, deepest: int) -
         Equally spaced.
     lag_from_s : float
         Where the first kernel begins.
-    shape : Shape
     deepest : int
         Most derivatives that are asked for, at most 4.
     """

@@ -45,14 +45,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A measured state and the derivative of it that stands on the kernel.
-
-    Attributes
-    ----------
-    state : str
-    derivatives : int
-    factor : float
-    """
+    """A measured state and the derivative of it that stands on the kernel."""
 
     state: str
     derivatives: int

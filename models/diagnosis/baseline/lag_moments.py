@@ -48,8 +48,6 @@ class LagMoments:
 
     Attributes
     ----------
-    of : RowWindow
-    kernels : Kernels
     values : ndarray, shape (n_moments, n_terms)
         One row per reference and kernel, SI units.
     hop_values : ndarray, shape (n_hops, n_moments, n_terms)
@@ -101,8 +99,6 @@ class RowWindow:
 
     Attributes
     ----------
-    window : WindowStatistics
-    formation : Formation
     references : tuple of str
         States that serve as references.
     terms : ndarray of complex, shape (n_bins, n_states, n_terms)
@@ -165,7 +161,6 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
 
     Parameters
     ----------
-    row : Row
     window : WindowStatistics
         With correlations at lags up to 0.1 s or more.
     states : tuple of str

@@ -45,7 +45,6 @@ class Relation:
         Theirs, widened where the relation did not fit.
     misfit : float
         χ² of the fit per degree of freedom.
-    degrees_of_freedom : int
     allowance : float
         Factor on the variances of every later window, from how well the relation holds in conditions that it was not
         learned in; at least 1.
@@ -72,7 +71,6 @@ class Contribution:
 
     Attributes
     ----------
-    moments : LagMoments
     projection : ndarray, shape (n_coefficients, n_moments)
         From its moments to the coefficients.
     """
@@ -94,14 +92,12 @@ class RowChange:
         wider where more is left over than chance leaves.
     sensitivity : ndarray, shape (n_own, n_coefficients)
         Of the change to the relation's coefficients.
-    moments : LagMoments
     combination : ndarray, shape (n_terms,)
         The window's own force.
     widening : float
         Scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance.
     chi2 : float
         What the change leaves, in units of all its errors.
-    degrees_of_freedom : int
     """
 
     change: FloatArray
@@ -122,8 +118,6 @@ class Fit:
     ----------
     coefficients : ndarray, shape (n,)
     covariance : ndarray, shape (n, n)
-    chi2 : float
-    degrees_of_freedom : int
     """
 
     coefficients: FloatArray
@@ -188,7 +182,6 @@ def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
 
     Parameters
     ----------
-    row : Row
     parts : sequence of LagMoments
         One of each healthy window.
     """
@@ -202,7 +195,6 @@ def learn_row(row: Row, parts: Sequence[LagMoments], *, widened: bool = True) ->
 
     Parameters
     ----------
-    row : Row
     parts : sequence of LagMoments
         One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
     widened : bool

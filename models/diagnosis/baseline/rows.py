@@ -181,7 +181,6 @@ def evaluable_rows(
         Measured state variables and accelerations.
     has_phase_reference : bool
         Or a speed that the vibration's own line is looked for at.
-    rows : sequence of Row
 
     Returns
     -------

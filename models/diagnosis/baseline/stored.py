@@ -101,7 +101,6 @@ class BaselineRecord(BaseModel):
         Of the coefficients of all rows.
     rotations : tuple
         Synchronous vectors by speed.
-    duration_s : float
     consistency : tuple
         Healthy windows against each other.
     """

@@ -46,7 +46,6 @@ class SynchronousVectors:
         Real parts of the displacements, then their imaginary parts, m.
     covariance : ndarray, shape (2 n, 2 n)
         From the stochastic part near the speed.
-    speed_rad_s : float
     absolute : bool
         Whether angles are those to the phase reference; otherwise only angles between coordinates hold.
     """

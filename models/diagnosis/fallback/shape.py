@@ -49,7 +49,6 @@ class ShapeSpread(BaseModel):
 
     Attributes
     ----------
-    channel : str
     mean : tuple of float
         ρ at the lags.
     directions : tuple of tuple of float
@@ -90,10 +89,8 @@ class HealthyShape(BaseModel):
         Healthy windows it was learned from.
     window_s : float
         Length of the shortest of them.
-    lags_s : tuple of float
     speed_rad_s : tuple of float or None
         Slowest and fastest of them; None without a phase reference.
-    channels : tuple of ShapeSpread
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -116,7 +113,6 @@ class HealthyShape(BaseModel):
 
         Parameters
         ----------
-        window : WindowStatistics
         rate : float
             Declared probability that any channel of an unchanged machine is called changed in one window.
 

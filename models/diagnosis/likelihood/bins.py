@@ -99,7 +99,6 @@ def group_bins(
         Its nominal modes say where spectra are narrow.
     excluded : ndarray of bool, shape (n_bins,)
         Bins that belong to no group.
-    widest_hz : float
     """
     spacing = frequencies_hz[1] - frequencies_hz[0]
     modes_hz, damping = natural_frequencies(machine)

@@ -41,8 +41,6 @@ def unexplained_at(
 
     Parameters
     ----------
-    model : SpectralModel
-    weights : Weights
     reached : Whitened
         The point.
     states : ndarray, shape (n_groups, n_states, n_states)

@@ -54,7 +54,6 @@ class Linearised:
 
     Parameters
     ----------
-    model : SpectralModel
     weights : Weights
         Those of the search that ended there.
     searched : ModelPoint
@@ -154,7 +153,6 @@ class Linearised:
         ----------
         observed : ndarray, shape (n_groups, n, n)
             In the units of the model.
-        speed_rad_s : float
         near, gain : float
             As `FisherScoring.maximise` has them.
         """

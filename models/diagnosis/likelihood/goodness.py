@@ -39,7 +39,6 @@ class Alternative:
 
     Attributes
     ----------
-    name : str
     z : float
         Its score in standard errors.
     change : float
@@ -110,10 +109,6 @@ def goodness_of_fit(
 
     Parameters
     ----------
-    machine : Machine
-    model : SpectralModel
-    weights : Weights
-    found : Maximum
     states : ndarray, shape (n_groups, n_states, n_states)
         Estimated cross-spectra of the states, SI: displacement and velocity are compared with each other, too.
     """

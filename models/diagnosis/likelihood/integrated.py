@@ -19,10 +19,6 @@ def integrated(window: WindowStatistics) -> WindowStatistics:
 
     An acceleration beside a velocity of the same place is left out: it is the same motion with more noise at low
     frequencies. Correlations are kept at lag zero alone, where they follow from the spectra.
-
-    Parameters
-    ----------
-    window : WindowStatistics
     """
     if not any(name in ACCELERATIONS for name in window.states):
         return window

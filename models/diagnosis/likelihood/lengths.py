@@ -14,12 +14,7 @@ __all__ = ["LengthFits"]
 
 
 class LengthFits:
-    """One fit for the window, and one for every shorter length that has news.
-
-    Parameters
-    ----------
-    machine : Machine
-    """
+    """One fit for the window, and one for every shorter length that has news."""
 
     def __init__(self, machine: Machine) -> None:
         self._machine = machine
@@ -73,11 +68,6 @@ class LengthFits:
 
     def short(self, hops: int, stretch: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
-
-        Parameters
-        ----------
-        hops : int
-        stretch : WindowStatistics
 
         Raises
         ------

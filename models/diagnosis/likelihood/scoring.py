@@ -46,7 +46,6 @@ class Whitened:
 
     Attributes
     ----------
-    point : ModelPoint
     L_inverse : ndarray, shape (n_groups, n, n)
     excess : ndarray, shape (n_groups, n, n)
         L⁻¹ Ŝ L⁻ᴴ - I: zero where theory and estimate agree.
@@ -130,7 +129,6 @@ class Weights:
 
     Parameters
     ----------
-    model : SpectralModel
     n_segments : int
         Segments the estimated spectra are averaged over.
     usual_cutoff_hz : float
@@ -178,12 +176,10 @@ class FisherScoring:
 
     Parameters
     ----------
-    model : SpectralModel
     observed : ndarray, shape (n_groups, n, n)
         Estimated cross-spectra in units of the model's scale.
     n_segments : int
         Segments they are averaged over.
-    speed_rad_s : float
     usual_cutoff_hz : float
         Where the cutoff is pulled, weakly, if the band does not show it.
     strength : float, optional
@@ -227,7 +223,6 @@ class FisherScoring:
         Parameters
         ----------
         theta : ndarray, shape (size,)
-        most_steps : int
         near, gain : float
             Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
             gain less than `gain` in log-likelihood.

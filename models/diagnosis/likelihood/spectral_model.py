@@ -225,7 +225,6 @@ class SpectralModel:
 
         Parameters
         ----------
-        point : ModelPoint
         L_inverse : ndarray, shape (n_groups, n, n)
             Inverse Cholesky factors of the spectra.
         out : ndarray, shape (size, n_groups, n²), optional
@@ -270,7 +269,6 @@ class SpectralModel:
 
         Parameters
         ----------
-        point : ModelPoint
         whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
             L⁻¹G and L⁻¹GC.
         change : ndarray, shape (6, 6)
@@ -293,7 +291,6 @@ class SpectralModel:
 
         Parameters
         ----------
-        point : ModelPoint
         whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
             L⁻¹G and L⁻¹GC.
         row, column : int

@@ -24,12 +24,10 @@ def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatAr
 
     Parameters
     ----------
-    model : SpectralModel
     observed : ndarray, shape (n_groups, n, n)
         Estimated cross-spectra in units of the model's scale.
     centre : ndarray, shape (size,)
         Usual values of everything else.
-    speed_rad_s : float
     """
     groups = model.groups
     w = 2 * np.pi * groups.centre_hz

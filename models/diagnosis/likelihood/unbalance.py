@@ -38,10 +38,8 @@ class Unbalance:
 
     Attributes
     ----------
-    change, variance : float
     covariance : ndarray, shape (5,)
         With the logarithmic ratios of the structural parameters.
-    vector : UnbalanceVector
     """
 
     change: float
@@ -108,15 +106,12 @@ def estimate_unbalance(
 
     Parameters
     ----------
-    machine : Machine
-    model : SpectralModel
     point : ModelPoint
         The model's spectra at the estimate.
     covariance : ndarray, shape (5, 5)
         Of the logarithmic ratios of the structural parameters.
     synchronous : ndarray of complex, shape (n_states,)
         q, SI.
-    speed_rad_s, duration_s : float
 
     Raises
     ------

@@ -105,8 +105,6 @@ class AmortisedNetworks:
     ----------
     states : tuple of str
         Measured states they were trained with.
-    basis : FeatureBasis
-    networks : tuple of AmortisedNetwork
     calibration : mapping of str to Calibration
         For every parameter; empty before calibration.
     novelty_limit : float
@@ -124,13 +122,7 @@ class AmortisedNetworks:
 
 
 class NetworkDiagnostician:
-    """Reads all parameters of a window from the amortised networks.
-
-    Parameters
-    ----------
-    machine : Machine
-    amortised : AmortisedNetworks
-    """
+    """Reads all parameters of a window from the amortised networks."""
 
     def __init__(self, machine: Machine, amortised: AmortisedNetworks) -> None:
         self._machine, self._amortised = machine, amortised

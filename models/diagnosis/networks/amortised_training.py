@@ -116,7 +116,6 @@ def train_networks(
 
     Parameters
     ----------
-    machine : Machine
     states : tuple of str
         Measured states that the features were made of.
     principal : tuple of ndarray
@@ -208,8 +207,6 @@ def calibrate_networks(
 
     Parameters
     ----------
-    machine : Machine
-    trained : AmortisedNetworks
     groups : sequence of iterables of (WindowStatistics, relative changes)
         From seeds of their own, one group for every layout of the sources: no window says which one it is of, so the
         group that needs the larger standard errors decides. Parameters that are not named are nominal.

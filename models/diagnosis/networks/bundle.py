@@ -123,10 +123,8 @@ class Bundle:
 
     Attributes
     ----------
-    manifest : Manifest
     networks : tuple of EquationNetwork
         Relation networks in the order of the equation table.
-    amortised : AmortisedNetworks or None
     """
 
     manifest: Manifest

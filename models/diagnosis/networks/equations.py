@@ -104,8 +104,6 @@ class Equation:
     ----------
     number, title : str
         The paper's number, and what it is about.
-    target : Term
-    inputs : tuple of Term
     signatures : mapping of str to function
         Own parameter to the coefficients of the inputs that it scales, a function of the rotor.
     """
@@ -290,7 +288,6 @@ def missing(equation: Equation | SynchronousEquation, measured: tuple[str, ...])
 
     Parameters
     ----------
-    equation : Equation or SynchronousEquation
     measured : tuple of str
         Measured states, with ``theta`` for the phase reference.
     """

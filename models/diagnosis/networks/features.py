@@ -264,7 +264,6 @@ def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Arra
     ----------
     series : ndarray, shape (n_series, n_windows, n_bins)
         Of expected spectra, without sampling error.
-    n_kept : int
     """
     mean = series.mean(axis=1, keepdims=True)
     deviation = (series - mean).astype(np.float64)

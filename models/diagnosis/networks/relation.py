@@ -180,7 +180,6 @@ class RelationDiagnostician:
 
     Parameters
     ----------
-    machine : Machine
     networks : tuple of EquationNetwork
         The trained networks, calibrated.
     """

@@ -40,10 +40,8 @@ def train_network(
 
     Parameters
     ----------
-    equation : Equation or SynchronousEquation
     windows : sequence of WindowStatistics
         Own parameters nominal, everything else random.
-    machine : Machine
     seed : int
         Of the initial weights.
     progress : callable
@@ -103,10 +101,8 @@ def calibrate(trained: EquationNetwork, windows: Sequence[WindowStatistics], mac
 
     Parameters
     ----------
-    trained : EquationNetwork
     windows : sequence of WindowStatistics
         Healthy in the equation's own parameters, at least ten, from seeds of their own.
-    machine : Machine
     """
     readings = [
         read_equation(EquationNetwork(trained.equation, trained.network, None), window, machine) for window in windows

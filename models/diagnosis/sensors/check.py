@@ -27,7 +27,6 @@ def sensor_findings(
 
     Parameters
     ----------
-    window : WindowStatistics
     reference : SensorReference, optional
         What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
         found.

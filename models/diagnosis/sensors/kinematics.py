@@ -37,7 +37,6 @@ class PairReading:
 
     Attributes
     ----------
-    pair : MotionPair
     log_gain, log_gain_error : float
         Logarithm of the second's gain over the first's, and its standard error.
     polarity : int
@@ -164,8 +163,6 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
 
     Parameters
     ----------
-    window : WindowStatistics
-    pair : MotionPair
     bands : Banded, optional
         What `banded` has made of them.
 

@@ -83,11 +83,8 @@ def noisy(
 
     Parameters
     ----------
-    window : WindowStatistics
     readings : sequence of PairReading
         Of pairs that see the same motion.
-    bands : mapping of MotionPair to Banded
-    naming : Naming
     reference : SensorReference or None
         Without it, or if it says nothing of noise, nothing is found.
     sound : callable

@@ -64,10 +64,8 @@ def phase_faults(
 
     Parameters
     ----------
-    window : WindowStatistics
     columns : sequence of int
         Channels that nothing is wrong with.
-    naming : Naming
     reference : SensorReference or None
         Without it a speed that contradicts the vibration is not found.
     """

@@ -87,8 +87,6 @@ class SensorReference(BaseModel):
         Healthy windows it was learned from, and the hops in them.
     speed_rad_s : float or None
         Mean speed in them.
-    channels : tuple of ChannelReference
-    pairs : tuple of PairReference
     """
 
     model_config = _STRICT

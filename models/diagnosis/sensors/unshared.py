@@ -51,7 +51,6 @@ class PairNoise:
 
     Attributes
     ----------
-    pair : MotionPair
     density : ndarray, shape (n_bands,)
         Power of their difference as the second shows it, two-sided, SI²/Hz.
     leakage : ndarray, shape (n_bands,)
@@ -82,7 +81,6 @@ class ChannelNoise:
 
     Attributes
     ----------
-    column : int
     density : ndarray, shape (n_bands,)
         What is left of it, two-sided, SI²/Hz.
     share : ndarray, shape (n_bands,)

@@ -31,7 +31,6 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
 
     Parameters
     ----------
-    diagnosis : Diagnosis
     window : WindowStatistics
         What it was made of. A stretch of a tenth of the window has three times its errors, and says as much as that.
     length_s : float
@@ -52,7 +51,6 @@ def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis
 
     Parameters
     ----------
-    diagnosis : Diagnosis
     covariance : ndarray, shape (6, 6)
         Of the values that changes are relative to, in the scale of the errors, in the order of `PARAMETERS`.
     """

@@ -204,8 +204,6 @@ def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float)
     ----------
     stretch : Stretch
         What it was read in.
-    name, by : str
-    value, error : float
     """
     if name != "e":
         return possible_reading(name, by, from_scale(name, value), error * slope(name, value))

@@ -78,7 +78,6 @@ class SequentialSettings:
 
         Parameters
         ----------
-        machine : MachineFile
         per_month : float, optional
             Another rate.
         short : bool

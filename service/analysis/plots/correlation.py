@@ -82,7 +82,6 @@ class Correlations:
         Oldest and newest data in the window.
     speed_rad_s : float
         Mean speed; nan without a shaft angle.
-    panels : tuple of Panel
     """
 
     start_ns: int

@@ -27,7 +27,6 @@ class Excerpt:
     ----------
     start_ns : int
         Acquisition time of the first sample.
-    rate_hz : float
     samples : ndarray, shape (n_samples, n_channels)
     angle_rad : ndarray, shape (n_samples,) or None
         Shaft angle; None if it is not measured.
@@ -67,8 +66,6 @@ class RecordedStream:
 
     Parameters
     ----------
-    source : RecordingSource
-    keys : MachineKeys
     from_ns, to_ns : int
         Only data from `from_ns` up to, and without, `to_ns`.
 
@@ -130,7 +127,6 @@ class RecordedStream:
 
         Parameters
         ----------
-        channels : sequence of Channel
         longest_s : float, optional
             Length of a stretch, s; without it only gaps cut.
         from_ns : int, optional

@@ -24,7 +24,6 @@ class Vector:
 
     Attributes
     ----------
-    channel : str
     q_um : complex
         q of x = Re{q e^{jθ}}, µm.
     direction : int
@@ -102,10 +101,8 @@ class Orbits:
     ----------
     start_ns, end_ns : int
         First and last pulse of the keyphasor.
-    revolutions : int
     speed_rad_s : float
         Mean speed; negative where the shaft turns from z to y.
-    orbits : tuple of Orbit
     """
 
     start_ns: int
@@ -159,7 +156,6 @@ def orbits_of(stretch: Excerpt, pairs: list[tuple[Channel, Channel]], revolution
         Its columns are the channels of `pairs`, one pair after the other.
     pairs : list of (Channel, Channel)
         y and z of each place.
-    revolutions : int
 
     Raises
     ------

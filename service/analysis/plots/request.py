@@ -34,8 +34,6 @@ class Recorded:
 
     Attributes
     ----------
-    source : RecordingSource
-    keys : MachineKeys
     from_ns, to_ns : int
         Times of the data, from `from_ns` up to, and without, `to_ns`.
     """
@@ -62,7 +60,6 @@ class Lines:
 
     Attributes
     ----------
-    window_s, resolution_hz : float
     scaling : str
         ``amplitude`` or ``density``.
     log : bool
@@ -90,7 +87,6 @@ def recorded(
 
     Parameters
     ----------
-    files : tuple of Path
     key : str or None
         ``SITE/MACHINE``, where the recordings hold several.
     between : (str or None, str or None)

@@ -68,7 +68,6 @@ class Spectrum:
     ----------
     start_ns, end_ns : int
         Oldest and newest data in it.
-    channels : tuple of Channel
     frequencies_hz : ndarray, shape (n_bins,)
     values : ndarray, shape (n_channels, n_bins)
         As `shown_as` states them.
@@ -104,7 +103,6 @@ class Waterfall:
 
     Attributes
     ----------
-    channel : Channel
     frequencies_hz : ndarray, shape (n_bins,)
     start_ns, end_ns : ndarray of int, shape (n_spectra,)
         Data in each.
@@ -114,7 +112,6 @@ class Waterfall:
         As `shown_as` states them.
     scaling : str
         ``amplitude`` or ``density``.
-    resolution_hz : float
     """
 
     channel: Channel

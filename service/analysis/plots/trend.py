@@ -34,7 +34,6 @@ class ParameterTrend:
 
     Attributes
     ----------
-    name, text : str
     change, low, high : ndarray, shape (n_reports,)
         Change and the ends of its 95 % interval, plain ratios.
     """
@@ -56,11 +55,8 @@ class Trend:
         ``site/machine``.
     end_ns : ndarray of int, shape (n_reports,)
         End of each window.
-    states : tuple of HealthState
     speed_rad_s : ndarray, shape (n_reports,)
         nan where it is not known.
-    parameters : tuple of ParameterTrend
-    alarms : tuple of AlarmEventData
     limits : AlarmSettings or None
         Those in force, where the machine file is at hand.
     origin : str
@@ -106,7 +102,6 @@ def read_trend(source: RecordingSource, keys: MachineKeys, machine: str | None, 
 
     Parameters
     ----------
-    source : RecordingSource
     keys : MachineKeys
         The recorded machine.
     machine : str or None

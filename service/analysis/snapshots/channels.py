@@ -44,8 +44,6 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
 
     Parameters
     ----------
-    machine : MachineFile
-    names : sequence of str
     field : str
         What the names were given as.
 

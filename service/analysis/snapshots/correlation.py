@@ -27,8 +27,6 @@ def correlation_snapshot(
 
     Parameters
     ----------
-    subject : Subject
-    data : LatestData
     prediction : Prediction
         Theory for the latest window.
     first, second : sequence of str

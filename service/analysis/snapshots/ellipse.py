@@ -64,7 +64,6 @@ def phase_lag_deg(vector: complex, direction: int) -> float:
 
     Parameters
     ----------
-    vector : complex
     direction : int
         1 if the shaft angle grows, -1 if it falls.
     """

@@ -72,7 +72,6 @@ class Excitation:
 
         Parameters
         ----------
-        rotor : RotorParameters
         states : tuple of str
             Measured states and accelerations.
         frequencies_hz : ndarray, shape (n_frequencies,)
@@ -123,7 +122,6 @@ def excitation_of(machine: Machine, window: WindowStatistics) -> Excitation:
     ----------
     machine : Machine
         Its rotor is taken as it is.
-    window : WindowStatistics
 
     Raises
     ------

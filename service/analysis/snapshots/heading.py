@@ -21,8 +21,6 @@ class Subject:
 
     Attributes
     ----------
-    identity : Identity
-    machine : MachineFile
     known : Machine or None
         The machine with all its parameters.
     """

@@ -22,11 +22,6 @@ class MachineSnapshots:
     """Makes snapshots of one machine; any thread may ask.
 
     The theory of a window takes longer than all the rest, and is kept until another window comes.
-
-    Parameters
-    ----------
-    installed : Installed
-    identity : Identity
     """
 
     def __init__(self, installed: Installed, identity: Identity) -> None:

@@ -41,8 +41,6 @@ def measured_correlations(
 
     Parameters
     ----------
-    machine : MachineFile
-    window : WindowStatistics
     pairs : list of (int, int)
         Reference and response, as columns of the window.
     """

@@ -55,8 +55,6 @@ def orbit_snapshot(
 
     Parameters
     ----------
-    subject : Subject
-    data : LatestData
     revolutions : int
         Whole revolutions to be shown as measured; none with 0.
     units : str

@@ -22,13 +22,10 @@ class NewestPath:
 
     Attributes
     ----------
-    machine : MachineFile
     samples : ndarray, shape (n_samples, n_channels)
         As streamed.
-    rate_hz : float
     start_ns : int or None
         Time of the first sample; None without samples.
-    revolutions : int
     pulses_s : ndarray, shape (n_pulses,)
         When the shaft angle was 0, after `start_ns`.
     reason : str
@@ -56,7 +53,6 @@ def newest_path(
 
     Parameters
     ----------
-    machine : MachineFile
     blocks : tuple of SampleBlock
         Without a gap.
     revolutions : int

@@ -46,7 +46,6 @@ class Prediction:
     ----------
     machine : Machine
         As nominal.
-    excitation : Excitation or None
     changes : dict of str to float
         Relative changes of the machine as estimated.
     nominal_reason, estimated_reason : str
@@ -78,7 +77,6 @@ class Prediction:
 
         Parameters
         ----------
-        states : tuple of str
         frequencies_hz : ndarray, shape (n_lines,)
             Lines of the window's spectrum, evenly spaced.
 
@@ -113,7 +111,6 @@ class Prediction:
 
         Parameters
         ----------
-        states : tuple of str
         pairs : list of (int, int)
             Reference and response, as places in `states`.
         lags_s : ndarray, shape (n_lags,)
@@ -190,7 +187,6 @@ def predict(
     ----------
     known : Machine or None
         The machine with all its parameters.
-    window : WindowStatistics
     readings : iterable of Parameter
         Of this window, by the diagnostician that decides; empty if it was not evaluated.
     why_not : str

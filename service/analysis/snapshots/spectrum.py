@@ -50,8 +50,6 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
 
     Parameters
     ----------
-    subject : Subject
-    data : LatestData
     prediction : Prediction
         Theory for the latest window.
     channels : sequence of str

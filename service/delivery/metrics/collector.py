@@ -78,7 +78,6 @@ class Metrics:
 
     Parameters
     ----------
-    service : MeasuredService
     requests : RequestCounts
         HTTP requests.
     """

@@ -29,8 +29,6 @@ class Observed:
 
     Attributes
     ----------
-    worker : MachineWorker
-    health : Health
     busy_s : float
         How long its thread has been at work on the same block.
     recorder : RecorderStatus or None

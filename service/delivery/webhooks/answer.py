@@ -33,7 +33,6 @@ class Answer:
 
     Attributes
     ----------
-    meaning : Meaning
     text : str
         In a few words; empty if delivered.
     retry_after_s : float
@@ -50,7 +49,6 @@ def answer_of(status: int, headers: Mapping[str, str], now_s: float) -> Answer:
 
     Parameters
     ----------
-    status : int
     headers : mapping
         With ``retry-after``, if the receiver has sent it.
     now_s : float
@@ -83,7 +81,6 @@ def pause_s(answer: Answer, failures: int, longest_s: float, chance: float) -> f
 
     Parameters
     ----------
-    answer : Answer
     failures : int
         Attempts that failed one after the other, this one included.
     longest_s : float

@@ -81,8 +81,6 @@ class Dispatcher:
 
     Parameters
     ----------
-    settings : WebhookSettings
-    receiver : Post
     logs : mapping of str to AlarmLog
         Of all machines, by ``site/machine``. A webhook that is new is told what comes after this moment.
     cursors : Cursors

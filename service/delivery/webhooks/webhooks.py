@@ -24,10 +24,6 @@ class NotDeliveredError(RotorwatchError):
 class Webhooks:
     """Starts and stops webhooks and says how they stand.
 
-    Parameters
-    ----------
-    webhooks : sequence of WebhookSettings
-
     Raises
     ------
     MachineFileError

@@ -58,7 +58,6 @@ def orders(control: Control, *, lines: bool, keyboard: bool) -> Iterator[None]:
 
     Parameters
     ----------
-    control : Control
     lines : bool
         Orders are lines, see `obey`; when the input ends, because whoever gave the orders is gone, the replay stops.
     keyboard : bool

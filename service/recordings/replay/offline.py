@@ -38,7 +38,6 @@ class OfflineReplay:
 
     Parameters
     ----------
-    source : RecordingSource
     keys : MachineKeys
         The recorded machine whose stream is replayed.
     installed : Installed
