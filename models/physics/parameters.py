@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -59,43 +60,31 @@ class RotorParameters(KnownRotor):
         return self.shaft_E_Pa * math.pi * self.shaft_diameter_m**4 / 64
 
 
-FAULT_FIELDS: Mapping[str, str] = MappingProxyType(
-    {
-        "k_by": "k_by_N_per_m",
-        "c_by": "c_by_N_s_per_m",
-        "k_bz": "k_bz_N_per_m",
-        "c_bz": "c_bz_N_s_per_m",
-        "e": "e_m",
-        "EI": "shaft_E_Pa",
-    }
-)
-"""Parameters a fault can change, and the field that carries them (EI through Young's modulus)."""
+class _Parameter(NamedTuple):
+    field: str
+    text: str
+    quantity: str
 
-PARAMETERS: tuple[str, ...] = tuple(FAULT_FIELDS)
+
+_TABLE = {
+    "k_by": _Parameter("k_by_N_per_m", "bearing stiffness, horizontal", "stiffness"),
+    "c_by": _Parameter("c_by_N_s_per_m", "bearing damping, horizontal", "damping"),
+    "k_bz": _Parameter("k_bz_N_per_m", "bearing stiffness, vertical", "stiffness"),
+    "c_bz": _Parameter("c_bz_N_s_per_m", "bearing damping, vertical", "damping"),
+    "e": _Parameter("e_m", "unbalance (eccentricity)", "distance"),
+    "EI": _Parameter("shaft_E_Pa", "shaft bending stiffness", "stiffness"),
+}
+
+PARAMETERS: tuple[str, ...] = tuple(_TABLE)
 """The diagnosed parameters, in the order in which they are always reported."""
 
-PARAMETER_TEXT: Mapping[str, str] = MappingProxyType(
-    {
-        "k_by": "bearing stiffness, horizontal",
-        "c_by": "bearing damping, horizontal",
-        "k_bz": "bearing stiffness, vertical",
-        "c_bz": "bearing damping, vertical",
-        "e": "unbalance (eccentricity)",
-        "EI": "shaft bending stiffness",
-    }
-)
+FAULT_FIELDS: Mapping[str, str] = MappingProxyType({name: row.field for name, row in _TABLE.items()})
+"""Parameters a fault can change, and the field that carries them (EI through Young's modulus)."""
+
+PARAMETER_TEXT: Mapping[str, str] = MappingProxyType({name: row.text for name, row in _TABLE.items()})
 """Each parameter in a vibration engineer's words."""
 
-QUANTITY: Mapping[str, str] = MappingProxyType(
-    {
-        "k_by": "stiffness",
-        "c_by": "damping",
-        "k_bz": "stiffness",
-        "c_bz": "damping",
-        "e": "distance",
-        "EI": "stiffness",
-    }
-)
+QUANTITY: Mapping[str, str] = MappingProxyType({name: row.quantity for name, row in _TABLE.items()})
 """What kind of quantity each parameter is."""
 
 

@@ -13,6 +13,8 @@ __all__ = [
     "MachineHash",
     "Name",
     "Number",
+    "ParameterName",
+    "ParameterText",
     "Reason",
     "Site",
     "finite",
@@ -52,6 +54,12 @@ MachineHash = Annotated[
     str,
     Field(description="12 hexadecimal digits that change with the machine file's content", examples=["9a0c41d27be8"]),
 ]
+
+
+ParameterName = Annotated[str, Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])]
+
+
+ParameterText = Annotated[str, Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])]
 
 
 Reason = Annotated[str, Field(description="why it was not evaluated; empty if it was", examples=[""])]

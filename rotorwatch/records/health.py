@@ -1,6 +1,9 @@
 """How a machine is: window by window, and where it stands now."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Annotated
 
 from pydantic import BaseModel, Field
@@ -9,7 +12,7 @@ from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Reason, Site
 from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
 
-__all__ = ["Health", "HealthState", "Quality", "Report", "State", "StreamStatus"]
+__all__ = ["MEASURES", "Health", "HealthState", "Measure", "Quality", "Report", "State", "StreamStatus"]
 
 
 class HealthState(StrEnum):
@@ -34,6 +37,21 @@ class HealthState(StrEnum):
 State = Annotated[HealthState, Field(description="health in one word", examples=["alert"])]
 
 
+@dataclass(frozen=True, slots=True)
+class Measure:
+    """Marks a number of the window that is kept over time, exported and shown.
+
+    Attributes
+    ----------
+    name : str
+        What it is asked for by.
+    unit : str
+    """
+
+    name: str
+    unit: str
+
+
 class Report(BaseModel):
     """One evaluation of the sliding window."""
 
@@ -45,8 +63,10 @@ class Report(BaseModel):
     end_ns: int = Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])
     state: State
     filled: float = Field(description="fraction of a full window", examples=[1.0])
-    speed_rad_s: Number = Field(default=None, description="mean speed in the window", examples=[138.23])
-    misfit_z: Number = Field(
+    speed_rad_s: Annotated[Number, Measure("speed", "rad/s")] = Field(
+        default=None, description="mean speed in the window", examples=[138.23]
+    )
+    misfit_z: Annotated[Number, Measure("misfit", "1")] = Field(
         default=None,
         description="distance of the window from what the model can explain, standard deviations; null without a test",
         examples=[0.4],
@@ -76,6 +96,17 @@ class Report(BaseModel):
     reason: Reason = ""
     bundle: BundleIdentity
     machine_hash: MachineHash
+
+
+MEASURES: Mapping[str, tuple[str, Measure]] = MappingProxyType(
+    {
+        measure.name: (field, measure)
+        for field, info in Report.model_fields.items()
+        for measure in info.metadata
+        if isinstance(measure, Measure)
+    }
+)
+"""The fields of a report that are measures, by the name of the measure."""
 
 
 class Quality(BaseModel):

@@ -4,7 +4,7 @@ from pydantic import BaseModel, Field
 
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.fields import EXAMPLE_NS, JSON
-from rotorwatch.records.health import Report
+from rotorwatch.records.health import MEASURES, Report
 
 __all__ = ["AlarmEventList", "AuditList", "AuditRecord", "Reading", "ReadingBucket", "ReadingList", "ReportList"]
 
@@ -69,8 +69,8 @@ class ReadingList(BaseModel):
     model_config = JSON
 
     quantity: str = Field(
-        description="parameter (relative change), equation (mean squared difference), misfit (standard deviations) or "
-        "speed (rad/s)",
+        description="parameter (relative change), equation (mean squared difference) or a measure of the window: "
+        + ", ".join(f"{name} ({Report.model_fields[field].description})" for name, (field, _) in MEASURES.items()),
         examples=["parameter"],
     )
     readings: tuple[Reading, ...] = Field(description="in the order of arrival; empty with `points`")

@@ -2,7 +2,16 @@
 
 from pydantic import BaseModel, Field, JsonValue
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Site
+from rotorwatch.records.fields import (
+    EXAMPLE_NS,
+    JSON,
+    BundleIdentity,
+    MachineHash,
+    Name,
+    ParameterName,
+    ParameterText,
+    Site,
+)
 from rotorwatch.records.health import State
 
 __all__ = [
@@ -83,8 +92,8 @@ class DetectableParameter(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    name: ParameterName
+    text: ParameterText
     loss: float = Field(description="smallest relative change downwards found in one window", examples=[-0.025])
     gain: float = Field(description="smallest relative change upwards found in one window", examples=[0.026])
     length_s: float | None = Field(

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Site
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, ParameterName, Site
 
 __all__ = [
     "ChannelDensity",
@@ -65,7 +65,7 @@ class PredictedChange(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    name: ParameterName
     relative_change: float = Field(description="relative change from nominal", examples=[-0.247])
 
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, Number, Reason
+from rotorwatch.records.fields import EXAMPLE_NS, JSON, Number, ParameterName, ParameterText, Reason
 from rotorwatch.records.sensor_faults import FaultKind
 
 __all__ = [
@@ -53,8 +53,8 @@ class Parameter(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    name: ParameterName
+    text: ParameterText
     by: str = Field(description="who says so: likelihood, network or relation", examples=["likelihood"])
     relative_change: Number = Field(
         default=None, description="relative change from nominal; null if not evaluable", examples=[-0.247]
@@ -98,7 +98,7 @@ class Agreement(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    name: ParameterName
     between: tuple[str, str] = Field(description="who is compared", examples=[("likelihood", "relation")])
     verdict: Literal["agree", "disagree", "only-one"] = Field(
         description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
@@ -126,8 +126,8 @@ class Finding(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
-    text: str = Field(description="the parameter in words", examples=["bearing stiffness, horizontal"])
+    name: ParameterName
+    text: ParameterText
     since_ns: int = Field(
         description="start of the stretch of data that found it first: the date of the change, as far as it is known",
         examples=[EXAMPLE_NS - 20_000_000_000],
@@ -178,7 +178,7 @@ class Detectable(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="k_by, c_by, k_bz, c_bz, e or EI", examples=["k_by"])
+    name: ParameterName
     loss: float = Field(description="relative change downwards; -1: not even a total loss", examples=[-0.025])
     gain: float = Field(description="relative change upwards", examples=[0.026])
     length_s: float = Field(description="data that takes", examples=[60.0])

@@ -21,7 +21,7 @@ from models.signals.keys import PREFIX
 from models.signals.recording import RecordedMessage, read_recording, summarize_recording
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.health import Report
+from rotorwatch.records.health import MEASURES, Report
 
 __all__ = ["Selection", "Table", "alarm_table", "report_table", "stream_table"]
 
@@ -143,8 +143,10 @@ def report_table(selection: Selection) -> Table:
         _field("end_ns", pa.int64(), "ns", "end of the newest data in the window"),
         _field("state", pa.string(), "", "health after this window"),
         _field("filled", pa.float64(), "1", "fraction of a full window"),
-        _field("speed_rad_s", pa.float64(), "rad/s", "mean speed"),
-        _field("misfit_z", pa.float64(), "1", "distance from the model in standard deviations"),
+        *(
+            _field(field, pa.float64(), measure.unit, str(Report.model_fields[field].description))
+            for field, measure in MEASURES.values()
+        ),
         _field("suspect", pa.string(), "", "what explains the misfit best"),
         _field("verdict", pa.string(), "", "what has changed, in words"),
         _field("changed", pa.string(), "", "parameters that have changed"),
@@ -302,8 +304,7 @@ def _report_row(payload: bytes) -> _Row:
         "end_ns": report.end_ns,
         "state": report.state,
         "filled": report.filled,
-        "speed_rad_s": report.speed_rad_s,
-        "misfit_z": report.misfit_z,
+        **{field: getattr(report, field) for field, _ in MEASURES.values()},
         "suspect": report.suspect,
         "reason": report.reason,
     }

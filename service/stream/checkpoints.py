@@ -6,7 +6,7 @@ from dataclasses import replace
 from models.errors import CheckpointError
 from rotorwatch import __version__
 from rotorwatch.records.fields import finite
-from rotorwatch.records.health import Report
+from rotorwatch.records.health import MEASURES, Report
 from service.history.errors import StoreError
 from service.history.machine import MachineStore
 from service.history.records import (
@@ -36,12 +36,11 @@ def stored_report(window: Report) -> StoredReport:
 
 
 def stored_readings(windows: Iterable[Report]) -> tuple[StoredReading, ...]:
-    """Parameters, residuals of the equations, misfit and speed of each window, as points in time."""
+    """Parameters, residuals of the equations and the measures of each window, as points in time."""
     found = []
     for window in windows:
         points: list[tuple[str, str, float | None, float | None]] = [
-            ("misfit", "misfit", window.misfit_z, None),
-            ("speed", "speed", window.speed_rad_s, None),
+            (name, name, getattr(window, field), None) for name, (field, _) in MEASURES.items()
         ]
         points += [("parameter", one.name, one.relative_change, one.standard_error) for one in window.parameters]
         points += [("equation", one.equation, one.msd, None) for one in window.equations]

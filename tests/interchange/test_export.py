@@ -17,7 +17,7 @@ from models.signals.recording import RecordedMessage, RecordingWriter
 from models.signals.wire import encode_arrow, encode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
-from rotorwatch.records.health import Report
+from rotorwatch.records.health import MEASURES, Report
 from service.interchange.exported import Selection
 from service.interchange.exporting import ExportFormat, export
 from tests.interchange.material import START_NS, imported, stretches
@@ -141,11 +141,12 @@ def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
     read = pa.parquet.read_table(tmp_path / "reports.parquet")
     assert read.column("end_ns").to_pylist() == [START_NS, START_NS + 5_000_000_000]
     report = Report.model_validate(example(Report))
-    assert read.column("speed_rad_s").to_pylist() == [report.speed_rad_s] * 2
+    for field, measure in MEASURES.values():
+        assert read.column(field).to_pylist() == [getattr(report, field)] * 2
+        assert read.schema.field(field).metadata[b"unit"] == measure.unit.encode()
     (reading,) = report.parameters
     assert read.column(f"{reading.name}.relative_change").to_pylist() == [reading.relative_change] * 2
     assert read.column("e.relative_change").null_count == 2
-    assert read.schema.field("speed_rad_s").metadata[b"unit"] == b"rad/s"
     export(Selection((tmp_path / "run.mcap",)), "alarms", "csv", tmp_path / "alarms.csv")
     with (tmp_path / "alarms.csv").open(newline="", encoding="utf-8") as file:
         (event,) = list(csv.DictReader(file))

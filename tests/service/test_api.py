@@ -10,7 +10,7 @@ from models.alarm_names import ALARMS
 from models.machine import Machine, load_machine
 from models.physics.parameters import PARAMETERS
 from rotorwatch.records.alarms import Alarm, AlarmStates
-from rotorwatch.records.health import Health
+from rotorwatch.records.health import MEASURES, Health
 from rotorwatch.records.history import AlarmEventList, AuditList, ReadingList, ReportList
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
 from rotorwatch.records.monitor import Alive, Readiness
@@ -92,6 +92,17 @@ def test_reports_are_cut_by_time_and_number(http: httpx.Client) -> None:
     second = answered(http.get(f"{PLACE}/reports?limit=10&before={first.next_before}"), ReportList)
     assert [report.end_ns for report in second.reports] == ends[10:]
     assert second.next_before is None
+
+
+def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Client) -> None:
+    report = answered(http.get(f"{PLACE}/health"), Health).report
+    assert report is not None
+    page = http.get("/").text
+    for name, (field, measure) in MEASURES.items():
+        value = getattr(report, field)
+        assert answered(http.get(f"{PLACE}/readings?quantity={name}"), ReadingList).readings[-1].value == value
+        assert re.search(rf"\b{name} {value:.4g}\b", page), measure
+    assert problem(http.get(f"{PLACE}/readings?quantity=nose"), 422).detail.startswith("quantity: ")
 
 
 def test_readings_over_time(http: httpx.Client) -> None:

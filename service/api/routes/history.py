@@ -1,12 +1,15 @@
 """The history over HTTP: alarm events, window reports, readings over time, and the audit log."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query
 from fastapi.responses import Response
+from pydantic import AfterValidator
+from pydantic_core import PydanticCustomError
 
 from rotorwatch.records.alarms import EventKind, Severity
+from rotorwatch.records.health import MEASURES
 from rotorwatch.records.history import (
     AlarmEventList,
     AuditList,
@@ -33,15 +36,25 @@ from service.api.views import (
 __all__ = ["add_history_routes"]
 
 _LARGEST = 2**63 - 1
-_SINGLE = {"misfit": "misfit", "speed": "speed"}
+_QUANTITIES = ("parameter", "equation", *MEASURES)
 
 _After = Annotated[
     int | None,
     Query(ge=-1, le=_LARGEST, description="only events with a greater sequence, oldest first; -1 for all there are"),
 ]
 _Before = Annotated[int | None, Query(ge=0, le=_LARGEST, description="`next_before` of the answer before")]
+
+
+def _known_quantity(name: str) -> str:
+    if name not in _QUANTITIES:
+        raise PydanticCustomError("enum", f"Input should be one of {', '.join(_QUANTITIES)}")
+    return name
+
+
 _Quantity = Annotated[
-    Literal["parameter", "equation", "misfit", "speed"], Query(description="what the windows are read for")
+    str,
+    AfterValidator(_known_quantity),
+    Query(description="what the windows are read for", json_schema_extra={"enum": list(_QUANTITIES)}),
 ]
 _ReadingName = Annotated[str, Query(pattern="^[A-Za-z0-9_.-]{1,64}$")]
 _Names = Annotated[
@@ -49,7 +62,7 @@ _Names = Annotated[
     Query(
         max_length=64,
         description="which parameter or equation; may be given several times with `points`, where all is the default. "
-        "Not needed for misfit and speed",
+        "Not needed for the measures of a window",
     ),
 ]
 _Points = Annotated[
@@ -131,9 +144,9 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         after: _After = None,
         limit: Limit = 1000,
     ) -> ReadingList:
-        """Parameters, residuals, misfit and speed over time: one by one, or with `points` for a plot of any length."""
+        """Parameters, residuals and measures over time: one by one, or with `points` for a plot of any length."""
         history = found_machine(service, site, machine).history
-        names = name or [_SINGLE[quantity]] if quantity in _SINGLE else name
+        names = name or [quantity] if quantity in MEASURES else name
         if points is not None:
             if after is not None:
                 raise HTTPException(422, "after: goes with single readings, not with points")

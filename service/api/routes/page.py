@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 from models.diagnosis.readings import Z95
 from rotorwatch.records.alarms import Alarm, Severity
-from rotorwatch.records.health import Health, Report
+from rotorwatch.records.health import MEASURES, Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
 __all__ = ["front_page"]
@@ -48,13 +48,22 @@ def _machine(health: Health) -> str:
     if report is not None and report.verdict is not None:
         suspect = f" Best explained by: {html.escape(report.suspect)}." if report.suspect else ""
         said = f"<p>{html.escape(report.verdict.text)}.{suspect}</p>"
-    window = "" if report is None else _table(report, raised) + _shapes(report)
+    window = "" if report is None else _measures(report) + _table(report, raised) + _shapes(report)
     return (
         f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span>{silent}</h2>'
         f"{reason}{said}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
         f"{sum(health.quality.refused_blocks.values())} refused, {health.quality.gaps} gaps; {links}</p>"
         f"{_alarms(health)}{window}"
     )
+
+
+def _measures(report: Report) -> str:
+    """Numbers of the window, those that there are."""
+    values = ((name, getattr(report, field), measure.unit) for name, (field, measure) in MEASURES.items())
+    shown = [
+        f"{name} {value:.4g}{'' if unit == '1' else ' ' + unit}" for name, value, unit in values if value is not None
+    ]
+    return f"<p>In the window: {', '.join(shown)}</p>" if shown else ""
 
 
 def _alarms(health: Health) -> str:
