@@ -192,7 +192,7 @@ class Plant:
         self.start()
         while True:
             health = httpx.get(f"{self.url}/api/v1/machines/{_PLACE}/health", trust_env=False).json()
-            if health["quality"]["accepted_blocks"] or health["quality"]["refused_blocks"]:
+            if health["quality"]["accepted_blocks"] or health["quality"]["refused_blocks"] or health["filled"]:
                 break
             time.sleep(0.05)
         self.reports += 1  # what was on its way has been lost or has arrived

@@ -2,7 +2,7 @@
 
 ::
 
-    RWCP | version | BLAKE2b of the rest | npz archive, uncompressed
+    RWCP | version | BLAKE2b of the rest | npz archive, compressed as a whole with zstd
 
 The digest is looked at first, so that damaged bytes are refused before anything is read from them. Arrays of Python
 objects are refused on either side: nothing in stored bytes is ever executed.
@@ -17,13 +17,14 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+import zstandard
 
 from models.errors import CheckpointError
 
 __all__ = ["checked", "from_bytes", "prefixed", "texts", "to_bytes", "unprefixed"]
 
 _MAGIC = b"RWCP"
-_VERSION = 1
+_VERSION = 2
 _HEADER = struct.Struct("<4sH16s")
 _SUFFIX = ".npy"
 
@@ -56,7 +57,7 @@ def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
             # An entry made from a bare name would be given the time of day.
             with archive.open(zipfile.ZipInfo(name + _SUFFIX), "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=False)
-    payload = body.getvalue()
+    payload = zstandard.compress(body.getvalue())
     return _HEADER.pack(_MAGIC, _VERSION, _digest(payload)) + payload
 
 
@@ -81,7 +82,7 @@ def from_bytes(data: bytes) -> dict[str, np.ndarray]:
     if _digest(payload) != digest:
         raise CheckpointError(f"a checkpoint of {len(data)} bytes is damaged: its checksum does not fit its contents")
     found = {}
-    with zipfile.ZipFile(io.BytesIO(payload)) as archive:
+    with zipfile.ZipFile(io.BytesIO(zstandard.decompress(payload))) as archive:
         for name in archive.namelist():
             with archive.open(name) as entry:
                 found[name.removesuffix(_SUFFIX)] = np.lib.format.read_array(entry, allow_pickle=False)

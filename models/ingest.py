@@ -156,6 +156,15 @@ class Gate:
         """What was accepted, the present course last; empty before the first block."""
         return (*self._earlier, *(() if self._expected is None else (self._expected,)))
 
+    def knows(self, block: SampleBlock) -> bool:
+        """Whether a block's place is among those that were received or passed over."""
+        return any(course.covers(block) for course in self.courses)
+
+    def is_newest(self, block: SampleBlock) -> bool:
+        """Whether it is the latest block that was received."""
+        expected = self._expected
+        return expected is not None and expected.covers(block) and block.sequence == expected.sequence - 1
+
     def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
         """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
 

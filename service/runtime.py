@@ -18,7 +18,7 @@ is noticed on the monotonic clock; the time of day is used for what is recorded 
 """
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
@@ -26,6 +26,7 @@ from pathlib import Path
 from models.commissioning.installed import install
 from models.machine import MachineFile
 from models.signals.keys import MachineKeys
+from models.signals.recording import RecordedMessage
 from rotorwatch.records.health import Health
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.access.guard import Guard
@@ -41,6 +42,7 @@ from service.history.audit import AuditLog
 from service.history.errors import StoreError
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
+from service.recordings.heard import heard, recorded_files
 from service.recordings.recorder import MachineRecorder, RecorderStatus
 from service.settings.service import ServiceSettings
 from service.stream.liveness import Pulse
@@ -173,7 +175,9 @@ class Runtime:
             for installed in self._installed:
                 machine = installed.machine
                 history = self.store.machine(machine.site, machine.name)
-                worker = MachineWorker(installed, self.settings.queue, history, on_events=self._alarm_events)
+                worker = MachineWorker(
+                    installed, self.settings.queue, history, on_events=self._alarm_events, recorded=self._heard(machine)
+                )
                 self._workers.append(worker)
                 self._pulses.append(Pulse(worker.inbox.call))
                 self.metrics.watch(worker)
@@ -199,6 +203,13 @@ class Runtime:
     def _alarm_events(self) -> None:
         self.feed.wake()
         self.webhooks.wake()
+
+    def _heard(self, machine: MachineFile) -> Callable[[int], Iterable[RecordedMessage]]:
+        """What was recorded of a machine until now, where anything of it is."""
+        directory = self.settings.recording.directory
+        if directory is None or self.settings.link.namespace:
+            return lambda _: ()
+        return partial(heard, recorded_files(Path(directory) / machine.site / machine.name), machine.keys.stream)
 
     def _record(self, machine: MachineFile, link: Link, undo: ExitStack) -> None:
         """Record the machine, if that is wanted; trouble with the disk is the recorder's own affair."""

@@ -1,13 +1,20 @@
-"""The sliding window: a ring of hop moments, and the statistics of the window they make."""
+"""The sliding window: a ring of hop moments, and the statistics of the window they make.
+
+What is remembered of a window with every hop is small: from where to where its hops reach, and which samples they are
+made of. The moments themselves, megabytes, are computed again from the same samples (`models.diagnosis.recall`), unless
+all of them were stored.
+"""
 
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from models.checkpoint import checked
+from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.moments import ComplexArray, HopMoments, Plan, hop_moments
+from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
 from models.diagnosis.synchronous import (
     Rotation,
     SpeedSource,
@@ -223,10 +230,14 @@ class SlidingWindow:
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
         self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
+        self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
         self._pending: list[FloatArray] = []
         self._pending_samples = 0
         self._pending_start_ns = 0
+        self._blocks: deque[tuple[int, int]] = deque()  # start and length of those that the pending samples are of
+        self._row = 0  # of the first of them, with which the pending samples begin
         self._level: FloatArray | None = None
+        self._recall: Recall | None = None
 
     @property
     def filled(self) -> float:
@@ -259,11 +270,13 @@ class SlidingWindow:
             End time of a hop that became complete and is in the window now. A long block may complete several: ask for
             the statistics between them, and take all, or the rest of the block is lost.
         """
+        self.give_up()
         # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
         self._pending_start_ns = start_ns - round(self._pending_samples * 1e9 / self.plan.rate_hz)
         # Rows first, whatever the caller has: sums must not depend on how samples lie in memory.
         self._pending.append(np.ascontiguousarray(samples))
         self._pending_samples += samples.shape[0]
+        self._blocks.append((start_ns, samples.shape[0]))
         need = self.plan.preamble + self.plan.hop
         while self._pending_samples >= need:
             buffer = np.concatenate(self._pending)
@@ -271,9 +284,13 @@ class SlidingWindow:
             self._pending = [rest]
             self._pending_samples = rest.shape[0]
             self._pending_start_ns += round(self.plan.hop * 1e9 / self.plan.rate_hz)
-            yield self._complete(buffer[:need], first_ns)
+            block_ns, row = self._blocks[0][0], self._row
+            self._row += self.plan.hop
+            while self._blocks and self._row >= self._blocks[0][1]:
+                self._row -= self._blocks.popleft()[1]
+            yield self._complete(buffer[:need], first_ns, block_ns, row)
 
-    def _complete(self, samples: FloatArray, first_ns: int) -> int:
+    def _complete(self, samples: FloatArray, first_ns: int, block_ns: int, row: int) -> int:
         if self._level is None or not self._hops:
             # The median: one wild sample must not become the level of everything that follows.
             self._level = np.median(samples[:, : len(self.plan.states)], axis=0)
@@ -281,39 +298,93 @@ class SlidingWindow:
         hop = hop_moments(self.plan, samples, self._level, start_ns)
         while self._hops and hop.end_ns - self._hops[0].start_ns > self.plan.max_span_ns:
             self._hops.popleft()
+            self._pieces.popleft()
         self._hops.append(hop)
+        self._pieces.append(Piece(start_ns, block_ns, row, samples.shape[0], digest_of(samples)))
         return hop.end_ns
 
     def gap(self) -> None:
         """Forget the unfinished hop: what comes next does not continue it."""
+        self.give_up()
         self._pending = []
-        self._pending_samples = 0
+        self._pending_samples = self._row = 0
+        self._blocks.clear()
 
     def clear(self) -> None:
         """Forget everything."""
         self.gap()
         self._hops.clear()
+        self._pieces.clear()
 
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything but the hops themselves, as named arrays, between two blocks."""
+    @property
+    def lacks(self) -> bool:
+        """Whether samples are to be taken again: `recall` wants them."""
+        return self._recall is not None
+
+    def recall(self, samples: npt.NDArray[np.float32] | FloatArray, start_ns: int, *, newest: bool) -> None:
+        """Take a block again that was in the window when `checkpoint` was called.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_channels)
+            As received, not yet in SI units.
+        start_ns : int
+            Time of the first sample.
+        newest : bool
+            Whether no later one has been there: everything may be complete now.
+        """
+        if self._recall is None:
+            return
+        self._recall.take(samples, start_ns)
+        if newest and self._recall.complete():
+            self.give_up()
+
+    def give_up(self) -> int:
+        """Go on with what could be recalled; how many hops could not."""
+        recall, self._recall = self._recall, None
+        if recall is None:
+            return 0
+        there = recall.hops()
+        self._pieces = deque((piece for piece, _ in there), maxlen=self.plan.hops)
+        self._hops = deque((hop for _, hop in there), maxlen=self.plan.hops)
+        found = recall.pending()
+        if found is not None:
+            samples, blocks = found
+            self._pending, self._pending_samples = [samples], samples.shape[0]
+            self._blocks, self._row = deque(blocks), recall.last.row
+            self._pending_start_ns = recall.last.start_ns
+        return len(recall.pieces) - len(there)
+
+    def checkpoint(self, *, whole: bool = False) -> dict[str, np.ndarray]:
+        """What a window goes on from, as named arrays, between two blocks.
+
+        Parameters
+        ----------
+        whole : bool
+            With moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
+        """
+        if self._recall is not None:
+            return dict(self._recall.arrays)
         pending = np.concatenate(self._pending) if self._pending else np.empty((0, self._columns))
-        return {
-            "pending": pending,
-            "pending_start_ns": np.array(self._pending_start_ns, dtype=np.int64),
+        block_ns = self._blocks[0][0] if self._blocks else 0
+        last = Piece(self._pending_start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
+        found: dict[str, np.ndarray] = {
             "level": np.array([] if self._level is None else self._level, dtype=np.float64),
-            "hop_times_ns": np.array([(hop.start_ns, hop.end_ns) for hop in self._hops], np.int64).reshape(-1, 2),
+            **pieces_of((*self._pieces, last)),
         }
+        if whole:
+            found |= {"pending": pending, "pending_blocks": np.array(self._blocks, dtype=np.int64).reshape(-1, 2)}
+            for number, hop in enumerate(self._hops):
+                found |= prefixed(f"hop_{number}", hop.checkpoint())
+        return found
 
-    def restore(self, arrays: Mapping[str, np.ndarray], hops: Iterable[HopMoments]) -> None:
-        """Go on where `checkpoint` was called.
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called; without moments the window `lacks` its samples until they are recalled.
 
         Parameters
         ----------
         arrays : mapping of str to ndarray
             What `checkpoint` gave.
-        hops : iterable of HopMoments
-            Those that were in the window then, in the order in which they were completed; there may be more. Of two
-            with the same times the later one counts.
 
         Raises
         ------
@@ -321,22 +392,26 @@ class SlidingWindow:
             If an array is missing or of another form, a hop is missing, or it does not fit the plan; nothing is
             changed then.
         """
-        pending = checked(arrays, "pending", np.float64, (None, self._columns))
-        pending_start_ns = int(checked(arrays, "pending_start_ns", np.int64, ()))
         level = checked(arrays, "level", np.float64, (None,))
         if level.size not in (0, len(self.plan.states)):
             raise CheckpointError(f"level has {level.size} values, expected {len(self.plan.states)} or none")
-        there = {(hop.start_ns, hop.end_ns): hop for hop in hops}
-        ring = []
-        for start_ns, end_ns in checked(arrays, "hop_times_ns", np.int64, (None, 2)).tolist():
-            hop = there.get((start_ns, end_ns))
-            if hop is None:
-                raise CheckpointError(f"the hop from start_ns {start_ns} to {end_ns} is missing")
-            self._check_fits(hop)
-            ring.append(hop)
-        self._hops = deque(ring, maxlen=self.plan.hops)
-        self._pending, self._pending_samples = ([pending] if pending.size else []), pending.shape[0]
-        self._pending_start_ns = pending_start_ns
+        recall = Recall(self.plan, level, arrays)
+        if recall.pieces and not level.size:
+            raise CheckpointError(
+                f"level has no values, expected {len(self.plan.states)} for {len(recall.pieces)} hops"
+            )
+        if "pending" in arrays:
+            pending = checked(arrays, "pending", np.float64, (recall.last.rows, self._columns))
+            blocks = checked(arrays, "pending_blocks", np.int64, (None, 2))
+            ring = [HopMoments.restored(unprefixed(f"hop_{number}", arrays)) for number in range(len(recall.pieces))]
+            for hop in ring:
+                self._check_fits(hop)
+            self._hops, self._pieces = deque(ring, self.plan.hops), deque(recall.pieces, self.plan.hops)
+            self._pending, self._pending_samples = ([pending] if pending.size else []), pending.shape[0]
+            self._pending_start_ns = recall.last.start_ns
+            self._blocks, self._row = deque((start, rows) for start, rows in blocks.tolist()), recall.last.row
+        elif recall.pieces or recall.last.rows:
+            self._recall = recall
         self._level = level if level.size else None
 
     @property

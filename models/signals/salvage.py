@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from models.errors import RecordingError
 from models.signals.recording import DAMAGE, RecordedMessage, RecordingWriter, reading, unpacked, writing
 
-__all__ = ["Salvage", "inspect_recording", "salvage_recording"]
+__all__ = ["Salvage", "inspect_recording", "salvage_recording", "salvaged_messages"]
 
 
 @dataclass(slots=True)
@@ -118,6 +118,17 @@ def inspect_recording(path: Path) -> Salvage:
     for _ in _salvaged(path, salvage):
         pass
     return salvage
+
+
+def salvaged_messages(path: Path) -> Iterator[RecordedMessage]:
+    """Messages that can be read of a recording, cut off or not, in the order in which they were written.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be opened.
+    """
+    return _salvaged(path, _nothing_yet(path))
 
 
 def _nothing_yet(path: Path) -> Salvage:

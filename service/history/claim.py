@@ -42,8 +42,8 @@ class Bundle:
     readings: deque[tuple[int, StoredReading]] = field(default_factory=deque)
     events: list[StoredEvent] = field(default_factory=list)
     head: CheckpointHead | None = None
-    new_hops: dict[int, bytes] = field(default_factory=dict)
-    keep: frozenset[int] = frozenset()
+    new_parts: dict[str, bytes] = field(default_factory=dict)
+    keep: frozenset[str] = frozenset()
     steps: int = 0
     heard: list[Future[bool]] = field(default_factory=list)
 
@@ -128,10 +128,10 @@ class Claim:
         waiting.reports.extend(reports)
         waiting.readings.extend((recorded_ns, reading) for reading in step.readings)
         if step.checkpoint is not None:
-            new_hops = dict(step.checkpoint.new_hops)
+            new = dict(step.checkpoint.new_parts)
             waiting.head = step.checkpoint.head
-            waiting.keep = frozenset(step.checkpoint.keep) | new_hops.keys()
-            waiting.new_hops = {end: hop for end, hop in waiting.new_hops.items() if end in waiting.keep} | new_hops
+            waiting.keep = frozenset(step.checkpoint.keep) | new.keys()
+            waiting.new_parts = {name: part for name, part in waiting.new_parts.items() if name in waiting.keep} | new
         while len(waiting.reports) > self.most_reports:
             waiting.reports.popleft()
             self.dropped_reports += 1
@@ -168,8 +168,6 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
         _check(machine, f"alarm event {event.sequence}", event)
     if step.checkpoint is not None:
         _check(machine, "checkpoint", step.checkpoint.head)
-        for end_ns, _ in step.checkpoint.new_hops:
-            _check_number(machine, "hop of the checkpoint", "end_ns", end_ns)
     compressor = zstandard.ZstdCompressor()
     return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
 

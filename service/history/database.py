@@ -36,7 +36,7 @@ _FINISH_S = 2.0  # for what others have asked for when the history is closed
 _JOIN_S = 10.0
 _WATCH_S = 0.5
 _IMMEDIATE = "rotorwatch_immediate"
-_NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_hops", "series", "tokens", "webhook_cursors")
+_NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_parts", "series", "tokens", "webhook_cursors")
 """Tables without which a monitor cannot go on; to look through the others would take minutes."""
 _POSTGRESQL = {"application_name": "rotorwatch", "tcp_user_timeout": 25_000} | {
     "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3
@@ -421,8 +421,10 @@ def _checked(url: str) -> URL:
 def _prepare_sqlite(connection: Any, record: object) -> None:
     _ = record
     connection.isolation_level = None  # the transactions below, not those that the driver would begin
-    # A compressed report is somewhat longer than half of SQLite's usual page, of which the rest would stay empty.
-    for setting in ("page_size = 8192", "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
+    # Every page that a step touches is written whole, and few pages hold more than one thing that a step changes. Those
+    # that every step touches go from the log into the file only every few hundred steps.
+    small = ("page_size = 1024", "wal_autocheckpoint = 4000")
+    for setting in (*small, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {setting}")
 
 

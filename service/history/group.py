@@ -2,11 +2,12 @@
 
 import math
 from collections import ChainMap, defaultdict
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from sqlalchemy import Connection, Table, case, delete, insert, or_, select, update
+import zstandard
+from sqlalchemy import ColumnElement, Connection, Table, case, delete, insert, or_, select, update
 
 from service.history.claim import Bundle, Claim
 from service.history.database import Database
@@ -15,10 +16,11 @@ from service.history.records import StoredEvent
 from service.history.tables import (
     alarm_events,
     buckets,
-    checkpoint_hops,
+    checkpoint_parts,
     checkpoints,
     evaluations,
     machines,
+    open_buckets,
     readings,
     reports,
     series,
@@ -169,38 +171,64 @@ def _add_readings(
 
 
 def _fill_buckets(database: Database, connection: Connection, rows: list[dict[str, Any]]) -> None:
-    """Add readings to the buckets they lie in."""
-    merged: dict[tuple[int, int], dict[str, Any]] = {}
+    """Add readings to the open buckets; those that they lie beyond are closed."""
+    filling = open_buckets.c
+    wanted = filling.series_id.in_({row["series_id"] for row in rows})
+    # Locked in one order, whoever writes: two monitors on one server must not wait for each other.
+    query = select(open_buckets).where(wanted).order_by(filling.series_id).with_for_update()
+    there = {row["series_id"]: dict(row) for row in connection.execute(query).mappings()}
+    closed: dict[tuple[int, int, int], dict[str, Any]] = {}
     for row in rows:
-        there = merged.setdefault((row["series_id"], row["start_ns"]), row)
-        if there is not row:
-            there |= {name: there[name] + row[name] for name in _ADDED}
-            there |= {name: max(there[name], row[name]) for name in _GREATEST}
-            there["minimum"] = min(there["minimum"], row["minimum"])
-    made, stored = database.insert(buckets), buckets.c
+        before = there.get(row["series_id"])
+        if before is not None and _place(before) == _place(row):
+            _add(before, row)
+            continue
+        if before is not None:
+            _add(closed.setdefault(_place(before), before), before)
+        there[row["series_id"]] = row
+    _upsert(database, connection, open_buckets, there.values(), filling.series_id)
+    if closed:
+        stored = buckets.c
+        _upsert(database, connection, buckets, closed.values(), stored.series_id, stored.start_ns, stored.length_ns)
+
+
+def _place(row: Mapping[str, Any]) -> tuple[int, int, int]:
+    return row["series_id"], row["start_ns"], row["length_ns"]
+
+
+def _add(bucket: dict[str, Any], more: Mapping[str, Any]) -> None:
+    if bucket is not more:
+        bucket |= {name: bucket[name] + more[name] for name in _ADDED}
+        bucket |= {name: max(bucket[name], more[name]) for name in _GREATEST}
+        bucket["minimum"] = min(bucket["minimum"], more["minimum"])
+
+
+def _upsert(
+    database: Database, connection: Connection, table: Table, rows: Iterable[dict[str, Any]], *key: ColumnElement[int]
+) -> None:
+    """Write open buckets as they are, and add closed ones to what is stored of them."""
+    made, stored = database.insert(table), table.c
     new = made.excluded
-    added = made.on_conflict_do_update(
-        index_elements=[stored.series_id, stored.start_ns, stored.length_ns],
-        set_={name: stored[name] + new[name] for name in _ADDED}
-        | {name: case((new[name] > stored[name], new[name]), else_=stored[name]) for name in _GREATEST}
-        | {"minimum": case((new.minimum < stored.minimum, new.minimum), else_=stored.minimum)},
-    )
-    # In one order, whoever writes: two monitors on one server must not wait for each other.
-    connection.execute(added, [merged[place] for place in sorted(merged)])
+    changes: dict[str, Any] = {one.name: new[one.name] for one in stored if one.name != "series_id"}
+    if table is buckets:
+        changes = {name: stored[name] + new[name] for name in _ADDED}
+        changes |= {name: case((new[name] > stored[name], new[name]), else_=stored[name]) for name in _GREATEST}
+        changes["minimum"] = case((new.minimum < stored.minimum, new.minimum), else_=stored.minimum)
+    connection.execute(made.on_conflict_do_update(index_elements=key, set_=changes), sorted(rows, key=_place))
 
 
 def _write_checkpoint(connection: Connection, machine_id: int, bundle: Bundle) -> None:
     if bundle.head is None:
         return
-    values = asdict(bundle.head)
+    values = asdict(bundle.head) | {"alarms": zstandard.compress(bundle.head.alarms.encode())}
     changed = connection.execute(update(checkpoints).where(checkpoints.c.machine_id == machine_id).values(values))
     if changed.rowcount == 0:
         connection.execute(insert(checkpoints).values(machine_id=machine_id, **values))
-    hops = checkpoint_hops.c
-    there = connection.scalars(select(hops.end_ns).where(hops.machine_id == machine_id))
-    gone = [end_ns for end_ns in there if end_ns not in bundle.keep or end_ns in bundle.new_hops]
+    parts = checkpoint_parts.c
+    there = connection.scalars(select(parts.name).where(parts.machine_id == machine_id))
+    gone = [name for name in there if name not in bundle.keep or name in bundle.new_parts]
     if gone:
-        connection.execute(delete(checkpoint_hops).where(hops.machine_id == machine_id, hops.end_ns.in_(gone)))
-    new = [{"machine_id": machine_id, "end_ns": end, "moments": hop} for end, hop in bundle.new_hops.items()]
+        connection.execute(delete(checkpoint_parts).where(parts.machine_id == machine_id, parts.name.in_(gone)))
+    new = [{"machine_id": machine_id, "name": name, "data": part} for name, part in bundle.new_parts.items()]
     if new:
-        connection.execute(insert(checkpoint_hops), new)
+        connection.execute(insert(checkpoint_parts), new)

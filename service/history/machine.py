@@ -1,6 +1,7 @@
 """What one machine writes into the history and reads from it."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from sqlalchemy import Connection, func, select
@@ -20,7 +21,7 @@ from service.history.records import (
     StoredReading,
     StoredReport,
 )
-from service.history.tables import alarm_events, checkpoint_hops, checkpoints, evaluations, readings, reports, series
+from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evaluations, readings, reports, series
 from service.history.trend import trend
 from service.history.writer import Writer
 
@@ -114,14 +115,18 @@ class MachineStore:
 
     def restore(self) -> Checkpoint | None:
         """State of the monitor after the last committed step, or None if there is none."""
-        hops, machine_id = checkpoint_hops.c, self._claim.machine_id
+        parts, machine_id = checkpoint_parts.c, self._claim.machine_id
         with self._database.reading() as connection:
             head = connection.execute(select(*_HEAD).where(checkpoints.c.machine_id == machine_id)).one_or_none()
             if head is None:
                 return None
-            query = select(hops.end_ns, hops.moments).where(hops.machine_id == machine_id).order_by(hops.end_ns)
+            query = select(parts.name, parts.data).where(parts.machine_id == machine_id).order_by(parts.name)
             rows = connection.execute(query).all()
-        return Checkpoint(CheckpointHead(*head), tuple((row.end_ns, row.moments) for row in rows))
+        with suppress(StoreError):  # without alarms, whoever restores them finds out and says so
+            alarms = ""
+            alarms = unpack(head.alarms)
+        kept = CheckpointHead(**head._asdict() | {"alarms": alarms})
+        return Checkpoint(kept, tuple((row.name, row.data) for row in rows))
 
     def events(  # noqa: PLR0913  # each narrows the query
         self,

@@ -69,7 +69,7 @@ class StoredReading:
 
 @dataclass(frozen=True, slots=True)
 class CheckpointHead:
-    """State of a monitor after a step, all but the ring of hops.
+    """State of a monitor after a step, all but its large parts.
 
     `format` is that of `state`; `bundle`, `machine_hash` and `code_version` are what it belongs to; `end_ns` is the end
     of the newest data in it; `alarms` is the state of the alarms, JSON.
@@ -87,22 +87,22 @@ class CheckpointHead:
 
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
-    """What a monitor goes on from: head and ring of hops, each with the end of its data, oldest first."""
+    """What a monitor goes on from: head and parts, each with its name."""
 
     head: CheckpointHead
-    hops: tuple[tuple[int, bytes], ...]
+    parts: tuple[tuple[str, bytes], ...]
 
 
 @dataclass(frozen=True, slots=True)
 class CheckpointStep:
-    """How the checkpoint changes in a step: a new head, new hops, and the ends of those that remain.
+    """How the checkpoint changes in a step: a new head, new parts, and the names of those that remain.
 
-    All other hops are deleted. New ones remain whether they are named or not.
+    All other parts are deleted. New ones remain whether they are named or not.
     """
 
     head: CheckpointHead
-    new_hops: tuple[tuple[int, bytes], ...]
-    keep: tuple[int, ...]
+    new_parts: tuple[tuple[str, bytes], ...]
+    keep: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from service.history.database import Database
 from service.history.errors import StoreError
 from service.history.records import Dropped
 from service.history.retention import Retention
-from service.history.tables import buckets, evaluations, readings, reports, series
+from service.history.tables import buckets, evaluations, open_buckets, readings, reports, series
 
 __all__ = ["Reduction"]
 
@@ -54,7 +54,10 @@ class Reduction:
             return Dropped(
                 reports=self._repeat(reports, now_ns - round(kept.reports_days * _DAY_NS)),
                 windows=self._repeat(evaluations, now_ns - round(kept.readings_days * _DAY_NS)),
-                buckets=self._repeat(buckets, now_ns - round(max(kept.buckets_days, kept.readings_days) * _DAY_NS)),
+                buckets=sum(
+                    self._repeat(table, now_ns - round(max(kept.buckets_days, kept.readings_days) * _DAY_NS))
+                    for table in (buckets, open_buckets)
+                ),
             )
 
     def _run(self) -> None:

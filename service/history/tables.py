@@ -5,8 +5,8 @@
     machines --< alarm_events                      the log of alarms; triggers refuse to change it
              --< reports                           the newest, whole and compressed
              --< evaluations --< readings >-- series    a window's numbers: one row for the window, one for each number
-                                 buckets >-- series     the same reduced, filled as they come, and kept longer
-             --- checkpoints --< checkpoint_hops   where a monitor goes on from
+                    open_buckets, buckets >-- series    the same reduced, filled as they come, and kept longer
+             --- checkpoints --< checkpoint_parts  where a monitor goes on from
     tokens    audit_log    webhook_cursors
 """
 
@@ -17,11 +17,11 @@ from sqlalchemy import BigInteger, Double, Integer, LargeBinary, Text
 from sqlalchemy.types import TypeEngine
 
 __all__ = [
-    "REVISION", "alarm_events", "audit_log", "buckets", "checkpoint_hops", "checkpoints", "evaluations", "machines",
-    "metadata", "readings", "reports", "series", "tokens", "webhook_cursors",
+    "REVISION", "alarm_events", "audit_log", "buckets", "checkpoint_parts", "checkpoints", "evaluations", "machines",
+    "metadata", "open_buckets", "readings", "reports", "series", "tokens", "webhook_cursors",
 ]  # fmt: skip
 
-REVISION = "0002"
+REVISION = "0003"
 """The migration that ends with these tables."""
 
 metadata = sa.MetaData(
@@ -117,16 +117,32 @@ readings = sa.Table(
     sqlite_with_rowid=False,
 )
 
+
+def _reduced() -> tuple[sa.Column[Any], ...]:
+    return (
+        sa.Column("series_id", Integer, sa.ForeignKey("series.series_id"), nullable=False),
+        *_filled(BigInteger, "start_ns", "length_ns", "recorded_ns", "count"),
+        *_filled(Double, "minimum", "maximum", "total"),
+        *_filled(BigInteger, "errors"),
+        *_filled(Double, "errors_total"),
+    )
+
+
 buckets = sa.Table(
     "buckets",
     metadata,
-    sa.Column("series_id", Integer, sa.ForeignKey("series.series_id"), nullable=False),
-    *_filled(BigInteger, "start_ns", "length_ns", "recorded_ns", "count"),
-    *_filled(Double, "minimum", "maximum", "total"),
-    *_filled(BigInteger, "errors"),
-    *_filled(Double, "errors_total"),
+    *_reduced(),
     sa.PrimaryKeyConstraint("series_id", "start_ns", "length_ns"),
     sa.Index(None, "recorded_ns"),
+    sqlite_with_rowid=False,
+)
+
+# Those that are being filled: beside each other, where the others lie far apart, and each would cost a page.
+open_buckets = sa.Table(
+    "open_buckets",
+    metadata,
+    *_reduced(),
+    sa.PrimaryKeyConstraint("series_id"),
     sqlite_with_rowid=False,
 )
 
@@ -138,17 +154,18 @@ checkpoints = sa.Table(
     sa.Column("bundle", Text, nullable=True),
     *_filled(Text, "machine_hash", "code_version"),
     *_filled(BigInteger, "end_ns", "recorded_ns"),
-    *_filled(Text, "alarms"),
-    *_filled(LargeBinary, "state"),
+    *_filled(LargeBinary, "alarms", "state"),
 )
 
-checkpoint_hops = sa.Table(
-    "checkpoint_hops",
+# What is large in a checkpoint and stays the same for many hops.
+checkpoint_parts = sa.Table(
+    "checkpoint_parts",
     metadata,
     _machine_id(),
-    *_filled(BigInteger, "end_ns"),
-    *_filled(LargeBinary, "moments"),
-    sa.PrimaryKeyConstraint("machine_id", "end_ns"),
+    *_filled(Text, "name"),
+    *_filled(LargeBinary, "data"),
+    sa.PrimaryKeyConstraint("machine_id", "name"),
+    sqlite_with_rowid=False,
 )
 
 tokens = sa.Table(

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import BigInteger, Connection, Select, case, cast, func, literal, select, union_all
+from sqlalchemy import BigInteger, Connection, Select, Table, case, cast, func, literal, select, union_all
 
 from service.history.records import Bucket
-from service.history.tables import buckets, evaluations, readings, series
+from service.history.tables import buckets, evaluations, open_buckets, readings, series
 
 __all__ = ["trend"]
 
@@ -62,7 +62,7 @@ def trend(
         return ()
     parts = [_readings(machine_id, list(titles), first, end) for first, end in grid.of_windows]
     if grid.of_buckets[0] < grid.of_buckets[1]:
-        parts.append(_buckets(list(titles), *grid.of_buckets))
+        parts += [_buckets(table, list(titles), *grid.of_buckets) for table in (buckets, open_buckets)]
     found = union_all(*parts).subquery().c
     place = ((found.at_ns - grid.start_ns) // grid.length_ns).label("place")
     count, errors = (cast(func.sum(column), BigInteger) for column in (found["count"], found.errors))
@@ -93,7 +93,7 @@ def _grid(
 ) -> _Grid | None:
     """Where the buckets lie; None if there is nothing."""
     since, until = since_ns or 0, 2**63 - 1 if until_ns is None else until_ns
-    window, stored = evaluations.c, buckets.c
+    window = evaluations.c
     asked = select(window.end_ns).where(window.machine_id == machine_id, window.end_ns >= since, window.end_ns < until)
     # One after the other: each is found at an end of the index then, and not by looking through it.
     oldest: int | None = connection.scalar(asked.order_by(window.end_ns.asc()).limit(1))
@@ -105,13 +105,16 @@ def _grid(
         start = oldest if since_ns is None else since
         end = newest + 1 if until_ns is None else until
         return _Grid(start, end, -(-(end - start) // points), (0, 0), ((start, end),))
-    within = (stored.series_id.in_(series_ids), stored.start_ns >= since, stored.start_ns < until)
-    bounds = select(func.min(stored.start_ns), func.max(stored.start_ns), func.max(stored.length_ns)).where(*within)
-    of_buckets = connection.execute(bounds).one()
-    found = [value for value in (oldest, newest, *of_buckets[:2]) if value is not None]
+    found, unit = [value for value in (oldest, newest) if value is not None], 1
+    for stored in (buckets.c, open_buckets.c):
+        within = (stored.series_id.in_(series_ids), stored.start_ns >= since, stored.start_ns < until)
+        bounds = select(func.min(stored.start_ns), func.max(stored.start_ns), func.max(stored.length_ns)).where(*within)
+        first_ns, last_ns, length_ns = connection.execute(bounds).one()
+        if length_ns is not None:
+            found += [first_ns, last_ns]
+            unit = max(unit, length_ns)
     if not found:
         return None
-    unit = of_buckets[2] or 1
     start = (min(found) if since_ns is None else since) // unit * unit
     end = max(found) + 1 if until_ns is None else until
     shortest = -(-(end - start) // points)
@@ -152,8 +155,8 @@ def _readings(machine_id: int, series_ids: list[int], first_ns: int, end_ns: int
     )
 
 
-def _buckets(series_ids: list[int], first_ns: int, end_ns: int) -> Select[*tuple[Any, ...]]:
-    stored = buckets.c
+def _buckets(table: Table, series_ids: list[int], first_ns: int, end_ns: int) -> Select[*tuple[Any, ...]]:
+    stored = table.c
     columns = (stored["count"], stored.minimum, stored.maximum, stored.total, stored.errors, stored.errors_total)
     within = (stored.start_ns >= first_ns, stored.start_ns < end_ns)
     return select(stored.series_id, stored.start_ns.label("at_ns"), *columns).where(

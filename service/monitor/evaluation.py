@@ -33,6 +33,7 @@ from models.errors import BundleError, CheckpointError, EstimationError, Unexpla
 from models.machine import Machine, MachineFile
 from models.physics.parameters import PARAMETERS
 from models.signals.channels import Channel, with_channel_names
+from rotorwatch.records.health import HealthState
 from rotorwatch.records.windows import Equation, Opinion, Shape
 
 __all__ = ["Evaluation", "WindowEvaluator", "evaluator_for"]
@@ -71,6 +72,22 @@ class Evaluation:
     opinions: tuple[Opinion, ...]
     speed_rad_s: float | None
     shapes: tuple[Shape, ...] = ()
+
+    def calm(self, *, outside: bool) -> HealthState:
+        """State without raised alarms: healthy only if something was read that could have said otherwise."""
+        if outside:
+            return HealthState.OUTSIDE_MODEL
+        if self.deciding.evaluable:
+            return HealthState.HEALTHY
+        states = {shape.verdict for shape in self.shapes}
+        if "not changed" in states and "changed" not in states:
+            return HealthState.UNCHANGED
+        return HealthState.NOT_EVALUABLE
+
+    @property
+    def why_nothing(self) -> str:
+        """Why no parameter could be read, every reason once."""
+        return "; ".join(dict.fromkeys(one.reason for one in self.deciding.parameters if one.reason))
 
     def named(self, channels: Sequence[Channel]) -> "Evaluation":
         """The same with sentences in the names of a machine's channels."""

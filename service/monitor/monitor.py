@@ -18,14 +18,14 @@ import numpy as np
 
 from models.alarm_names import SHAPE
 from models.arrivals import Arrivals, Arrived
-from models.checkpoint import checked, from_bytes, prefixed, texts, to_bytes, unprefixed
+from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.commissioning.installed import Installed
-from models.diagnosis.moments import HopMoments, plan_for
-from models.diagnosis.readings import Diagnosis, no_reading
+from models.diagnosis.moments import plan_for
+from models.diagnosis.readings import no_reading
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.verdict.detectable import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
-from models.diagnosis.verdict.stretch import Stretch, stretch_of
+from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Admission, Gate, Reason
@@ -38,7 +38,8 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
-from service.monitor.evaluation import Evaluation, evaluator_for
+from service.monitor.evaluation import evaluator_for
+from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
 
 __all__ = ["MachineMonitor"]
@@ -85,6 +86,7 @@ class MachineMonitor:
         self._end_ns: int | None = None
         self._reached_ns: int | None = None
         self._kept_is_valid = True
+        self._not_recalled = 0
         self._drops: dict[tuple[int, int], int] = {}
         self._dropped = 0
         self._fault = ""
@@ -123,6 +125,9 @@ class MachineMonitor:
         misshapen = self._gate.form(block, schema_hash)
         if misshapen is not None:  # before anything is made of its run and number
             return (MonitorReport(self._count(misshapen)),)
+        if self._window.lacks and self._gate.knows(block):
+            self._recall(block)
+            return ()
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
             verdict = Admission(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
@@ -133,6 +138,30 @@ class MachineMonitor:
         done = self._step_due()
         self.used = self._used is block
         return done
+
+    def recall(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
+        """Take a message of a recording, for the window that a restored monitor lacks; nothing else comes of it.
+
+        Returns whether it is the newest block that the monitor has had: what was recorded after it is new.
+        """
+        try:
+            block, schema_hash = decode_block(payload, attachment, encoding)
+        except WireError:
+            return False
+        return self._gate.form(block, schema_hash) is None and self._gate.knows(block) and self._recall(block)
+
+    def _recall(self, block: SampleBlock) -> bool:
+        newest = self._gate.is_newest(block)
+        self._window.recall(block.samples, block.start_ns, newest=newest)
+        return newest
+
+    @property
+    def recalled(self) -> str:
+        """What became of a window that was to be recalled, in words; empty if nothing of it is missing."""
+        if self._window.lacks:
+            return "the window is not there until its samples come again"
+        lost = self._not_recalled
+        return f"{lost} hops of the window did not come again, it fills anew" if lost else ""
 
     def flush(self) -> tuple[MonitorReport, ...]:
         """Take the blocks that wait for earlier ones: those will not come any more."""
@@ -191,6 +220,7 @@ class MachineMonitor:
 
     def _hops(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
         """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
+        self._not_recalled += self._window.give_up()
         if not verdict.continuous:
             self._window.gap()
         self._newest.add(block, continuous=verdict.continuous and not verdict.clock_step_s)
@@ -245,11 +275,6 @@ class MachineMonitor:
         return self._end_ns
 
     @property
-    def hops(self) -> tuple[int, ...]:
-        """Ends of the hops in the window."""
-        return tuple(hop.end_ns for hop in self._window.hops)
-
-    @property
     def window(self) -> WindowStatistics | None:
         """The window of the latest report; None if it was not full."""
         return self._statistics
@@ -274,51 +299,49 @@ class MachineMonitor:
         """What has happened and was never handed over, because a defect came in between."""
         return self._alarms.take()
 
-    def state(self, kept: Collection[int] = ()) -> MonitorState:
-        """Everything that is remembered, to be put into another monitor.
+    def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:
+        """What is remembered, to be put into another monitor.
 
         Parameters
         ----------
-        kept : collection of int
-            Ends of the hops that are stored already and need not be handed over again.
+        kept : collection of str
+            Names of the parts that are stored already and need not be handed over again.
+        whole : bool
+            With the samples and moments of the window, megabytes, which otherwise have to be recalled.
         """
-        hops = self._window.hops
-        known = kept if self._kept_is_valid else ()
+        arrays = {
+            **prefixed("gate", self._gate.checkpoint()),
+            **prefixed("window", self._window.checkpoint(whole=whole)),
+            **prefixed("test", self._test.state.checkpoint()),
+            **prefixed("evaluator", self._evaluator.checkpoint()),
+            "calm": np.array([self._calm.value]),
+            "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
+        }
+        state, new, names = divided(arrays, self._test.state.hops(), kept if self._kept_is_valid else ())
         self._kept_is_valid = True
-        return MonitorState(
-            alarms=self._alarms.checkpoint(),
-            state=to_bytes(
-                {
-                    **prefixed("gate", self._gate.checkpoint()),
-                    **prefixed("window", self._window.checkpoint()),
-                    **prefixed("test", self._test.state.checkpoint()),
-                    **prefixed("evaluator", self._evaluator.checkpoint()),
-                    "calm": np.array([self._calm.value]),
-                    "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
-                }
-            ),
-            new_hops=tuple((hop.end_ns, to_bytes(hop.checkpoint())) for hop in hops if hop.end_ns not in known),
-            hops=self.hops,
-            end_ns=self._end_ns,
-        )
+        return MonitorState(self._alarms.checkpoint(), state, new, names, self._end_ns)
 
-    def restore(self, state: bytes, hops: Collection[bytes]) -> None:
+    def restore(self, state: bytes, parts: Collection[bytes] = ()) -> None:
         """Go on where another monitor of the same machine, files and version stood; alarms are restored by themselves.
+
+        Parameters
+        ----------
+        state : bytes
+        parts : collection of bytes
 
         Raises
         ------
         CheckpointError
             If the bytes are damaged or of another form; this monitor is of no use then.
         """
-        arrays = from_bytes(state)
-        moments = tuple(HopMoments.restored(from_bytes(hop)) for hop in hops)
-        test = SequentialState.restored(unprefixed("test", arrays))
+        arrays, hops = joined(state, parts)
+        test = SequentialState.restored(unprefixed("test", arrays), hops)
         calm = texts(arrays, "calm")
         if calm not in {(state.value,) for state in HealthState}:
             raise CheckpointError(f"calm is {calm}, expected one of {', '.join(HealthState)}")
         end_ns = next(iter(checked(arrays, "end_ns", np.int64, (None,)).tolist()), None)
         self._gate.restore(unprefixed("gate", arrays))
-        self._window.restore(unprefixed("window", arrays), moments)
+        self._window.restore(unprefixed("window", arrays))
         self._evaluator.restore(unprefixed("evaluator", arrays))
         self._test.state = test
         self._end_ns, self._calm = end_ns, HealthState(*calm)
@@ -416,9 +439,9 @@ class MachineMonitor:
             state = self._state(HealthState.NOT_EVALUABLE)
             return Report(**self._window_now(statistics.start_ns, end_ns, state), reason=str(error))
         evaluation = evaluation.named(self.machine.sensors)
-        looks = {hops: _stretch(evaluation.short[hops], present[hops]) for hops in evaluation.short}
+        looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
         whole = self._test.settings.window_hops
-        looks[whole] = _stretch(evaluation.deciding, statistics)
+        looks[whole] = stretch_of(evaluation.deciding, statistics.start_ns, end_ns)
         verdict = self._test.update(looks)
         changed = [shape.text for shape in evaluation.shapes if shape.verdict == "changed"]
         self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
@@ -433,12 +456,12 @@ class MachineMonitor:
         # Where the window straddles a change, what is explained is in the verdict's current readings.
         reason = "" if verdict.current else unexplained
         if not unexplained and not evaluation.deciding.evaluable:
-            reason = _why_nothing(evaluation.deciding)
+            reason = evaluation.why_nothing
         if evaluation.shapes:
             evidence = Evidence(start_ns=statistics.start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
         outside = verdict.outside_model
-        state = self._state(_calm_state(evaluation, outside=outside))
+        state = self._state(evaluation.calm(outside=outside))
         return Report(
             **self._window_now(statistics.start_ns, end_ns, state),
             speed_rad_s=evaluation.speed_rad_s,
@@ -472,24 +495,3 @@ class MachineMonitor:
                 return HealthState.ALERT
             case None:
                 return otherwise
-
-
-def _calm_state(evaluation: Evaluation, *, outside: bool) -> HealthState:
-    """What a machine without raised alarms is: healthy only if something was read that could have said otherwise."""
-    if outside:
-        return HealthState.OUTSIDE_MODEL
-    if evaluation.deciding.evaluable:
-        return HealthState.HEALTHY
-    states = {shape.verdict for shape in evaluation.shapes}
-    if "not changed" in states and "changed" not in states:
-        return HealthState.UNCHANGED
-    return HealthState.NOT_EVALUABLE
-
-
-def _why_nothing(diagnosis: Diagnosis) -> str:
-    """Why no parameter could be read, every reason once."""
-    return "; ".join(dict.fromkeys(reading.reason for reading in diagnosis.parameters if reading.reason))
-
-
-def _stretch(diagnosis: Diagnosis, window: WindowStatistics) -> Stretch:
-    return stretch_of(diagnosis, window.start_ns, window.end_ns)

@@ -108,19 +108,19 @@ class MonitorState:
     alarms : str
         The alarms, JSON.
     state : bytes
-        Everything else but the hops of the window (`models.checkpoint`).
-    new_hops : tuple of (int, bytes)
-        Hops of the window that are not known to be kept already, by the time of their end, oldest first.
-    hops : tuple of int
-        Ends of all hops that are in the window, oldest first.
+        Everything else that is small (`models.checkpoint`).
+    new_parts : tuple of (str, bytes)
+        What is large and is not known to be kept already, by name.
+    parts : tuple of str
+        Names of all parts that belong to the state.
     end_ns : int or None
         End of the newest data; None before the first.
     """
 
     alarms: str
     state: bytes
-    new_hops: tuple[tuple[int, bytes], ...]
-    hops: tuple[int, ...]
+    new_parts: tuple[tuple[str, bytes], ...]
+    parts: tuple[str, ...]
     end_ns: int | None
 
 

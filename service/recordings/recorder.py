@@ -272,6 +272,8 @@ class MachineRecorder:
             self._descriptor = message
         self._unsafe.append(message)
         writer.write(message)
+        if message.key == self.machine.keys.report:
+            writer.flush()  # a monitor that is killed now goes on from what this report was made of
         self._count(writer)
 
     def _open(self, first: RecordedMessage) -> RecordingWriter:

@@ -1,9 +1,10 @@
 """What of a monitor goes into the history with every hop, and how a monitor comes back from it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 
 from models.errors import CheckpointError
+from models.signals.recording import RecordedMessage
 from rotorwatch import __version__
 from rotorwatch.records.fields import finite
 from rotorwatch.records.health import MEASURES, Report
@@ -24,10 +25,14 @@ from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
-__all__ = ["FORMAT", "StepWriter", "checkpoint_step", "restored", "stored_event", "stored_readings", "stored_report"]
+__all__ = [
+    "FORMAT", "StepWriter", "checkpoint_step", "heard_since", "recorded_since_ns", "restored", "stored_event",
+    "stored_readings", "stored_report",
+]  # fmt: skip
 
-FORMAT = 1
+FORMAT = 2
 """Goes up when what a monitor remembers changes its form."""
+_LOOK_BACK_NS, _LATE_NS = 300 * 10**9, 3600 * 10**9
 
 
 def stored_report(window: Report) -> StoredReport:
@@ -92,13 +97,13 @@ class StepWriter:
         self._history = history
         self._identity = identity
         self._owed: tuple[AlarmEvent, ...] = ()
-        self._kept: tuple[int, ...] = ()
+        self._kept: tuple[str, ...] = ()
         self._generation = 0
         self.refused: Exception | None = None
 
-    def keeps(self, hops: tuple[int, ...]) -> None:
-        """Take note of the hops that are in the history already."""
-        self._kept = hops
+    def keeps(self, parts: tuple[str, ...]) -> None:
+        """Take note of the parts of the state that are in the history already."""
+        self._kept = parts
 
     def begun_anew(self) -> str:
         """Why the history has to be given everything again; empty if it has not."""
@@ -109,9 +114,17 @@ class StepWriter:
         self._owed += events
 
     def commit(
-        self, monitor: MachineMonitor, windows: tuple[Report, ...], recorded_ns: int
+        self, monitor: MachineMonitor, windows: tuple[Report, ...], recorded_ns: int, *, whole: bool = False
     ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...], bool]:
         """Commit windows, the events that are owed, and the state of the monitor; raises nothing.
+
+        Parameters
+        ----------
+        monitor : MachineMonitor
+        windows : tuple of WindowReport
+        recorded_ns : int
+        whole : bool
+            With all that is in the window, so that nothing has to be recalled.
 
         Returns
         -------
@@ -125,14 +138,14 @@ class StepWriter:
         told = tuple(self._told(event, recorded_ns) for event in self._owed)
         try:
             reports = tuple(stored_report(window) for window in windows)
-            state = monitor.state(self._kept)
+            state = monitor.state(self._kept, whole=whole)
             checkpoint = checkpoint_step(self._identity, state, recorded_ns)
             written = self._history.commit(Step(reports, stored_readings(windows), told, checkpoint))
         except Exception as error:  # whatever it is, no alarm may be lost to it
             self.refused, self._kept = error, ()
             self._commit_events(told)
             return reports, told, False
-        self._kept, self._owed = state.hops, ()
+        self._kept, self._owed = state.parts, ()
         return reports, told, written
 
     def _told(self, event: AlarmEvent, recorded_ns: int) -> StoredEvent:
@@ -167,7 +180,7 @@ def checkpoint_step(identity: Identity, state: MonitorState, recorded_ns: int) -
         alarms=state.alarms,
         state=state.state,
     )
-    return CheckpointStep(head, state.new_hops, state.hops)
+    return CheckpointStep(head, state.new_parts, state.parts)
 
 
 def restored(
@@ -198,7 +211,7 @@ def restored(
     differs = _differences(head, identity)
     if not differs:
         try:
-            monitor.restore(head.state, tuple(data for _, data in checkpoint.hops))
+            monitor.restore(head.state, tuple(data for _, data in checkpoint.parts))
         except CheckpointError as error:
             monitor, differs = build(), [str(error)]
     try:
@@ -209,6 +222,22 @@ def restored(
     if differs:
         return monitor, f"alarms are as they were at {at}; the window fills anew: {'; '.join(differs)}"
     return monitor, f"went on where it stood at {at}"
+
+
+def recorded_since_ns(head: CheckpointHead) -> int:
+    """From when on, by the computer's time, recordings hold all that the window was made of."""
+    late_ns = head.recorded_ns - head.end_ns  # long after the latest data, or by another clock
+    return head.recorded_ns - _LOOK_BACK_NS - (late_ns if 0 < late_ns < _LATE_NS else 0)
+
+
+def heard_since(monitor: MachineMonitor, recorded: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
+    """What was recorded after the newest block that the monitor has had; what was before goes into its window."""
+    newest = False
+    for message in recorded:
+        if newest:
+            yield message
+        else:
+            newest = monitor.recall(message.payload, message.attachment, message.encoding)
 
 
 def _differences(head: CheckpointHead, identity: Identity) -> Sequence[str]:

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from models.commissioning.installed import Installed
+from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
@@ -28,11 +28,12 @@ from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
 from service.settings.service import QueueSettings
-from service.stream.checkpoints import StepWriter, restored
+from service.stream.checkpoints import StepWriter, heard_since, recorded_since_ns, restored
 from service.stream.inbox import Inbox, RawBlock
+from service.stream.outlet import Outlet
 from service.terminal.logs import Limiter, logger
 
-__all__ = ["Clocks", "MachineWorker", "Outlet"]
+__all__ = ["Clocks", "MachineWorker"]
 
 _OPERATION_S = 10.0
 _HELD_UP_S = 2.0
@@ -57,19 +58,6 @@ class Clocks:
     utc_ns: Callable[[], int] = time.time_ns
 
 
-class Outlet(Protocol):
-    """Where a worker publishes; `service.stream.transport.MachineLink` is one."""
-
-    def publish_report(self, text: str) -> None:
-        """Publish a window report."""
-
-    def publish_alarm_event(self, text: str) -> None:
-        """Publish an alarm event."""
-
-    def publish_alarm_state(self, text: str) -> None:
-        """Publish the alarms as they are now."""
-
-
 class MachineWorker:
     """Monitors one machine in a thread of its own.
 
@@ -87,6 +75,9 @@ class MachineWorker:
         Say how old the latest data are and when things were recorded, nothing else.
     on_events : callable
         Called after alarm events were committed.
+    recorded : callable
+        Takes a time of this computer and returns the messages of the stream that were recorded since then, before this
+        program was started.
     """
 
     def __init__(
@@ -96,6 +87,7 @@ class MachineWorker:
         history: MachineStore,
         clocks: Clocks = Clocks(),  # immutable
         on_events: Callable[[], None] = lambda: None,
+        recorded: Callable[[int], Iterable[RecordedMessage]] = lambda _: (),
     ) -> None:
         self.machine = machine = installed.machine
         self.inbox = Inbox(
@@ -113,6 +105,8 @@ class MachineWorker:
         self.tally = Tally()
         self._clocks = clocks
         self._on_events = on_events
+        self._recorded = recorded
+        self._recorded_since_ns: int | None = None
         self._log = logger(machine=f"{machine.site}/{machine.name}")
         self._limiter = Limiter(clocks.monotonic_s)
         self.steps = StepWriter(history, self.identity)
@@ -145,13 +139,14 @@ class MachineWorker:
                 monitor.restore_alarms(NO_ALARMS, last + 1)
             return monitor, ""
         monitor, text = restored(lambda: MachineMonitor(installed), self.identity, checkpoint, last + 1)
-        self.steps.keeps(monitor.hops)
+        self.steps.keeps(tuple(name for name, _ in checkpoint.parts))
         self.history.go_on_from(monitor.next_sequence - 1)
         self._asleep_s = max(0.0, (self._clocks.utc_ns() - checkpoint.head.recorded_ns) / 1e9)
         # They were committed, but nobody knows whether they were published; whoever heard them leaves them out by id.
         latest = self.history.events(after=last - _LATEST, limit=_LATEST)
         self._unpublished = tuple(one for one in latest if one.recorded_ns >= checkpoint.head.recorded_ns)
         self._log.info("restart", what=text)
+        self._recorded_since_ns = recorded_since_ns(checkpoint.head)
         return monitor, text
 
     @property
@@ -231,7 +226,7 @@ class MachineWorker:
             link_missed_blocks=self._missed,
             worker_errors=self.errors,
             last_worker_error=self.last_error,
-            restart=self.restart,
+            restart="; ".join(each for each in (self.restart, self._monitor.recalled) if each),
         )
 
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
@@ -345,7 +340,20 @@ class MachineWorker:
                 return
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
+    def _hear_again(self, since_ns: int) -> None:
+        """Take from the recording what the window lacks, and what came after the latest step that was committed."""
+        for message in heard_since(self._monitor, self._recorded(since_ns)):
+            self._take(RawBlock(message.payload, message.attachment, message.encoding))
+            self._asleep_s = max(0.0, (self._clocks.utc_ns() - message.log_time_ns) / 1e9)
+        self._snapshot = self._monitor.health()
+        self._latest_data_s = None  # they are as old as they are
+
     def _run(self) -> None:
+        try:
+            if self._recorded_since_ns is not None:
+                self._hear_again(self._recorded_since_ns)
+        except Exception as error:  # what it brought to light must not end the monitoring of the machine
+            self._failed(error)
         while (item := self.inbox.get()) is not None:
             try:
                 if isinstance(item, RawBlock):
@@ -356,7 +364,7 @@ class MachineWorker:
                 self._failed(error)
                 self._fault(f"{type(error).__name__}: {error}")
         # An orderly end keeps where the monitor stands to the last block: going on needs no publisher's cache.
-        self._conclude((), (), always=True)
+        self._conclude((), (), whole=True)
 
     def _failed(self, error: Exception) -> None:
         self.errors += 1
@@ -401,7 +409,7 @@ class MachineWorker:
         )
 
     def _conclude(
-        self, windows: tuple[Report, ...], events: tuple[AlarmEvent, ...], *, always: bool = False
+        self, windows: tuple[Report, ...], events: tuple[AlarmEvent, ...], *, always: bool = False, whole: bool = False
     ) -> tuple[str, ...]:
         """Commit, then let it be seen and publish; returns the events as they are published."""
         events += self._monitor.take_events()  # left behind by a defect
@@ -410,8 +418,8 @@ class MachineWorker:
         reports: tuple[StoredReport, ...] = ()
         told: tuple[StoredEvent, ...] = ()
         try:
-            if windows or events or always:
-                reports, told = self._commit(windows)
+            if windows or events or always or whole:
+                reports, told = self._commit(windows, whole=whole)
         finally:
             self._snapshot = snapshot
             self.latest = self._held()
@@ -429,10 +437,12 @@ class MachineWorker:
             self._fault(f"the history refuses what happens: {self.steps.refused}")
         return texts
 
-    def _commit(self, windows: tuple[Report, ...]) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
+    def _commit(
+        self, windows: tuple[Report, ...], *, whole: bool
+    ) -> tuple[tuple[StoredReport, ...], tuple[StoredEvent, ...]]:
         """Bring windows, events and the monitor's state into the history, as they are to be published."""
         begin_s = self._clocks.monotonic_s()
-        reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns())
+        reports, told, written = self.steps.commit(self._monitor, windows, self._clocks.utc_ns(), whole=whole)
         if self.steps.refused is not None:
             self._failed(self.steps.refused)
         elif not written:

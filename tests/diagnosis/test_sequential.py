@@ -7,7 +7,7 @@ import pytest
 
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
 from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
-from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.parameters import PARAMETERS
 from models.signals.block import FloatArray
@@ -40,6 +40,10 @@ def play(test: SequentialTest, hops: GaussianHops, *story: tuple[int, FloatArray
                 verdicts.append((number, test.update({h: look for h, look in looks.items() if h in wanted})))
             number += 1
     return verdicts
+
+
+def again(state: SequentialState) -> SequentialState:
+    return SequentialState.restored(state.checkpoint(), [hop_arrays(came) for _, came in sorted(state.hops().items())])
 
 
 def gaussian(seed: int, settings: SequentialSettings = SETTINGS) -> GaussianHops:
@@ -210,10 +214,10 @@ def test_a_restored_test_goes_on_as_if_nothing_had_happened() -> None:
     hops = gaussian(SEED + 9)
     going = SequentialTest(SETTINGS)
     play(going, hops, (60, true()), (30, true(c_by=-0.15)))
-    restored = SequentialTest(SETTINGS, SequentialState.restored(going.state.checkpoint()))
+    restored = SequentialTest(SETTINGS, again(going.state))
     for _ in range(30):
         looks = hops.looks(true(c_by=-0.15))
         assert restored.update(looks) == going.update(looks)
     assert going.state.findings[0].name == "c_by"
     going.clear()
-    assert SequentialState.restored(going.state.checkpoint()) == SequentialState()
+    assert again(going.state) == SequentialState()

@@ -310,7 +310,7 @@ def test_another_machine_file_keeps_the_time_of_the_alarms(later_ns: int, expect
     before.operate(order("shelve", "k_by", duration_s=HOUR_S), end_ns)
     identity = Identity(site="demo", machine="lab", bundle=None, machine_hash="old")
     step = checkpoint_step(identity, before.state(), 1)
-    then = Checkpoint(step.head, step.new_hops)
+    then = Checkpoint(step.head, step.new_parts)
     changed = install(machine(on_delay_s=77.0), None)
     now = identity_of(changed)
     after, text = restored(lambda: MachineMonitor(changed), now, then, 1)

@@ -108,14 +108,14 @@ def test_a_history_that_was_replaced_goes_on_with_the_numbers_of_the_alarms(tmp_
         at.put(*map(block, range(12)), block(40, run=2, sequence=0))
         at.put(*(block(40 + n, run=2, sequence=n) for n in range(1, 35)))
         last = at.history.last_sequence()
-        hops = in_file(tmp_path, "SELECT count(*) FROM checkpoint_hops")
+        state = in_file(tmp_path, "SELECT count(*) FROM checkpoints")
         assert last >= 0
         other.rename(history_of(tmp_path))
         until(lambda: at.store.lost != "", "the notice")
         until(lambda: ticked(at) and at.history.last_sequence() > last, "the alarm")
         until(lambda: at.history.waiting == 0, "the state in the new file")
         assert at.log() == [(last + 1, "raised", FAULT)]
-        assert in_file(tmp_path, "SELECT count(*) FROM checkpoint_hops") == hops != [(0,)]
+        assert in_file(tmp_path, "SELECT count(*) FROM checkpoints") == state == [(1,)]
         # Nobody else gets the machine meanwhile.
         second = Store(f"sqlite:///{history_of(tmp_path)}", Retention())
         second.open()

@@ -45,7 +45,7 @@ from tests.service.test_alarm_trouble import bench, block, named, order, watched
 DEFECT = "a defect of the evaluation"
 
 
-def defective(*_: object) -> None:
+def defective(*_: object, **__: object) -> None:
     raise RuntimeError(DEFECT)
 
 
@@ -303,7 +303,7 @@ def test_whatever_is_accepted_can_be_remembered_and_restored(
         monitor.step_payload(payload, b"", ARROW_ENCODING)
     identity = identity_of(installed)
     step = checkpoint_step(identity, monitor.state(), 1)
-    again, text = restored(lambda: MachineMonitor(installed), identity, Checkpoint(step.head, step.new_hops), 0)
+    again, text = restored(lambda: MachineMonitor(installed), identity, Checkpoint(step.head, step.new_parts), 0)
     assert again.state().state == monitor.state().state
     assert text.startswith("went on where it stood")
 

@@ -83,9 +83,9 @@ def head(end_ns: int, **changes: object) -> CheckpointHead:
 
 
 def hop_step(number: int, ring: int = 3, **parts: object) -> Step:
-    """The step of a hop: a report, readings and a checkpoint whose ring holds so many hops."""
+    """The step of a hop: a report, readings and a checkpoint with so many parts, one of which is new."""
     end_ns = T0 + number * 5 * NS
-    keep = tuple(T0 + each * 5 * NS for each in range(max(0, number - ring + 1), number))
+    keep = tuple(f"part {each:06}" for each in range(max(0, number - ring + 1), number))
     fields: dict[str, object] = {
         "reports": (StoredReport(end_ns - 60 * NS, end_ns, "healthy", 0.5, f'{{"number": {number}}}'),),
         "readings": (
@@ -93,7 +93,7 @@ def hop_step(number: int, ring: int = 3, **parts: object) -> Step:
             StoredReading(end_ns, "parameter", "e", -0.1 * number, None),
             StoredReading(end_ns, "misfit", "z", 1.5, None),
         ),
-        "checkpoint": CheckpointStep(head(end_ns), ((end_ns, b"hop %d" % number),), keep),
+        "checkpoint": CheckpointStep(head(end_ns), ((f"part {number:06}", b"part %d" % number),), keep),
     }
     return Step(**(fields | parts))  # type: ignore[arg-type]  # fields of any kind
 
@@ -137,7 +137,7 @@ def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
         for place, (quantity, name) in enumerate((("parameter", "k_by"), ("parameter", "e"), ("misfit", "z"))):
             found = [reading for _, reading in lab.readings(quantity=quantity, name=name)]
             assert found == [step.readings[place] for step in steps]
-        newest = [(T0 + number * 5 * NS, b"hop %d" % number) for number in (3, 4, 5)]
+        newest = [(f"part {number:06}", b"part %d" % number) for number in (3, 4, 5)]
         assert lab.restore() == Checkpoint(head(T0 + 25 * NS), tuple(newest))
     finally:
         again.close()
@@ -195,17 +195,17 @@ def test_reports_stand_in_the_order_of_arrival_when_a_clock_was_set_back(lab: Ma
     assert [round(reading.value / 0.1) for _, reading in readings] == [10, 3, 4]
 
 
-def test_the_ring_of_hops_holds_what_is_to_remain(lab: MachineStore) -> None:
+def test_the_parts_of_a_checkpoint_are_those_that_are_to_remain(lab: MachineStore) -> None:
     for number in range(4):
         lab.commit(hop_step(number))
     cleared = head(T0, bundle="lab", alarms='{"k_by": 1}', state=b"")
     lab.commit(Step(checkpoint=CheckpointStep(cleared, (), ())))
     assert lab.restore() == Checkpoint(cleared, ())
-    lab.commit(Step(checkpoint=CheckpointStep(cleared, ((5, b"a"), (3, b"b")), ())))
-    lab.commit(Step(checkpoint=CheckpointStep(cleared, ((5, b"c"),), (3,))))
-    assert lab.restore() == Checkpoint(cleared, ((3, b"b"), (5, b"c")))
+    lab.commit(Step(checkpoint=CheckpointStep(cleared, (("e", b"a"), ("c", b"b")), ())))
+    lab.commit(Step(checkpoint=CheckpointStep(cleared, (("e", b"c"),), ("c",))))
+    assert lab.restore() == Checkpoint(cleared, (("c", b"b"), ("e", b"c")))
     lab.commit(Step(events=(alarm_event(0),)))  # a step without a checkpoint leaves it alone
-    assert lab.restore() == Checkpoint(cleared, ((3, b"b"), (5, b"c")))
+    assert lab.restore() == Checkpoint(cleared, (("c", b"b"), ("e", b"c")))
 
 
 def test_a_step_that_is_written_twice_leaves_its_events_once(lab: MachineStore) -> None:
@@ -467,10 +467,10 @@ def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
     store.open()
     try:
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
-        names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size")
+        names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size", "wal_autocheckpoint")
         with store._database.reading() as reader:
             found = [reader.scalar(text(f"PRAGMA {name}")) for name in names]
-        assert found == ["wal", 2, 1, 5000, 8192]
+        assert found == ["wal", 2, 1, 5000, 1024, 4000]
     finally:
         store.close()
     with sqlite3.connect(file) as connection:

@@ -104,7 +104,7 @@ def test_nothing_is_lost_while_the_database_is_away(
         restored = lab.restore()
         assert restored is not None
         assert restored.head == head(T0 + 40 * 5_000_000_000)
-        assert [hop for _, hop in restored.hops] == [b"hop 38", b"hop 39", b"hop 40"]
+        assert [part for _, part in restored.parts] == [b"part 38", b"part 39", b"part 40"]
 
 
 def test_what_waits_is_bounded_and_events_are_never_dropped(
@@ -126,7 +126,7 @@ def test_what_waits_is_bounded_and_events_are_never_dropped(
         ]  # fmt: skip
         restored = lab.restore()
         assert restored is not None
-        assert [hop for _, hop in restored.hops] == [b"hop 57", b"hop 58", b"hop 59"]
+        assert [part for _, part in restored.parts] == [b"part 57", b"part 58", b"part 59"]
 
 
 def test_what_waits_is_written_at_closing(parts: Parts) -> None:

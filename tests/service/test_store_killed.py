@@ -42,7 +42,7 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
             assert len(lab.readings(quantity="misfit", name="z", limit=10_000)) == steps
             restored = lab.restore()
             assert restored is not None
-            assert [hop for _, hop in restored.hops] == [b"hop %d" % n for n in range(steps - 3, steps)]
+            assert [part for _, part in restored.parts] == [b"part %d" % n for n in range(steps - 3, steps)]
             safe = steps - 1
         finally:
             store.close()

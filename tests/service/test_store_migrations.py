@@ -12,6 +12,7 @@ from sqlalchemy import create_engine, inspect, make_url, text
 from sqlalchemy.engine import Engine
 
 from service.history.errors import StoreError
+from service.history.records import Checkpoint, CheckpointHead
 from service.history.retention import Retention
 from service.history.schema import migrate
 from service.history.store import Store
@@ -126,3 +127,24 @@ def test_a_database_of_others_is_left_alone(url: str, change: str, message: str)
     engine.dispose()
     with pytest.raises(StoreError, match=message):
         opened_and_closed(url)
+
+
+def test_a_checkpoint_of_an_older_version_keeps_its_alarms(url: str) -> None:
+    engine = engine_for(url)
+    alarms = '{"k_by": "raised"}'
+    with engine.begin() as connection:
+        migrate(connection, "0002")
+        connection.execute(text("INSERT INTO machines VALUES (1, 'demo', 'lab', '', 3, 0, 3)"))
+        connection.execute(
+            text("INSERT INTO checkpoints VALUES (1, 1, NULL, 'hash', '0.1', 5, 6, :alarms, :state)"),
+            {"alarms": alarms, "state": b"RWCP"},
+        )
+        connection.execute(text("INSERT INTO checkpoint_hops VALUES (1, 5, :moments)"), {"moments": b"moments"})
+    engine.dispose()
+    store = Store(url, Retention())
+    store.open()
+    try:
+        found = store.machine("demo", "lab").restore()
+    finally:
+        store.close()
+    assert found == Checkpoint(CheckpointHead(1, None, "hash", "0.1", 5, 6, alarms, b"RWCP"), ())

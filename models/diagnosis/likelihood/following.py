@@ -16,7 +16,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from models.checkpoint import checked
-from models.diagnosis.likelihood.scoring import Derivatives, Maximum, Weights, inverse_factor, whitened_at
+from models.diagnosis.likelihood.scoring import (
+    Derivatives,
+    Maximum,
+    Weights,
+    information_of,
+    inverse_factor,
+    whitened_at,
+)
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, factor_of, packed
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
@@ -99,7 +106,8 @@ class Linearised:
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that is neither the model's nor the weights', as named arrays.
 
-        Spectra and slopes, megabytes, are computed again at the points where they were computed.
+        Spectra, slopes and information, megabytes, are computed again at the points where they were computed; of the
+        information the diagonal is kept, to which pulls have been added and taken away again.
         """
         return {
             "searched": self.theta,
@@ -108,7 +116,7 @@ class Linearised:
             "speeds_rad_s": np.array(
                 [self._searched.speed_rad_s, self._point.speed_rad_s, self.derivatives.speed_rad_s], dtype=np.float64
             ),
-            "information": self.derivatives.information,
+            "information": np.diag(self.derivatives.information),
             "left": self._left,
             "fitted": np.array(self._fitted, dtype=np.float64),
         }
@@ -132,16 +140,15 @@ class Linearised:
         if not (np.all(np.isfinite(theta)) and np.all(np.isfinite(point)) and np.all(np.isfinite(levels))):
             raise np.linalg.LinAlgError("a point that is not finite")
         at_slopes = model.at(theta, of_slopes)
+        slopes = model.slopes(at_slopes, inverse_factor(at_slopes.S))
+        information = information_of(slopes, weights)
+        information[np.diag_indices(model.size)] = checked(arrays, "information", np.float64, size)
         return cls(
             model,
             weights,
             model.at(theta, of_searched),
             model.at(point, of_point, levels),
-            Derivatives(
-                model.slopes(at_slopes, inverse_factor(at_slopes.S)),
-                checked(arrays, "information", np.float64, size * 2),
-                of_slopes,
-            ),
+            Derivatives(slopes, information, of_slopes),
             checked(arrays, "left", np.float64, (COLUMNS.size,)),
             float(checked(arrays, "fitted", np.float64, ())),
         )

@@ -18,6 +18,7 @@ __all__ = [
     "Weights",
     "Whitened",
     "Workspace",
+    "information_of",
     "inverse_factor",
     "whitened_at",
 ]
@@ -311,9 +312,7 @@ class FisherScoring:
         model, averages = self._model, self.weights.averages
         if derivatives is None:
             slopes = model.slopes(whitened.point, whitened.L_inverse, self._slopes)
-            root = np.sqrt(averages)[:, None]
-            weighted = np.multiply(slopes, root, out=self._weighted).reshape(model.size, -1)
-            on_levels: FloatArray = weighted @ weighted.T
+            on_levels = information_of(slopes, self.weights, self._weighted)
         else:
             slopes, on_levels = derivatives.slopes, derivatives.information.copy()
         excess = packed(whitened.excess) * averages[:, None]
@@ -329,6 +328,13 @@ class FisherScoring:
         information[np.diag_indices(model.size)] += self.weights.ridge
         on_levels[np.diag_indices(model.size)] += self.weights.pull
         return gradient, information, slopes, on_levels
+
+
+def information_of(slopes: FloatArray, weights: Weights, out: FloatArray | None = None) -> FloatArray:
+    """Fisher information of the data from packed slopes, levels by C, without pulls; `out` has the shape of slopes."""
+    weighted = np.multiply(slopes, np.sqrt(weights.averages)[:, None], out=out).reshape(slopes.shape[0], -1)
+    information: FloatArray = weighted @ weighted.T
+    return information
 
 
 def whitened_at(point: ModelPoint, observed: ComplexArray) -> Whitened | None:

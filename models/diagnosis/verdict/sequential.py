@@ -15,7 +15,7 @@ All times are those of the data.
 """
 
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
@@ -31,7 +31,7 @@ from models.physics.parameters import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Finding, Parameter, Verdict
 
-__all__ = ["SequentialSettings", "SequentialState", "SequentialTest", "finding"]
+__all__ = ["SequentialSettings", "SequentialState", "SequentialTest", "finding", "hop_arrays"]
 
 _SHORT_HOPS = (2, 4, 7)
 """Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
@@ -125,29 +125,30 @@ class SequentialState:
     findings: tuple[Finding, ...] = ()
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything as named arrays of numbers and text, for any array file format."""
-        n = len(PARAMETERS)
+        """Everything but the sums, which are in `hops`, as named arrays."""
         rows = [(PARAMETERS.index(one.name), one.since_ns, one.found_ns) for one in self.findings]
-        found: dict[str, np.ndarray] = {
+        oldest = [(windows, ring[0].end_ns) for windows, ring in self.sums.items() if ring]
+        return {
             "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
             "before": np.array(self.before, dtype=np.float64),
             "findings": np.array(rows, dtype=np.int64).reshape(-1, 3),
             "finding_stretch_s": np.array([one.stretch_s for one in self.findings], dtype=np.float64),
+            "oldest": np.array(oldest, dtype=np.int64).reshape(-1, 2),
         }
+
+    def hops(self) -> dict[int, list[tuple[int, Stretch]]]:
+        """What each hop has added to `sums`, by its end: windows and stretch. A hop that is past does not change."""
+        found: dict[int, list[tuple[int, Stretch]]] = {}
         for windows, ring in self.sums.items():
-            misfits = [one.misfit_z for one in ring if one.misfit_z is not None]
-            shared = [one.common for one in ring if one.common is not None]
-            found[f"times_{windows}"] = np.array([(one.start_ns, one.end_ns) for one in ring], dtype=np.int64)
-            found[f"has_{windows}"] = np.array([(one.misfit_z is not None, one.common is not None) for one in ring])
-            found[f"vector_{windows}"] = np.array([one.vector for one in ring])
-            found[f"information_{windows}"] = np.array([one.information[_LOWER] for one in ring])
-            found[f"misfit_z_{windows}"] = np.array(misfits, dtype=np.float64)
-            found[f"common_{windows}"] = np.array(shared, dtype=np.float64).reshape(-1, n, n)
+            for one in ring:
+                found.setdefault(one.end_ns, []).append((windows, one))
         return found
 
     @classmethod
-    def restored(cls, arrays: Mapping[str, np.ndarray]) -> "SequentialState":
-        """State from what `checkpoint` gave.
+    def restored(
+        cls, arrays: Mapping[str, np.ndarray], hops: Iterable[Mapping[str, np.ndarray]] = ()
+    ) -> "SequentialState":
+        """State from what `checkpoint` gave, and the `hops`, oldest first, as `hop_arrays` has them.
 
         Raises
         ------
@@ -165,36 +166,49 @@ class SequentialState:
             finding(PARAMETERS[number], since, found, length)
             for (number, since, found), length in zip(findings.tolist(), lengths.tolist(), strict=True)
         )
-        for windows in (2**power for power in range(_DOUBLINGS)):
-            if f"times_{windows}" in arrays:
-                state.sums[windows] = _restored_ring(arrays, windows)
+        oldest: dict[int, int] = dict(checked(arrays, "oldest", np.int64, (None, 2)).tolist())
+        state.sums = {windows: [] for windows in oldest}
+        for hop in hops:
+            for windows, one in _restored_hop(hop):
+                if windows in oldest and one.end_ns >= oldest[windows]:
+                    state.sums[windows].append(one)
+        for windows, end_ns in oldest.items():
+            if not state.sums[windows] or state.sums[windows][0].end_ns != end_ns:
+                raise CheckpointError(f"the sum of {windows} windows up to end_ns {end_ns} is missing")
         return state
 
 
-def _restored_ring(arrays: Mapping[str, np.ndarray], windows: int) -> list[Stretch]:
+def hop_arrays(came: Sequence[tuple[int, Stretch]]) -> dict[str, np.ndarray]:
+    """One of `SequentialState.hops` as named arrays."""
+    n, stretches = len(PARAMETERS), [one for _, one in came]
+    shared = [one.common for one in stretches if one.common is not None]
+    return {
+        "times": np.array([(windows, one.start_ns, one.end_ns) for windows, one in came], dtype=np.int64),
+        "has": np.array([(one.misfit_z is not None, one.common is not None) for one in stretches]),
+        "vector": np.array([one.vector for one in stretches]),
+        "information": np.array([one.information[_LOWER] for one in stretches]),
+        "misfit_z": np.array([one.misfit_z for one in stretches if one.misfit_z is not None], dtype=np.float64),
+        "common": np.array(shared, dtype=np.float64).reshape(-1, n, n),
+    }
+
+
+def _restored_hop(arrays: Mapping[str, np.ndarray]) -> list[tuple[int, Stretch]]:
     n = len(PARAMETERS)
-    times = checked(arrays, f"times_{windows}", np.int64, (None, 2))
-    has = checked(arrays, f"has_{windows}", np.bool_, times.shape)
-    vectors = checked(arrays, f"vector_{windows}", np.float64, (len(times), n))
-    lower = checked(arrays, f"information_{windows}", np.float64, (len(times), _LOWER[0].size))
+    times = checked(arrays, "times", np.int64, (None, 3))
+    has = checked(arrays, "has", np.bool_, (len(times), 2))
+    vectors = checked(arrays, "vector", np.float64, (len(times), n))
+    lower = checked(arrays, "information", np.float64, (len(times), _LOWER[0].size))
     information = np.zeros((len(times), n, n))
     information[:, _LOWER[0], _LOWER[1]] = information[:, _LOWER[1], _LOWER[0]] = lower
     n_misfits, n_shared = np.count_nonzero(has, axis=0).tolist()
-    misfits = iter(checked(arrays, f"misfit_z_{windows}", np.float64, (n_misfits,)).tolist())
-    shared = iter(checked(arrays, f"common_{windows}", np.float64, (n_shared, n, n)))
-    return [
-        Stretch(
-            start_ns,
-            end_ns,
-            vectors[at],
-            information[at],
-            next(misfits) if has_misfit else None,
-            next(shared) if has_common else None,
-        )
-        for at, ((start_ns, end_ns), (has_misfit, has_common)) in enumerate(
-            zip(times.tolist(), has.tolist(), strict=True)
-        )
-    ]
+    misfits = iter(checked(arrays, "misfit_z", np.float64, (n_misfits,)).tolist())
+    shared = iter(checked(arrays, "common", np.float64, (n_shared, n, n)))
+    found = []
+    for at, (windows, start_ns, end_ns) in enumerate(times.tolist()):
+        has_misfit, has_common = has[at]
+        misfit_z, common = next(misfits) if has_misfit else None, next(shared) if has_common else None
+        found.append((windows, Stretch(start_ns, end_ns, vectors[at], information[at], misfit_z, common)))
+    return found
 
 
 class SequentialTest:

@@ -1,0 +1,164 @@
+"""What a monitor writes to the disk for each hop and machine, in steady state, SQLite's log and checkpoints included.
+
+Run: ``python benchmarks/disk.py [--machines 20] [--hops 60] [--seed 1] [--days 30]``. Simulated rotor kits, each with a
+seed of its own, go through real workers into one SQLite history as fast as they can, so the hops of one machine follow
+each other faster than in real time; how many there are of each is counted. Machines complete their hops one after the
+other, as machines that know nothing of each other do; ``--together`` lets them do it at the same time, so that they
+share transactions. What is counted is ``write_bytes`` of this process in ``/proc/self/io``: what goes to the device,
+from when the windows are full until the last of it has moved from the write-ahead log into the file. Buckets of
+``--days`` are there before, because their rows would otherwise lie all on one page.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import sqlite3
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import islice
+from pathlib import Path
+
+from models.commissioning.installed import install
+from models.signals.block import SampleBlock
+from models.signals.wire import encode_block
+from service.history.retention import Retention
+from service.history.store import Store
+from service.settings.service import LogSettings, QueueSettings
+from service.stream.inbox import RawBlock
+from service.stream.worker import Clocks, MachineWorker
+from service.terminal.logs import configure_logging
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+
+BLOCK_S = 0.5
+BUCKET_NS = 600 * 10**9
+
+
+def stream(seed: int, length_s: float, start_ns: int) -> Iterator[SampleBlock]:
+    """A healthy rotor kit."""
+    scenario, machine = load_scenario("healthy")
+    for block, _ in blocks(scenario.overridden(seed=seed, duration_s=length_s), machine, BLOCK_S, start_ns):
+        yield block
+
+
+def written() -> int:
+    """Bytes that this process has caused to be written to the device."""
+    lines = dict(line.split(": ") for line in Path("/proc/self/io").read_text(encoding="ascii").splitlines())
+    return int(lines["write_bytes"])
+
+
+def age(file: Path, before_ns: int, days: float) -> int:
+    """Give every series the buckets of so many days; return how many."""
+    count = round(days * 86_400 * 10**9 / BUCKET_NS)
+    with closing(sqlite3.connect(file, timeout=60.0)) as database:
+        series = [number for (number,) in database.execute("SELECT series_id FROM series")]
+        end_ns = before_ns // BUCKET_NS * BUCKET_NS
+        database.executemany(
+            "INSERT INTO buckets (series_id, start_ns, length_ns, recorded_ns, count, minimum, maximum, total, errors, "
+            "errors_total) VALUES (?, ?, ?, ?, 120, -0.1, 0.1, 0.5, 120, 1.5)",
+            (
+                (one, end_ns - back * BUCKET_NS, BUCKET_NS, end_ns - back * BUCKET_NS)
+                for back in range(count, 0, -1)
+                for one in series
+            ),
+        )
+        database.commit()
+        database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return count * len(series)
+
+
+def feed(workers: list[MachineWorker], streams: list[Iterator[SampleBlock]], hops: int, *, together: bool) -> None:
+    """Give every machine the data of so many hops, and wait until what comes of them is committed."""
+    per_hop = round(workers[0].machine.window.hop_s / BLOCK_S)
+    for _ in range(hops):
+        for worker, source in zip(workers, streams, strict=True):
+            for block in islice(source, per_hop):
+                worker.inbox.put(RawBlock(*encode_block(block, worker.machine.descriptor.schema_hash)))
+            if not together:
+                settled([worker])
+        settled(workers)
+
+
+def settled(workers: list[MachineWorker]) -> None:
+    """Wait until every machine has nothing to do."""
+    for worker in workers:
+        idle = threading.Event()
+        worker.inbox.call(idle.set)
+        while not idle.wait(0.001) or len(worker.inbox):
+            idle.clear()
+            worker.inbox.call(idle.set)
+
+
+def measure(machines: int, hops: int, seed: int, days: float, *, together: bool) -> None:
+    """Run so many machines over so many hops, and print what was written."""
+    _, machine = load_scenario("healthy")
+    warm = machine.window.hops + 3
+    start_ns = time.time_ns()
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        file = Path(folder) / "history.sqlite"
+        store = Store(f"sqlite:///{file}", Retention())
+        store.open()
+        workers = []
+        for number in range(machines):
+            one = machine.model_copy(update={"name": f"lab{number}"})
+            queue = QueueSettings(when_full="wait")
+            workers.append(MachineWorker(install(one, "lab"), queue, store.machine(one.site, one.name), Clocks()))
+            workers[-1].start(_Silent())
+        length_s = (warm + hops + 2) * machine.window.hop_s
+        streams = [stream(seed + number, length_s, start_ns) for number in range(machines)]
+        feed(workers, streams, warm, together=together)
+        buckets = age(file, start_ns, days)
+        before, begin_s, count = written(), time.monotonic(), sum(worker.tally.windows for worker in workers)
+        feed(workers, streams, hops, together=together)
+        per_s = time.monotonic() - begin_s
+        with closing(sqlite3.connect(file, timeout=60.0)) as database:
+            page = database.execute("PRAGMA page_size").fetchone()[0]
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        total = written() - before
+        count = sum(worker.tally.windows for worker in workers) - count
+        print(
+            f"{machines:3d} machines (seeds {seed} to {seed + machines - 1}), {count} hops in {per_s:.0f} s, "
+            f"{'together' if together else 'one after the other'}, {buckets} buckets before, pages of {page} bytes: "
+            f"{total / count / 1e3:.1f} kB per hop and machine; the file has {file.stat().st_size / 1e6:.1f} MB",
+            flush=True,
+        )
+        before = written()
+        for worker in workers:
+            worker.stop()
+        store.close()
+        print(f"    an orderly stop: {(written() - before) / machines / 1e6:.2f} MB for each machine", flush=True)
+
+
+class _Silent:
+    """Nobody listens."""
+
+    def publish_report(self, text: str) -> None:
+        """Leave it."""
+
+    def publish_alarm_event(self, text: str) -> None:
+        """Leave it."""
+
+    def publish_alarm_state(self, text: str) -> None:
+        """Leave it."""
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="bytes written to the disk per hop and machine")
+    parser.add_argument("--machines", type=int, default=1)
+    parser.add_argument("--hops", type=int, default=600, help="of each machine")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--days", type=float, default=30.0, help="of buckets that are there before")
+    parser.add_argument("--together", action="store_true", help="machines complete their hops at the same time")
+    asked = parser.parse_args()
+    configure_logging(LogSettings(level="error"))
+    measure(asked.machines, asked.hops, asked.seed, asked.days, together=asked.together)
+
+
+if __name__ == "__main__":
+    main()

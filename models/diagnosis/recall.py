@@ -1,0 +1,140 @@
+"""A window's hops computed again from the samples they were made of, which were recorded or are sent once more.
+
+::
+
+    remembered   level | hops: start, first block, row in it, digest of the samples | the same of the unfinished hop
+    taken again  blocks ------------------------------------------------------------> those whose digest fits
+
+A hop is itself again to the last bit, or it is not there: its samples are compared by their digest, so neither blocks
+that were refused, nor other data of the same time, can get into it.
+"""
+
+import hashlib
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.checkpoint import checked
+from models.diagnosis.moments import HopMoments, Plan, hop_moments
+from models.signals.block import FloatArray
+
+__all__ = ["Piece", "Recall", "digest_of", "pieces_of"]
+
+_DIGEST = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Consecutive samples, known by where they begin and by their digest.
+
+    Attributes
+    ----------
+    start_ns : int
+        Time of the hop, or of the first pending sample.
+    block_ns, row : int
+        Start of the block that the first sample is of, and its row there.
+    rows : int
+        How many samples, those before the hop included.
+    digest : bytes
+    """
+
+    start_ns: int
+    block_ns: int
+    row: int
+    rows: int
+    digest: bytes
+
+
+def digest_of(samples: FloatArray) -> bytes:
+    """Digest of SI samples."""
+    return hashlib.blake2b(np.ascontiguousarray(samples).data, digest_size=_DIGEST).digest()
+
+
+def pieces_of(pieces: Iterable[Piece]) -> dict[str, np.ndarray]:
+    """Pieces as named arrays."""
+    found = tuple(pieces)
+    numbers = [(one.start_ns, one.block_ns, one.row, one.rows) for one in found]
+    return {
+        "pieces": np.array(numbers, dtype=np.int64),
+        "digests": np.frombuffer(b"".join(one.digest for one in found), np.uint8).reshape(-1, _DIGEST),
+    }
+
+
+class Recall:
+    """Blocks that are taken again, and what can be made of them.
+
+    Parameters
+    ----------
+    plan : Plan
+    level : ndarray, shape (n_states,) or (0,)
+        What was subtracted from all samples.
+    arrays : mapping of str to ndarray
+        From `pieces_of`: the hops, oldest first, and last the unfinished one.
+
+    Attributes
+    ----------
+    arrays : dict of str to ndarray
+        The same again, with the level.
+    pieces : tuple of Piece
+        Of the hops.
+    last : Piece
+        The unfinished hop.
+
+    Raises
+    ------
+    CheckpointError
+        If an array is missing or of another form.
+    """
+
+    def __init__(self, plan: Plan, level: FloatArray, arrays: Mapping[str, np.ndarray]) -> None:
+        numbers = checked(arrays, "pieces", np.int64, (None, 4))
+        digests = checked(arrays, "digests", np.uint8, (len(numbers), _DIGEST))
+        *hops, last = [
+            Piece(start_ns, block_ns, row, rows, digest.tobytes())
+            for (start_ns, block_ns, row, rows), digest in zip(numbers.tolist(), digests, strict=True)
+        ]
+        self.arrays: dict[str, np.ndarray] = {"level": level, "pieces": numbers, "digests": digests}
+        self.pieces, self.last = tuple(hops), last
+        self._plan, self._level = plan, level
+        self._oldest_ns = min(one.block_ns for one in (*hops, last) if one.rows) if hops or last.rows else 0
+        self._blocks: dict[int, npt.NDArray[np.float32] | FloatArray] = {}
+        self._found: dict[Piece, HopMoments] = {}
+
+    def take(self, samples: npt.NDArray[np.float32] | FloatArray, start_ns: int) -> None:
+        """Take a block; one that is not of the window is left."""
+        if start_ns >= self._oldest_ns:
+            self._blocks[start_ns] = samples
+
+    def complete(self) -> bool:
+        """Whether everything can be made of what is there."""
+        return len(self.hops()) == len(self.pieces) and self.pending() is not None
+
+    def hops(self) -> tuple[tuple[Piece, HopMoments], ...]:
+        """The hops whose samples are there, oldest first."""
+        for piece in self.pieces:
+            if piece not in self._found and (found := self._samples(piece)) is not None:
+                self._found[piece] = hop_moments(self._plan, found[0], self._level, piece.start_ns)
+        return tuple((piece, self._found[piece]) for piece in self.pieces if piece in self._found)
+
+    def pending(self) -> tuple[FloatArray, tuple[tuple[int, int], ...]] | None:
+        """Samples of the unfinished hop, and the blocks they are of; None if they are not there."""
+        return self._samples(self.last)
+
+    def _samples(self, piece: Piece) -> tuple[FloatArray, tuple[tuple[int, int], ...]] | None:
+        starts = sorted(self._blocks)
+        rows, blocks, samples = -piece.row, [], []
+        for start_ns in starts[bisect_left(starts, piece.block_ns) :]:
+            if rows >= piece.rows:
+                break
+            # Rows first, as in the window: sums depend on how samples lie in memory.
+            samples.append(np.ascontiguousarray(self._plan.to_si(self._blocks[start_ns])))
+            blocks.append((start_ns, len(samples[-1])))
+            rows += len(samples[-1])
+        if not samples:
+            width = len(self._plan.states) + (self._plan.angle_column is not None)
+            return None if piece.rows else (np.empty((0, width)), ())
+        found = np.concatenate(samples)[piece.row : piece.row + piece.rows]
+        return (found, tuple(blocks)) if digest_of(found) == piece.digest else None
