@@ -8,17 +8,16 @@ from sqlalchemy import Connection, func, select
 from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import ColumnElement
 
+from rotorwatch.records.history import Reading, ReadingBucket
 from service.history.alarm_log import EVENT
 from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
 from service.history.errors import StoreError
 from service.history.records import (
-    Bucket,
     Checkpoint,
     CheckpointHead,
     Step,
     StoredEvent,
-    StoredReading,
     StoredReport,
 )
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evaluations, readings, reports, series
@@ -202,8 +201,8 @@ class MachineStore:
         until_ns: int | None = None,
         after: int | None = None,
         limit: int = 1000,
-    ) -> tuple[tuple[int, StoredReading], ...]:
-        """Single readings in the order of arrival, oldest first, each with the number of its window.
+    ) -> tuple[Reading, ...]:
+        """Single readings in the order of arrival, oldest first.
 
         Parameters
         ----------
@@ -223,7 +222,10 @@ class MachineStore:
             chosen = self._windows(connection, window, since_ns, until_ns)
             query = query.where(*chosen, *_past(window.number, after, None)).order_by(window.number)
             rows = connection.execute(query.limit(_checked(limit))).all()
-        return tuple((row[0], StoredReading(row[1], quantity, name, *row[2:])) for row in rows)
+        return tuple(
+            Reading(number=number, end_ns=end_ns, value=value, standard_error=error)
+            for number, end_ns, value, error in rows
+        )
 
     def downsampled(
         self,
@@ -233,7 +235,7 @@ class MachineStore:
         since_ns: int | None = None,
         until_ns: int | None = None,
         points: int = 300,
-    ) -> tuple[Bucket, ...]:
+    ) -> tuple[ReadingBucket, ...]:
         """Readings reduced to at most so many buckets of equal length for each name, by name and time.
 
         Parameters

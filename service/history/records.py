@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 __all__ = [
     "AuditEntry",
-    "Bucket",
     "Checkpoint",
     "CheckpointHead",
     "CheckpointStep",
@@ -113,24 +112,6 @@ class Step:
     readings: tuple[StoredReading, ...] = ()
     events: tuple[StoredEvent, ...] = ()
     checkpoint: CheckpointStep | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Bucket:
-    """Readings of one quantity, of windows with start_ns ≤ end_ns < start_ns + length_ns.
-
-    `mean_standard_error` is that of the readings that have one; None if none has.
-    """
-
-    quantity: str
-    name: str
-    start_ns: int
-    length_ns: int
-    count: int
-    minimum: float
-    mean: float
-    maximum: float
-    mean_standard_error: float | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import BigInteger, Connection, Select, Table, case, cast, func, literal, select, union_all
 
-from service.history.records import Bucket
+from rotorwatch.records.history import ReadingBucket
 from service.history.tables import buckets, evaluations, open_buckets, readings, series
 
 __all__ = ["trend"]
@@ -44,7 +44,7 @@ def trend(
     since_ns: int | None,
     until_ns: int | None,
     points: int,
-) -> tuple[Bucket, ...]:
+) -> tuple[ReadingBucket, ...]:
     """Reduce readings, and what older ones have been reduced to, to at most `points` buckets; see `MachineStore`.
 
     Every reading is in a stored bucket. Where all windows that are asked for are there themselves, and not too many,
@@ -76,8 +76,17 @@ def trend(
         func.sum(found.errors_total) / func.nullif(errors, 0),
     ).group_by(found.series_id, place)
     made = (
-        Bucket(quantity, titles[series_id], grid.start_ns + number * grid.length_ns, grid.length_ns, *numbers)
-        for series_id, number, *numbers in connection.execute(reduced)
+        ReadingBucket(
+            name=titles[series_id],
+            start_ns=grid.start_ns + number * grid.length_ns,
+            length_ns=grid.length_ns,
+            count=count,
+            minimum=minimum,
+            mean=mean,
+            maximum=maximum,
+            mean_standard_error=mean_error,
+        )
+        for series_id, number, count, minimum, mean, maximum, mean_error in connection.execute(reduced)
     )
     return tuple(sorted(made, key=lambda each: (each.name, each.start_ns)))
 

@@ -98,9 +98,7 @@ def test_nothing_is_lost_while_the_database_is_away(
         assert [event.sequence for event in lab.events()] == list(range(41))
         assert [event.sequence for event in pump.events()] == list(range(37))
         assert [report.text for _, report in lab.reports()] == [f'{{"number": {n}}}' for n in range(40, -1, -1)]
-        assert [round(each.value / 0.1) for _, each in lab.readings(quantity="parameter", name="k_by")] == list(
-            range(41)
-        )
+        assert [round(each.value / 0.1) for each in lab.readings(quantity="parameter", name="k_by")] == list(range(41))
         restored = lab.restore()
         assert restored is not None
         assert restored.head == head(T0 + 40 * 5_000_000_000)

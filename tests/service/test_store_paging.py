@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rotorwatch.records.history import Reading
 from service.history.records import Step, StoredEvent, StoredReading, StoredReport
 from service.history.retention import Retention
 from service.history.store import Store
@@ -70,7 +71,7 @@ def test_pages_are_everything_once(
     def older(before: int | None) -> tuple[tuple[int, StoredReport], ...]:
         return lab.reports(since_ns=since, until_ns=until, before=before, limit=limit)
 
-    def later(after: int | None) -> tuple[tuple[int, StoredReading], ...]:
+    def later(after: int | None) -> tuple[Reading, ...]:
         return lab.readings(quantity="misfit", name="z", since_ns=since, until_ns=until, after=after, limit=limit)
 
     def forth(after: int | None) -> tuple[StoredEvent, ...]:
@@ -80,6 +81,7 @@ def test_pages_are_everything_once(
         return lab.events(before=before, since_ns=since, until_ns=until, limit=limit, newest_first=True)
 
     assert [report for _, report in pages(older, lambda row: row[0], limit)] == [reports[n] for n in chosen[::-1]]
-    assert [reading for _, reading in pages(later, lambda row: row[0], limit)] == [readings[n] for n in chosen]
+    singles = pages(later, lambda reading: reading.number, limit)
+    assert [(one.end_ns, one.value) for one in singles] == [(readings[n].end_ns, readings[n].value) for n in chosen]
     assert pages(forth, lambda event: event.sequence, limit) == [events[n] for n in chosen if n % 2 == 0]
     assert pages(back, lambda event: event.sequence, limit) == [events[n] for n in chosen[::-1]]

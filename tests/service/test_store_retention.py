@@ -11,8 +11,9 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
+from rotorwatch.records.history import ReadingBucket
 from service.history.machine import MachineStore
-from service.history.records import Bucket, Dropped, Step, StoredReading, StoredReport
+from service.history.records import Dropped, Step, StoredReading, StoredReport
 from service.history.retention import Retention
 from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
@@ -79,7 +80,7 @@ def write(lab: MachineStore, clock: Clock, hops: int, per_step: int = 40) -> Wri
     return Written(ends, values, errors)
 
 
-def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: Bucket) -> list[Bucket]:
+def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: ReadingBucket) -> list[ReadingBucket]:
     """Buckets on the grid of another one, from the readings themselves; `places` are the times that decide."""
     expected = []
     numbers = (places - grid.start_ns) // grid.length_ns
@@ -88,19 +89,20 @@ def by_numpy(written: Written, name: str, places: npt.NDArray[np.int64], grid: B
         value, error = written.values[name][inside], written.errors[name][inside]
         error = error[~np.isnan(error)]
         expected.append(
-            Bucket(
-                "parameter", name, int(grid.start_ns + number * grid.length_ns), grid.length_ns, int(inside.sum()),
-                float(value.min()), float(value.mean()), float(value.max()),
-                float(error.mean()) if len(error) else None,
+            ReadingBucket(
+                name=name, start_ns=int(grid.start_ns + number * grid.length_ns), length_ns=grid.length_ns,
+                count=int(inside.sum()), minimum=float(value.min()), mean=float(value.mean()),
+                maximum=float(value.max()),
+                mean_standard_error=float(error.mean()) if len(error) else None,
             )
         )  # fmt: skip
     return expected
 
 
-def assert_same(found: list[Bucket], expected: list[Bucket]) -> None:
+def assert_same(found: list[ReadingBucket], expected: list[ReadingBucket]) -> None:
     assert len(found) == len(expected)
     for one, other in zip(found, expected, strict=True):
-        exact = ("quantity", "name", "start_ns", "length_ns", "count", "minimum", "maximum")
+        exact = ("name", "start_ns", "length_ns", "count", "minimum", "maximum")
         assert [getattr(one, each) for each in exact] == [getattr(other, each) for each in exact]
         assert one.mean == pytest.approx(other.mean, rel=1e-12, abs=1e-12)
         assert one.mean_standard_error == (
@@ -143,7 +145,7 @@ def test_reduced_readings_and_those_that_are_still_there_are_one_trend(store: St
     middle = int(written.ends[1477])
     dropped = store.retain(middle + 90 * DAY)
     assert dropped.windows == 1440  # in steps of 40; the step of the window at that time is younger
-    left = [reading for _, reading in lab.readings(quantity="parameter", name="k_by", limit=5000)]
+    left = lab.readings(quantity="parameter", name="k_by", limit=5000)
     assert [reading.end_ns for reading in left] == list(written.ends[1440:])
     for name in ("e", "k_by"):
         found = [bucket for bucket in lab.downsampled(quantity="parameter", points=3000) if bucket.name == name]

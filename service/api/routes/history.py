@@ -1,6 +1,7 @@
 """The history over HTTP: alarm events, window reports, readings over time, and the audit log."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query
@@ -14,8 +15,6 @@ from rotorwatch.records.history import (
     AlarmEventList,
     AuditList,
     AuditRecord,
-    Reading,
-    ReadingBucket,
     ReadingList,
     ReportList,
 )
@@ -153,19 +152,14 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             buckets = history.downsampled(
                 quantity=quantity, names=names or None, since_ns=since_ns, until_ns=until_ns, points=points
             )
-            shown = tuple(ReadingBucket.model_validate(_fields(one, ReadingBucket)) for one in buckets)
-            return ReadingList(quantity=quantity, readings=(), buckets=shown, next_after=None)
+            return ReadingList(quantity=quantity, readings=(), buckets=buckets, next_after=None)
         if len(names) != 1:
             raise HTTPException(422, f"name: {len(names)} are given, expected one; several go with points")
         found = history.readings(
             quantity=quantity, name=names[0], since_ns=since_ns, until_ns=until_ns, after=after, limit=limit
         )
-        single = tuple(
-            Reading(number=number, end_ns=one.end_ns, value=one.value, standard_error=one.standard_error)
-            for number, one in found
-        )
-        following = found[-1][0] if len(found) == limit else None
-        return ReadingList(quantity=quantity, readings=single, buckets=(), next_after=following)
+        following = found[-1].number if len(found) == limit else None
+        return ReadingList(quantity=quantity, readings=found, buckets=(), next_after=following)
 
     @app.get("/api/v1/audit", tags=["service"], dependencies=[guard.configure], responses=responses(AuditList, 422))
     def audit(
@@ -176,7 +170,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     ) -> AuditList:
         """Who asked for what and what came of it, newest first; kept for ever."""
         found = service.audit.entries(before, limit, machine=machine, actor=actor)
-        entries = tuple(AuditRecord.model_validate(_fields(one, AuditRecord)) for one in found)
+        entries = tuple(AuditRecord(**asdict(one)) for one in found)
         return AuditList(entries=entries, next_before=found[-1].number if len(found) == limit else None)
 
 
@@ -184,7 +178,3 @@ def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:
     """Answer with what is stored as it was published, to the byte, whichever version of the program wrote it."""
     tail = "".join(f',"{cursor}":{"null" if value is None else value}' for cursor, value in cursors.items())
     return Response(f'{{"{name}":[{",".join(texts)}]{tail}}}', media_type="application/json")
-
-
-def _fields(record: object, model: type[ReadingBucket] | type[AuditRecord]) -> dict[str, object]:
-    return {name: getattr(record, name) for name in model.model_fields}
