@@ -73,7 +73,7 @@ def possible_reading(
     name: str, by: str, change: float, standard_error: float, vector: UnbalanceVector | None = None
 ) -> Parameter:
     """A reading, or the reason why the number is none: physics does not allow it."""
-    reason = impossible(change, QUANTITY[name])
+    reason = impossible(change, QUANTITY[name]) if math.isfinite(change) else f"reads as {change}"
     return no_reading(name, by, reason) if reason else parameter_reading(name, by, change, standard_error, vector)
 
 

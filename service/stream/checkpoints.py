@@ -121,7 +121,7 @@ class StepWriter:
         Parameters
         ----------
         monitor : MachineMonitor
-        windows : tuple of WindowReport
+        windows : tuple of Report
         recorded_ns : int
         whole : bool
             With all that is in the window, so that nothing has to be recalled.
