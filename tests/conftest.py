@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 import structlog
 
@@ -20,6 +21,11 @@ if str(ROOT) not in sys.path:
 
 # A run that a shell has put into the background ignores Ctrl-C, and so would all programs that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+# How long an example takes says what else the computer does, and nothing of the code.
+hypothesis.settings.register_profile(
+    "any computer", deadline=None, suppress_health_check=[hypothesis.HealthCheck.too_slow]
+)
+hypothesis.settings.load_profile("any computer")
 # As the programs show it: the library's own way prints every local variable, arrays included, which takes seconds.
 structlog.configure(
     processors=[

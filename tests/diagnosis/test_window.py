@@ -105,7 +105,7 @@ def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
     np.testing.assert_allclose(products / np.outer(scale, scale), direct / np.outer(scale, scale), atol=1e-12)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(cuts=st.lists(st.integers(1, 1199), max_size=40), seed=st.integers(0, 1000))
 def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[int], seed: int) -> None:
     plan, samples = small_plan(), signal(1200, seed)
@@ -359,7 +359,7 @@ def test_without_a_line_there_is_no_speed_and_nothing_is_taken_out() -> None:
     np.testing.assert_allclose(window.spectrum, plain.spectrum, rtol=1e-9, atol=1e-12 * abs(plain.spectrum).max())
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(cuts=st.lists(st.integers(1, 2449), max_size=20), angle=st.booleans())
 def test_hop_by_hop_any_splitting_gives_identical_statistics(cuts: list[int], angle: bool) -> None:
     t = np.arange(2450) / RATE

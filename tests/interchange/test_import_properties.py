@@ -39,7 +39,7 @@ def write(
     return np.column_stack([x, v, a])
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(content=runs, shift_ns=st.integers(0, STEP_NS))
 def test_gaps_stay_gaps_and_every_sample_keeps_its_time(
     tmp_path_factory: pytest.TempPathFactory, content: list[tuple[int, int]], shift_ns: int
@@ -61,7 +61,7 @@ def test_gaps_stay_gaps_and_every_sample_keeps_its_time(
         assert gap.to_ns - gap.from_ns == pytest.approx((pause - 1) * STEP_NS)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(rows=st.integers(3, 2000), data=st.data())
 def test_a_duplicated_time_is_named_by_its_row(
     tmp_path_factory: pytest.TempPathFactory, rows: int, data: st.DataObject
@@ -75,7 +75,7 @@ def test_a_duplicated_time_is_named_by_its_row(
         imported(folder, folder / "run.parquet", NANOSECONDS + CHANNELS)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     displacement=st.sampled_from(["m", "mm", "um", "µm", "\u03bcm", "mil", "in"]),
     velocity=st.sampled_from(["m/s", "mm/s", "in/s", "ips"]),
@@ -127,7 +127,7 @@ def test_any_mix_of_units_gives_the_same_motion(
     assert ((si[:, 2] >= 0) & (si[:, 2] < 2 * np.pi)).all()
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1), drift=st.floats(-5e-5, 5e-5))
 def test_jitter_and_a_drifting_clock_make_no_gaps(
     tmp_path_factory: pytest.TempPathFactory, seed: int, drift: float

@@ -36,7 +36,7 @@ def test_uniform_rotation_is_recovered(per_turn: int, reverse: bool) -> None:
     assert ((angle >= 0) & (angle < 2 * np.pi)).all()
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     seed=st.integers(0, 2**32 - 1),
     marks=st.lists(st.sampled_from(["good", "missing", "extra"]), min_size=12, max_size=12),
@@ -80,7 +80,7 @@ def test_unusable_pulses_are_named(times: list[float], said: str) -> None:
         pulse_train(np.array(times))
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(cuts=st.lists(st.integers(1, 3999), max_size=8, unique=True), rising=st.booleans())
 def test_edges_are_the_same_in_whatever_pieces_the_signal_comes(cuts: list[int], rising: bool) -> None:
     time = np.arange(4000) / RATE_HZ

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import hypothesis.strategies as st
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
@@ -48,7 +48,6 @@ def take_all(order: LogOrder) -> list[int]:
     return taken
 
 
-@settings(deadline=None)
 @given(
     st.integers(-1, 29),
     st.lists(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from models.commissioning.installed import Installed, install
@@ -145,8 +145,6 @@ class Plant:
 @pytest.mark.slow
 @settings(
     max_examples=4,
-    deadline=None,
-    suppress_health_check=[HealthCheck.too_slow],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the parts of a story are drawn from its seed
 )
 @given(seed=st.integers(0, 2**32 - 1), strikes=st.integers(0, 3), repeated=st.floats(0.0, 0.5))

@@ -281,7 +281,7 @@ def test_an_event_without_words_goes_out_and_holds_up_no_other(
 INTEGER = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([0, 2**16 - 1, 2**63 - 1, 2**64 - 1, 10**4300]))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     headers=st.lists(
         st.tuples(INTEGER, INTEGER, st.sampled_from([LAB.rate_hz, 1e-320, 1e6, 1e308, float("nan")]), INTEGER),

@@ -292,7 +292,6 @@ def made_up(
         max_examples=cases,
         derandomize=not CASES,
         database=None,
-        deadline=None,
         phases=[hypothesis.Phase.generate],
         suppress_health_check=list(hypothesis.HealthCheck),
     )

@@ -44,7 +44,7 @@ def _write(path: Path, content: list[RecordedMessage]) -> None:
             writer.write(message)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(content=st.lists(messages, max_size=30))
 def test_messages_come_back_verbatim_and_in_order(
     tmp_path_factory: pytest.TempPathFactory, content: list[RecordedMessage]
@@ -246,7 +246,7 @@ def test_the_chunk_that_names_the_keys_may_be_the_damaged_one(tmp_path: Path) ->
     assert salvage.unnamed_messages > 300
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(place=st.floats(0, 1), keep=st.floats(0, 1), flips=st.integers(0, 3))
 def test_whatever_the_damage_what_comes_back_was_written(
     tmp_path_factory: pytest.TempPathFactory, place: float, keep: float, flips: int

@@ -74,7 +74,7 @@ _samples = st.one_of(
 
 
 @pytest.mark.parametrize("encode", [encode_block, encode_arrow])
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     samples=_samples,
     start_ns=st.integers(-(2**63), 2**63 - 1),
@@ -191,7 +191,7 @@ def test_arrow_columns_must_be_lists_of_floats() -> None:
         decode_block(_arrow(_arrow_column([], "float32")), b"", ARROW_ENCODING)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(
     payload=st.binary(max_size=200),
     header=st.binary(max_size=40),
@@ -349,7 +349,7 @@ def test_other_columns_and_dictionaries_are_refused_unread() -> None:
             decode_block(_arrow(column), b"", ARROW_ENCODING)
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(data=st.data())
 def test_a_damaged_arrow_stream_is_refused_or_a_block(data: st.DataObject) -> None:
     payload = bytearray(encode_arrow(_block(), "")[0])
