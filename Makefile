@@ -54,6 +54,7 @@ lint: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
+	$(BIN)/mypy benchmarks/*.py  # programs, which find each other in their own folder
 
 contracts: $(READY)
 	$(BIN)/lint-imports

@@ -397,7 +397,7 @@ def _last_window(plant: Plant, end_ns: int) -> None:
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         health = httpx.get(f"{plant.url}/api/v1/machines/{_PLACE}/health", trust_env=False).json()
-        if (health["window_end_ns"] or 0) >= end_ns:
+        if (health["report"] or {"end_ns": 0})["end_ns"] >= end_ns:
             return
         time.sleep(0.1)
 
