@@ -15,7 +15,7 @@ from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.health import Report
+from rotorwatch.records.health import MEASURES, Report
 from service.analysis.plots.correlation import correlations_of, latest_window
 from service.analysis.plots.excerpts import RecordedStream
 from service.analysis.plots.orbit import read_orbits
@@ -311,6 +311,9 @@ def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[
     assert found.end_ns.tolist() == [report.end_ns for report in reports]
     assert found.states == tuple(report.state for report in reports)
     assert found.limits == LAB.alarms
+    for name, (field, _) in MEASURES.items():
+        known = [getattr(report, field) for report in reports]
+        np.testing.assert_array_equal(found.measures[name], np.array(known, dtype=np.float64))
     alarms = [AlarmCloudEvent.model_validate(line["message"]) for line in lines if "alarm" in str(line["topic"])]
     assert [alarm.time_ns for alarm in found.alarms] == [alarm.data.time_ns for alarm in alarms]
     assert found.alarms[0].name == "c_bz"

@@ -1,7 +1,7 @@
 """Trends: what the monitor read of every parameter over time, and what it said."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from models.physics.parameters import PARAMETER_TEXT
 from models.signals.block import FloatArray
 from models.signals.keys import PREFIX, MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
-from rotorwatch.records.health import HealthState, Report
+from rotorwatch.records.health import MEASURES, HealthState, Report
 from service.monitor.reports import machine_hash
 from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
@@ -55,8 +55,8 @@ class Trend:
         ``site/machine``.
     end_ns : ndarray of int, shape (n_reports,)
         End of each window.
-    speed_rad_s : ndarray, shape (n_reports,)
-        nan where it is not known.
+    measures : dict of str to ndarray, shape (n_reports,)
+        Measures of the windows by name, see `MEASURES`; nan where one is not known.
     limits : AlarmSettings or None
         Those in force, where the machine file is at hand.
     origin : str
@@ -66,7 +66,7 @@ class Trend:
     name: str
     end_ns: npt.NDArray[np.int64]
     states: tuple[HealthState, ...]
-    speed_rad_s: FloatArray
+    measures: Mapping[str, FloatArray]
     parameters: tuple[ParameterTrend, ...]
     alarms: tuple[AlarmEventData, ...]
     limits: AlarmSettings | None
@@ -174,7 +174,10 @@ def trend_of(
         name=f"{ordered[-1].site}/{ordered[-1].machine}",
         end_ns=np.array([report.end_ns for report in ordered], dtype=np.int64),
         states=tuple(report.state for report in ordered),
-        speed_rad_s=np.array([np.nan if r.speed_rad_s is None else r.speed_rad_s for r in ordered]),
+        measures={
+            name: np.array([getattr(report, field) for report in ordered], dtype=np.float64)  # None becomes nan
+            for name, (field, _) in MEASURES.items()
+        },
         parameters=tuple(
             ParameterTrend(name, PARAMETER_TEXT[name], *values)
             for name, values in series.items()

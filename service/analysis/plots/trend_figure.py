@@ -11,6 +11,7 @@ from models.alarm_names import MODEL
 from models.machine import AlarmSettings
 from models.physics.parameters import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmEventData
+from rotorwatch.records.health import MEASURES
 from service.analysis.plots.style import (
     COLOURS,
     GREY,
@@ -38,15 +39,20 @@ _LEAST_PERCENT = 5.0
 def paint_trend(trend: Trend, look: Look) -> Figure:
     """Small multiples over one time axis."""
     count = len(trend.parameters)
-    figure = Figure(figsize=look.size_in or (9.5, 1.9 + 1.15 * (count + 1)), layout="constrained")
+    figure = Figure(figsize=look.size_in or (9.5, 1.9 + 1.15 * (count + 0.8 * len(MEASURES))), layout="constrained")
     panels = figure.subplots(
-        count + 2, 1, sharex=True, squeeze=False, gridspec_kw={"height_ratios": [0.16, *[1.0] * count, 0.75]}
+        1 + count + len(MEASURES),
+        1,
+        sharex=True,
+        squeeze=False,
+        gridspec_kw={"height_ratios": [0.16, *[1.0] * count, *[0.75] * len(MEASURES)]},
     )[:, 0]
     step_ns = int(np.median(np.diff(trend.end_ns))) if trend.end_ns.size > 1 else 10**9
     _states(panels[0], trend, step_ns)
-    for axes, parameter in zip(panels[1:-1], trend.parameters, strict=True):
+    for axes, parameter in zip(panels[1:], trend.parameters, strict=False):
         _parameter(axes, parameter, trend, step_ns)
-    _speed(panels[-1], trend, step_ns)
+    for axes, name in zip(panels[1 + count :], MEASURES, strict=True):
+        _measure(axes, name, trend, step_ns)
     for axes in panels[1:]:
         alarm_lines(axes, trend.alarms)
     for name, axes in zip((MODEL, *(one.name for one in trend.parameters)), panels, strict=False):
@@ -54,7 +60,8 @@ def paint_trend(trend: Trend, look: Look) -> Figure:
     panels[-1].set_xlim(*as_dates(np.array([trend.end_ns[0], trend.end_ns[-1] + step_ns])))
     time_axis(panels[-1])
     figure.legend(handles=_legend(trend), loc="outside lower center", ncols=5, fontsize=8)
-    speeds = trend.speed_rad_s[np.isfinite(trend.speed_rad_s)] * 30 / np.pi
+    speed = trend.measures["speed"]
+    speeds = speed[np.isfinite(speed)] * 30 / np.pi
     heading(
         figure,
         look,
@@ -164,15 +171,17 @@ def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None)
     return drawn[-1][0]
 
 
-def _speed(axes: Axes, trend: Trend, step_ns: int) -> None:
-    time, speed = _with_gaps(trend.end_ns, step_ns, trend.speed_rad_s * 30 / np.pi)
-    axes.plot(time, speed, color=INK, linewidth=1.0)
-    axes.set_title("speed")
-    axes.set_ylabel("rpm")
-    known = speed[np.isfinite(speed)]
+def _measure(axes: Axes, name: str, trend: Trend, step_ns: int) -> None:
+    unit = MEASURES[name][1].unit
+    scale, shown = (30 / np.pi, "rpm") if unit == "rad/s" else (1.0, "" if unit == "1" else unit)
+    time, values = _with_gaps(trend.end_ns, step_ns, trend.measures[name] * scale)
+    axes.plot(time, values, color=INK, linewidth=1.0)
+    axes.set_title(name)
+    axes.set_ylabel(shown)
+    known = values[np.isfinite(values)]
     if known.size:
         middle = float(np.median(known))
-        spread = max(0.02 * middle, 1.2 * float(np.max(np.abs(known - middle))))
+        spread = max(0.02 * abs(middle), 1.2 * float(np.max(np.abs(known - middle))), 1e-9)
         axes.set_ylim(middle - spread, middle + spread)
     else:
         axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=GREY)
