@@ -2,18 +2,17 @@
 
 ::
 
-    RWCP | version | BLAKE2b of the rest | npz archive, compressed as a whole with zstd
+    RWCP | version | BLAKE2b of the rest | zstd of: length, list of names, types, shapes and orders as JSON, contents
 
 The digest is looked at first, so that damaged bytes are refused before anything is read from them. Arrays of Python
-objects are refused on either side: nothing in stored bytes is ever executed.
+objects are refused: nothing in stored bytes is ever executed.
 """
 
 import hashlib
-import io
+import json
 import struct
-import zipfile
 from collections.abc import Mapping
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,7 +25,7 @@ __all__ = ["checked", "from_bytes", "prefixed", "texts", "to_bytes", "unprefixed
 _MAGIC = b"RWCP"
 _VERSION = 2
 _HEADER = struct.Struct("<4sH16s")
-_SUFFIX = ".npy"
+_LENGTH = struct.Struct("<I")
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
@@ -49,15 +48,15 @@ def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
     >>> from_bytes(to_bytes({"speed_rad_s": np.array([138.2])}))
     {'speed_rad_s': array([138.2])}
     """
-    body = io.BytesIO()
-    with zipfile.ZipFile(body, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            if array.dtype.hasobject:
-                raise CheckpointError(f"{name}: an array of type {array.dtype}, expected numbers, truth values or text")
-            # An entry made from a bare name would be given the time of day.
-            with archive.open(zipfile.ZipInfo(name + _SUFFIX), "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, array, allow_pickle=False)
-    payload = zstandard.compress(body.getvalue())
+    head, contents = [], []
+    for name, array in arrays.items():
+        if array.dtype.hasobject:
+            raise CheckpointError(f"{name}: an array of type {array.dtype}, expected numbers, truth values or text")
+        order: Literal["C", "F"] = "F" if array.flags.f_contiguous and not array.flags.c_contiguous else "C"
+        head.append((name, array.dtype.str, array.shape, order))
+        contents.append(array.tobytes(order))
+    listed = json.dumps(head, separators=(",", ":")).encode()
+    payload = zstandard.compress(b"".join((_LENGTH.pack(len(listed)), listed, *contents)))
     return _HEADER.pack(_MAGIC, _VERSION, _digest(payload)) + payload
 
 
@@ -81,11 +80,13 @@ def from_bytes(data: bytes) -> dict[str, np.ndarray]:
     payload = data[_HEADER.size :]
     if _digest(payload) != digest:
         raise CheckpointError(f"a checkpoint of {len(data)} bytes is damaged: its checksum does not fit its contents")
+    content = zstandard.decompress(payload)
+    at = _LENGTH.size + _LENGTH.unpack_from(content)[0]
     found = {}
-    with zipfile.ZipFile(io.BytesIO(zstandard.decompress(payload))) as archive:
-        for name in archive.namelist():
-            with archive.open(name) as entry:
-                found[name.removesuffix(_SUFFIX)] = np.lib.format.read_array(entry, allow_pickle=False)
+    for name, kind, shape, order in json.loads(content[_LENGTH.size : at]):
+        array: np.ndarray = np.ndarray(shape, np.dtype(kind), content, at, order=order)
+        found[name] = array.copy("K")
+        at += array.nbytes
     return found
 
 

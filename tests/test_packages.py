@@ -16,7 +16,7 @@ import rotorwatch
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("models", "rotorwatch", "service", "simulator")
-SHIPPED = {".py", ".toml", ".json", ".safetensors", ".jinja", ".mako", ".typed"}
+SHIPPED = {".py", ".toml", ".json", ".safetensors", ".jinja", ".mako", ".typed", ".dictionary"}
 PROGRAMS = {
     "rotorsim": "simulator.rotorsim",
     "rotortrain": "simulator.rotortrain",

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import NamedTuple
 
 import zstandard
@@ -24,6 +25,11 @@ __all__ = ["Bundle", "Claim", "PackedReport", "pack", "unpack"]
 
 _LARGEST = 2**63
 _READINGS_PER_REPORT = 20
+_LEVEL = 15
+# Never changed: every report that was ever written is read with it, those of before it existed too.
+_LIKE_REPORTS = zstandard.ZstdCompressionDict(
+    Path(__file__).with_name("reports.dictionary").read_bytes(), dict_type=zstandard.DICT_TYPE_RAWCONTENT
+)
 
 
 class PackedReport(NamedTuple):
@@ -168,7 +174,7 @@ def pack(machine: str, step: Step, recorded_ns: int) -> tuple[PackedReport, ...]
         _check(machine, f"alarm event {event.sequence}", event)
     if step.checkpoint is not None:
         _check(machine, "checkpoint", step.checkpoint.head)
-    compressor = zstandard.ZstdCompressor()
+    compressor = zstandard.ZstdCompressor(_LEVEL, dict_data=_LIKE_REPORTS)
     return tuple(PackedReport(recorded_ns, each, compressor.compress(each.text.encode())) for each in step.reports)
 
 
@@ -181,7 +187,7 @@ def unpack(text: bytes) -> str:
         If the bytes are damaged.
     """
     try:
-        return zstandard.ZstdDecompressor().decompress(text).decode()
+        return zstandard.ZstdDecompressor(dict_data=_LIKE_REPORTS).decompress(text).decode()
     except (zstandard.ZstdError, UnicodeDecodeError) as error:
         raise StoreError(f"history: the text of a report is damaged: {error}") from error
 

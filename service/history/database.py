@@ -423,7 +423,7 @@ def _prepare_sqlite(connection: Any, record: object) -> None:
     connection.isolation_level = None  # the transactions below, not those that the driver would begin
     # Every page that a step touches is written whole, and few pages hold more than one thing that a step changes. Those
     # that every step touches go from the log into the file only every few hundred steps.
-    small = ("page_size = 1024", "wal_autocheckpoint = 4000")
+    small = ("page_size = 512", "wal_autocheckpoint = 32000")
     for setting in (*small, "journal_mode = WAL", "synchronous = FULL", "foreign_keys = ON"):
         connection.execute(f"PRAGMA {setting}")
 

@@ -4,13 +4,13 @@ import threading
 from collections.abc import Callable
 
 import structlog
-from sqlalchemy import Connection, Table, bindparam, delete, func, select, text, update
+from sqlalchemy import Connection, Table, delete, func, select, text, update
 
 from service.history.database import Database
 from service.history.errors import StoreError
 from service.history.records import Dropped
 from service.history.retention import Retention
-from service.history.tables import buckets, evaluations, open_buckets, readings, reports, series
+from service.history.tables import buckets, evaluations, machines, open_buckets, readings, reports, series
 
 __all__ = ["Reduction"]
 
@@ -83,27 +83,37 @@ class Reduction:
                 lock = text("SELECT pg_try_advisory_xact_lock(:high, :low)")
                 if not connection.scalar(lock, {"high": _LOCK[0], "low": _LOCK[1]}):
                     return 0  # another monitor is at it
+            if table in {reports, evaluations}:
+                numbers = connection.scalars(select(machines.c.machine_id)).all()
+                most = max(1, _BATCH // max(1, len(numbers)))
+                return sum(_drop_first(connection, table, each, until_ns, self._now_ns(), most) for each in numbers)
             oldest = select(table.c.recorded_ns).where(table.c.recorded_ns < until_ns)
             oldest = oldest.order_by(table.c.recorded_ns).limit(_BATCH)
             boundary_ns = connection.scalar(select(func.max(oldest.subquery().c.recorded_ns)))
-            if boundary_ns is None:
-                return 0
-            if table is evaluations:
-                _drop_readings(connection, boundary_ns)
-            return connection.execute(delete(table).where(table.c.recorded_ns <= boundary_ns)).rowcount
+            return connection.execute(delete(table).where(table.c.recorded_ns <= (boundary_ns or -1))).rowcount
 
 
-def _drop_readings(connection: Connection, boundary_ns: int) -> None:
-    """Drop the readings of old windows, which are in buckets since they came, and note how far that reaches."""
-    window, reading, of = evaluations.c, readings.c, series.c
-    latest = select(window.machine_id, func.max(window.end_ns)).where(window.recorded_ns <= boundary_ns)
-    for machine_id, end_ns in connection.execute(latest.group_by(window.machine_id)).all():
-        behind = (of.machine_id == machine_id, of.dropped_ns < end_ns)
+def _drop_first(connection: Connection, table: Table, machine_id: int, until_ns: int, now_ns: int, most: int) -> int:
+    """Drop what one machine has had longest, up to the last old one of so many; return how many.
+
+    Numbers say what came first. Where the computer's clock was ahead, its times do not: what such rows stand before was
+    recorded later, and they go with it.
+    """
+    row, last = table.c, -1
+    while True:
+        query = select(row.number, row.recorded_ns).where(row.machine_id == machine_id, row.number > last)
+        found = connection.execute(query.order_by(row.number).limit(most)).all()
+        old = [number for number, recorded_ns in found if recorded_ns < until_ns]
+        if old:
+            break
+        if len(found) < most or any(recorded_ns <= now_ns for _, recorded_ns in found):
+            return 0
+        last = found[-1].number
+    chosen = (row.machine_id == machine_id, row.number <= old[-1])
+    if table is evaluations:
+        end_ns = connection.scalar(select(func.max(row.end_ns)).where(*chosen))
+        behind = (series.c.machine_id == machine_id, series.c.dropped_ns < end_ns)
         connection.execute(update(series).where(*behind).values(dropped_ns=end_ns))
-    chosen = select(window.machine_id, window.number).where(window.recorded_ns <= boundary_ns)
-    gone = [{"of_machine": row.machine_id, "of_window": row.number} for row in connection.execute(chosen)]
-    # One by one along the key: a condition on all of them would make a database look through the whole table.
-    by_key = delete(readings).where(
-        reading.machine_id == bindparam("of_machine"), reading.number == bindparam("of_window")
-    )
-    connection.execute(by_key, gone)
+        gone = (readings.c.machine_id == machine_id, readings.c.number <= old[-1])
+        connection.execute(delete(readings).where(*gone))
+    return connection.execute(delete(table).where(*chosen)).rowcount

@@ -79,7 +79,6 @@ reports = sa.Table(
     *_filled(LargeBinary, "text"),
     sa.PrimaryKeyConstraint("machine_id", "number"),
     sa.Index(None, "machine_id", "end_ns"),
-    sa.Index(None, "recorded_ns"),
 )
 
 evaluations = sa.Table(
@@ -89,7 +88,6 @@ evaluations = sa.Table(
     *_filled(BigInteger, "number", "end_ns", "recorded_ns"),
     sa.PrimaryKeyConstraint("machine_id", "number"),
     sa.Index(None, "machine_id", "end_ns"),
-    sa.Index(None, "recorded_ns"),
     sqlite_with_rowid=False,
 )
 

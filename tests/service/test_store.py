@@ -471,7 +471,7 @@ def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
         names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size", "wal_autocheckpoint")
         with store._database.reading() as reader:
             found = [reader.scalar(text(f"PRAGMA {name}")) for name in names]
-        assert found == ["wal", 2, 1, 5000, 1024, 4000]
+        assert found == ["wal", 2, 1, 5000, 512, 32000]
     finally:
         store.close()
     with sqlite3.connect(file) as connection:

@@ -1,16 +1,20 @@
 """The migrations make exactly the tables that the code uses, once, whoever comes first."""
 
+import hashlib
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+import zstandard
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, inspect, make_url, text
 from sqlalchemy.engine import Engine
 
+from service.history import claim
+from service.history.claim import unpack
 from service.history.errors import StoreError
 from service.history.records import Checkpoint, CheckpointHead
 from service.history.retention import Retention
@@ -148,3 +152,10 @@ def test_a_checkpoint_of_an_older_version_keeps_its_alarms(url: str) -> None:
     finally:
         store.close()
     assert found == Checkpoint(CheckpointHead(1, None, "hash", "0.1", 5, 6, alarms, b"RWCP"), ())
+
+
+def test_reports_that_were_compressed_by_themselves_are_read() -> None:
+    """Those of earlier versions; and what all are compressed against is what it was, or none could be read."""
+    assert unpack(zstandard.compress(b'{"state": "healthy"}')) == '{"state": "healthy"}'
+    dictionary = Path(claim.__file__).with_name("reports.dictionary").read_bytes()
+    assert hashlib.sha256(dictionary).hexdigest() == "af2696c3ddde702e4bf51e00016417f4cb4fa04bf9e1e9b5ee9fba2fa27ef8ac"

@@ -10,6 +10,8 @@ down_revision = "0002"
 
 def upgrade() -> None:
     """Parts of a checkpoint in place of hops; one of before is still gone on from, with a window that fills anew."""
+    for table in ("reports", "evaluations"):
+        op.drop_index(f"{table}_recorded_ns", table)
     _checkpoints()
     op.drop_table("checkpoint_hops")
     op.create_table(
