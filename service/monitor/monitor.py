@@ -87,6 +87,7 @@ class MachineMonitor:
         self._reached_ns: int | None = None
         self._kept_is_valid = True
         self._not_recalled = 0
+        self._held: list[tuple[bytes, bytes, str]] = []
         self._drops: dict[tuple[int, int], int] = {}
         self._dropped = 0
         self._fault = ""
@@ -125,9 +126,12 @@ class MachineMonitor:
         misshapen = self._gate.form(block, schema_hash)
         if misshapen is not None:  # before anything is made of its run and number
             return (MonitorReport(self._count(misshapen)),)
-        if self._window.lacks and self._gate.knows(block):
-            self._recall(block)
-            return ()
+        if self._window.lacks:
+            if self._gate.knows(block):
+                self._recall(block)
+            else:  # one that is known may have been overtaken
+                self._held.append((payload, attachment, encoding))
+            return self._released()
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
             verdict = Admission(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
@@ -163,8 +167,18 @@ class MachineMonitor:
         lost = self._not_recalled
         return f"{lost} hops of the window did not come again, it fills anew" if lost else ""
 
+    def _released(self) -> tuple[MonitorReport, ...]:
+        """New blocks that came while the window was recalled, once it is there or not waited for any longer."""
+        if self._window.lacks and len(self._held) <= self.machine.ingest.reorder_blocks:
+            return ()
+        self._not_recalled += self._window.give_up()
+        held, self._held = self._held, []
+        return tuple(report for one in held for report in self.step_payload(*one))
+
     def flush(self) -> tuple[MonitorReport, ...]:
         """Take the blocks that wait for earlier ones: those will not come any more."""
+        self._not_recalled += self._window.give_up()
+        self._done += self._released()
         self._due.extend(self._arrivals.flush())
         return self._step_due()
 
@@ -300,15 +314,7 @@ class MachineMonitor:
         return self._alarms.take()
 
     def state(self, kept: Collection[str] = (), *, whole: bool = False) -> MonitorState:
-        """What is remembered, to be put into another monitor.
-
-        Parameters
-        ----------
-        kept : collection of str
-            Names of the parts that are stored already and need not be handed over again.
-        whole : bool
-            With the samples and moments of the window, megabytes, which otherwise have to be recalled.
-        """
+        """What is remembered, without parts named in `kept`; with `whole` the window too, megabytes."""
         arrays = {
             **prefixed("gate", self._gate.checkpoint()),
             **prefixed("window", self._window.checkpoint(whole=whole)),
@@ -323,11 +329,6 @@ class MachineMonitor:
 
     def restore(self, state: bytes, parts: Collection[bytes] = ()) -> None:
         """Go on where another monitor of the same machine, files and version stood; alarms are restored by themselves.
-
-        Parameters
-        ----------
-        state : bytes
-        parts : collection of bytes
 
         Raises
         ------

@@ -378,3 +378,19 @@ def test_parts_are_kept_apart() -> None:
     assert unprefixed("b", parts) == {}
     with pytest.raises(CheckpointError, match="x is missing; there are a/x, ab/x"):
         checked(parts, "x", np.int64, ())
+
+
+@pytest.mark.slow
+def test_a_window_is_recalled_though_a_new_block_overtakes_the_newest_known_one() -> None:
+    blocks, expected = stream("phase reference"), uninterrupted("phase reference")
+    before = monitor("phase reference")
+    for block in blocks[:680]:
+        before.step(block)
+    state = before.state()
+    after = monitor("phase reference")
+    after.restore(state.state, [part for _, part in state.new_parts])
+    after.restore_alarms(state.alarms)
+    arriving = [*blocks[:679], blocks[680], blocks[679], *blocks[681:760]]
+    said = [one for block in arriving for one in after.step_payload(*encode_block(block, ""))]
+    assert after.recalled == ""
+    assert [w for one in said for w in one.windows] == [w for one in expected[680:760] for w in one.windows] != []
