@@ -367,7 +367,8 @@ class SlidingWindow:
             return dict(self._recall.arrays)
         pending = np.concatenate(self._pending) if self._pending else np.empty((0, self._columns))
         block_ns = self._blocks[0][0] if self._blocks else 0
-        last = Piece(self._pending_start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
+        start_ns = self._pending_start_ns if pending.size else 0  # that of what a gap has taken away is of no use
+        last = Piece(start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
         found: dict[str, np.ndarray] = {
             "level": np.array([] if self._level is None else self._level, dtype=np.float64),
             **pieces_of((*self._pieces, last)),

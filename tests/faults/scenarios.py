@@ -107,7 +107,8 @@ ROWS = (
     Row(
         "The monitor is killed, three times",
         "`kill -9` at any moment, and started again",
-        "nothing that the publisher's cache still holds",
+        "nothing that the publisher's cache still holds; the window too is made again from "
+        "[recordings or that cache](history.md#after-a-restart), or fills anew",
         "`restart` in health: went on where it stood",
         "data come, and what was sent meanwhile has come out of the publisher's cache",
         faults.monitor_killed,

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from models.alarm_names import FAULT, GAP, OVERLOADED, STREAM_LOST
@@ -290,6 +290,7 @@ INTEGER = st.one_of(st.integers(-(2**70), 2**70), st.sampled_from([0, 2**16 - 1,
     ),
     start_ns=st.one_of(st.just(START_NS), INTEGER),
 )
+@example(headers=[(0, 0, LAB.rate_hz, 0), (0, 0, LAB.rate_hz, 1)], start_ns=START_NS)  # two versions of one block
 def test_whatever_is_accepted_can_be_remembered_and_restored(
     headers: list[tuple[int, int, float, int]], start_ns: int
 ) -> None:
