@@ -43,11 +43,15 @@ def heard(files: Sequence[Path], key: str, since_ns: int) -> Iterator[RecordedMe
 
 def _messages(path: Path, key: str, since_ns: int) -> Iterator[RecordedMessage]:
     complete = path.with_name(path.name.removesuffix(PART))
-    if not path.exists():
-        path = complete
-    if path == complete:
-        return read_recording(path, keys={key}, from_ns=since_ns) if _touched_ns(path) >= since_ns else iter(())
-    return salvaged_messages(path)
+    if path != complete:
+        try:
+            yield from salvaged_messages(path)
+            return
+        except RecordingError:
+            if path.exists():
+                raise
+    if _touched_ns(complete) >= since_ns:
+        yield from read_recording(complete, keys={key}, from_ns=since_ns)
 
 
 def _touched_ns(path: Path) -> int:
