@@ -42,7 +42,7 @@ from service.history.audit import AuditLog
 from service.history.errors import StoreError
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
-from service.recordings.heard import heard, recorded_files
+from service.recordings.recent import recent_messages, recorded_files
 from service.recordings.recorder import MachineRecorder, RecorderStatus
 from service.settings.service import ServiceSettings
 from service.stream.liveness import Pulse
@@ -176,7 +176,11 @@ class Runtime:
                 machine = installed.machine
                 history = self.store.machine(machine.site, machine.name)
                 worker = MachineWorker(
-                    installed, self.settings.queue, history, on_events=self._alarm_events, recorded=self._heard(machine)
+                    installed,
+                    self.settings.queue,
+                    history,
+                    on_events=self._alarm_events,
+                    recorded=self._recent(machine),
                 )
                 self._workers.append(worker)
                 self._pulses.append(Pulse(worker.inbox.call))
@@ -204,12 +208,14 @@ class Runtime:
         self.feed.wake()
         self.webhooks.wake()
 
-    def _heard(self, machine: MachineFile) -> Callable[[int], Iterable[RecordedMessage]]:
+    def _recent(self, machine: MachineFile) -> Callable[[int], Iterable[RecordedMessage]]:
         """What was recorded of a machine until now, where anything of it is."""
         directory = self.settings.recording.directory
         if directory is None or self.settings.link.namespace:
             return lambda _: ()
-        return partial(heard, recorded_files(Path(directory) / machine.site / machine.name), machine.keys.stream)
+        return partial(
+            recent_messages, recorded_files(Path(directory) / machine.site / machine.name), machine.keys.stream
+        )
 
     def _record(self, machine: MachineFile, link: Link, undo: ExitStack) -> None:
         """Record the machine, if that is wanted; trouble with the disk is the recorder's own affair."""

@@ -26,7 +26,7 @@ from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
 __all__ = [
-    "FORMAT", "StepWriter", "checkpoint_step", "heard_since", "recorded_since_ns", "restored", "stored_event",
+    "FORMAT", "StepWriter", "checkpoint_step", "recorded_after", "recorded_since_ns", "restored", "stored_event",
     "stored_readings", "stored_report",
 ]  # fmt: skip
 
@@ -230,7 +230,7 @@ def recorded_since_ns(head: CheckpointHead) -> int:
     return head.recorded_ns - _LOOK_BACK_NS - (late_ns if 0 < late_ns < _LATE_NS else 0)
 
 
-def heard_since(monitor: MachineMonitor, recorded: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
+def recorded_after(monitor: MachineMonitor, recorded: Iterable[RecordedMessage]) -> Iterator[RecordedMessage]:
     """What was recorded after the newest block that the monitor has had; what was before goes into its window."""
     newest = False
     for message in recorded:

@@ -28,7 +28,7 @@ from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
 from service.settings.service import QueueSettings
-from service.stream.checkpoints import StepWriter, heard_since, recorded_since_ns, restored
+from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.outlet import Outlet
 from service.terminal.logs import Limiter, logger
@@ -340,9 +340,9 @@ class MachineWorker:
                 return
         self._conclude((), self._monitor.passed(self._data_now_ns()))
 
-    def _hear_again(self, since_ns: int) -> None:
+    def _catch_up(self, since_ns: int) -> None:
         """Take from the recording what the window lacks, and what came after the latest step that was committed."""
-        for message in heard_since(self._monitor, self._recorded(since_ns)):
+        for message in recorded_after(self._monitor, self._recorded(since_ns)):
             self._take(RawBlock(message.payload, message.attachment, message.encoding))
             self._asleep_s = max(0.0, (self._clocks.utc_ns() - message.log_time_ns) / 1e9)
         self._snapshot = self._monitor.health()
@@ -351,7 +351,7 @@ class MachineWorker:
     def _run(self) -> None:
         try:
             if self._recorded_since_ns is not None:
-                self._hear_again(self._recorded_since_ns)
+                self._catch_up(self._recorded_since_ns)
         except Exception as error:  # what it brought to light must not end the monitoring of the machine
             self._failed(error)
         while (item := self.inbox.get()) is not None:

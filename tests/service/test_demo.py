@@ -81,13 +81,11 @@ def read_until(process: subprocess.Popen[str], *texts: str) -> list[str]:
 
 def check_lines(output: str) -> None:
     """What holds for every line of a demo."""
-    lines = output.splitlines()
-    for number, line in enumerate(lines):
+    for line in output.splitlines():
         assert len(line.rstrip()) <= 100
         assert not ("healthy" in line and "changed" in line)
         assert not re.search(r"(?<!\S)-\d", line)  # the true minus sign is another one
-        if "stream lost" in line:  # only where the computer was too busy for seconds: windows come again
-            assert any(re.search("healthy|changed|too little", later) for later in lines[number + 1 :])
+        assert "stream lost" not in line
 
 
 @pytest.mark.slow

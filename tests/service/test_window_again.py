@@ -108,6 +108,12 @@ def until_accepted(at: Program, count: int) -> None:
     until(lambda: at.health().quality.accepted_blocks >= count, f"{count} blocks")
 
 
+def put_first(here: Plant, first: Program) -> None:
+    for begin in range(0, FIRST, 19):  # no more on their way than an inbox takes
+        here.put(stream()[begin : begin + 19])
+        until_accepted(first, begin + 19)
+
+
 def until_evaluated(at: Program) -> None:
     last_ns = START_NS + 112_500_000_000  # of the last hop, or a little later where hops began anew
 
@@ -137,9 +143,7 @@ def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_nothing_had_
 ) -> None:
     with plant(tmp_path, recording=recording, kept=kept) as here:
         with here.monitor() as first:
-            for begin in range(0, FIRST, 19):  # no more on their way than an inbox takes
-                here.put(stream()[begin : begin + 19])
-                until_accepted(first, begin + 19)
+            put_first(here, first)
             first.kill()
         with here.monitor() as second:
             until(lambda: second.health().filled == 1.0, "full window")
@@ -156,9 +160,7 @@ def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_nothing_had_
 def test_killed_with_recordings_alone_the_window_is_there_and_what_nobody_has_is_a_gap(tmp_path: Path) -> None:
     with plant(tmp_path, recording=True, kept=0) as here:
         with here.monitor() as first:
-            for begin in range(0, FIRST, 19):  # no more on their way than an inbox takes
-                here.put(stream()[begin : begin + 19])
-                until_accepted(first, begin + 19)
+            put_first(here, first)
             first.kill()
         with here.monitor() as second:
             until(lambda: second.health().filled == 1.0, "full window")
@@ -174,9 +176,7 @@ def test_killed_with_recordings_alone_the_window_is_there_and_what_nobody_has_is
 def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tmp_path: Path, kept: int) -> None:
     with plant(tmp_path, recording=False, kept=kept) as here:
         with here.monitor() as first:
-            for begin in range(0, FIRST, 19):  # no more on their way than an inbox takes
-                here.put(stream()[begin : begin + 19])
-                until_accepted(first, begin + 19)
+            put_first(here, first)
             before = [one for one in first.health().alarms if one.raised]
             first.kill()
         with here.monitor() as second:
@@ -199,9 +199,7 @@ def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tm
 def test_stopped_in_order_the_window_is_kept(tmp_path: Path) -> None:
     with plant(tmp_path, recording=False, kept=0) as here:
         with here.monitor() as first:
-            for begin in range(0, FIRST, 19):  # no more on their way than an inbox takes
-                here.put(stream()[begin : begin + 19])
-                until_accepted(first, begin + 19)
+            put_first(here, first)
             assert first.stop() == 0
         with here.monitor() as second:
             health = second.health()

@@ -8,7 +8,7 @@ import pytest
 from models.signals.recording import RecordedMessage, read_recording
 from models.signals.salvage import salvaged_messages
 from service.recordings.catalogue import PART
-from service.recordings.heard import heard, recorded_files
+from service.recordings.recent import recent_messages, recorded_files
 from tests.service.live import LAB, scenario_blocks
 from tests.service.replaying import recording
 
@@ -28,5 +28,5 @@ def test_a_part_that_is_completed_meanwhile_is_read(tmp_path: Path, monkeypatch:
     if when == "before":
         part.rename(complete)
     else:
-        monkeypatch.setattr("service.recordings.heard.salvaged_messages", completed)
-    assert list(heard(files, LAB.keys.stream, 0)) == expected
+        monkeypatch.setattr("service.recordings.recent.salvaged_messages", completed)
+    assert list(recent_messages(files, LAB.keys.stream, 0)) == expected

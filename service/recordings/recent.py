@@ -10,7 +10,7 @@ from models.signals.wire import REPLAY_MARK
 from service.recordings.catalogue import PART, SUFFIX
 from service.terminal.logs import logger
 
-__all__ = ["heard", "recorded_files"]
+__all__ = ["recent_messages", "recorded_files"]
 
 _log = logger(part="recordings")
 
@@ -20,7 +20,7 @@ def recorded_files(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted((*folder.glob(f"*{SUFFIX}"), *folder.glob(f"*{SUFFIX}{PART}"))))
 
 
-def heard(files: Sequence[Path], key: str, since_ns: int) -> Iterator[RecordedMessage]:
+def recent_messages(files: Sequence[Path], key: str, since_ns: int) -> Iterator[RecordedMessage]:
     """Messages on a key, replays left out, in the order in which they came.
 
     Parameters
