@@ -72,8 +72,7 @@ def train(
 @app.command()
 def commission(
     machine: Annotated[
-        str,
-        typer.Option("--machine", "-m", help="Machine file (TOML). What it leaves out of [rotor] is learned."),
+        str, typer.Option("--machine", "-m", help="Machine file (TOML). What it leaves out of [rotor] is learned.")
     ],
     healthy: Annotated[
         list[Path],

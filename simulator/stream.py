@@ -29,11 +29,7 @@ _PIECE_S = 0.5
 
 
 def blocks(
-    scenario: Scenario,
-    machine: Machine,
-    block_s: float = 0.1,
-    start_ns: int = DEFAULT_START_NS,
-    run: int = 1,
+    scenario: Scenario, machine: Machine, block_s: float = 0.1, start_ns: int = DEFAULT_START_NS, run: int = 1
 ) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
     """Simulate a scenario, block by block.
 

@@ -17,11 +17,7 @@ import rotorwatch
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("models", "rotorwatch", "service", "simulator")
 SHIPPED = {".py", ".toml", ".json", ".safetensors", ".jinja", ".mako", ".typed", ".dictionary"}
-PROGRAMS = {
-    "rotorsim": "simulator.rotorsim",
-    "rotortrain": "simulator.rotortrain",
-    "rotorwatch": "service.rotorwatch",
-}
+PROGRAMS = {"rotorsim": "simulator.rotorsim", "rotortrain": "simulator.rotortrain", "rotorwatch": "service.rotorwatch"}
 
 
 @pytest.fixture(scope="module")

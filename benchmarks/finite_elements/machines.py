@@ -76,10 +76,7 @@ _STIFFENING = replace(
     _OVERHUNG,
     name="stiffening",
     description="Overhung disc, the bearing's stiffness grows with its displacement",
-    bearings=(
-        replace(_OVERHUNG.bearings[0], k_y=1.7e5, k_z=2.2e5, cubic_N_per_m3=2.0e13),
-        _OVERHUNG.bearings[1],
-    ),
+    bearings=(replace(_OVERHUNG.bearings[0], k_y=1.7e5, k_z=2.2e5, cubic_N_per_m3=2.0e13), _OVERHUNG.bearings[1]),
     speed_rad_s=2 * math.pi * 27.0,
 )
 

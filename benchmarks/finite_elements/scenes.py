@@ -47,11 +47,7 @@ COMMISSIONED = SceneRange(cutoff_hz=(80.0, 80.0), stochastic_to_1x=(1.5, 1.5), n
 
 
 def drawn_condition(
-    rotor: BeamRotor,
-    layout: SourceLayout,
-    limits: SceneRange,
-    changes: dict[str, float],
-    rng: np.random.Generator,
+    rotor: BeamRotor, layout: SourceLayout, limits: SceneRange, changes: dict[str, float], rng: np.random.Generator
 ) -> RunCondition:
     """Draw a condition; the level is that of the linear, unchanged rotor, so that a change shows as it would.
 

@@ -13,13 +13,7 @@ import numpy as np
 
 from benchmarks.studies import results as r
 from benchmarks.studies.opinions import TITLES, diagnosticians, named_in
-from benchmarks.studies.paper import (
-    PAPER_EQUATIONS,
-    PaperDiagnostician,
-    PaperHealthy,
-    PaperNetwork,
-    calibrate_paper,
-)
+from benchmarks.studies.paper import PAPER_EQUATIONS, PaperDiagnostician, PaperHealthy, PaperNetwork, calibrate_paper
 from benchmarks.studies.paper_training import train_paper_network
 from benchmarks.studies.results import Chart, Estimate, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Over, Study

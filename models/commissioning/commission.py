@@ -5,18 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.commissioning.checks import (
-    Check,
-    check_data,
-    check_lines,
-    check_sensors_of,
-    check_steady,
-)
-from models.commissioning.commissioned import (
-    Commissioned,
-    RecordingEntry,
-    described,
-)
+from models.commissioning.checks import Check, check_data, check_lines, check_sensors_of, check_steady
+from models.commissioning.commissioned import Commissioned, RecordingEntry, described
 from models.commissioning.conditions import OperatingRange
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.knowledge import KnowledgeLevel, knowledge_of

@@ -126,9 +126,7 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
     )
     filled = identified.machine.model_dump(mode="json", include=set(_TABLES))
     record = IdentifiedRecord(
-        machine=filled,
-        names=identified.names,
-        covariance=tuple(tuple(row) for row in identified.covariance.tolist()),
+        machine=filled, names=identified.names, covariance=tuple(tuple(row) for row in identified.covariance.tolist())
     )
     check = check_agreement([each for _, _, each in read], "the identified rotor")
     notes = _integrated(pieces, identified.machine)
@@ -311,10 +309,6 @@ def _halves(pieces: Sequence[Piece]) -> tuple[Read, ...]:
 
 
 LEVELS: Mapping[KnowledgeLevel, Callable[[MachineFile, Sequence[Piece], Progress], Learned]] = MappingProxyType(
-    {
-        KnowledgeLevel.FULL: _learn_full,
-        KnowledgeLevel.PARTIAL: _learn_partial,
-        KnowledgeLevel.NONE: _learn_none,
-    }
+    {KnowledgeLevel.FULL: _learn_full, KnowledgeLevel.PARTIAL: _learn_partial, KnowledgeLevel.NONE: _learn_none}
 )
 """How to learn at each level."""

@@ -55,16 +55,7 @@ _PLAIN, _PREFIXED = "none", "attachment-1"
 _LIBRARY = "rotorwatch"
 _PROFILE = "rotorwatch-1"
 # What the mcap library lets through when a file is cut off or overwritten.
-DAMAGE = (
-    McapError,
-    CRCValidationError,
-    struct.error,
-    zstandard.ZstdError,
-    ValueError,
-    KeyError,
-    EOFError,
-    MemoryError,
-)
+DAMAGE = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, ValueError, KeyError, EOFError, MemoryError)
 
 
 @dataclass(frozen=True, slots=True)

@@ -89,9 +89,7 @@ class Report(BaseModel):
         examples=[()],
     )
     shapes: tuple[Shape, ...] = Field(
-        default=(),
-        description="where no equation can be evaluated: whether each channel is as it was",
-        examples=[()],
+        default=(), description="where no equation can be evaluated: whether each channel is as it was", examples=[()]
     )
     reason: Reason = ""
     bundle: BundleIdentity

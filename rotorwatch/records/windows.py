@@ -104,9 +104,7 @@ class Agreement(BaseModel):
         description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
     )
     difference_z: Number = Field(
-        default=None,
-        description="second minus first change in combined standard errors",
-        examples=[0.8],
+        default=None, description="second minus first change in combined standard errors", examples=[0.8]
     )
 
 
@@ -195,10 +193,7 @@ class SensorFault(BaseModel):
         description="channels, value found and what was expected, in a sentence",
         examples=["gain of y1 is 20 % lower than when it was commissioned"],
     )
-    value: Number = Field(
-        description="; ".join(f"{kind}: {kind.measure}" for kind in FaultKind),
-        examples=[-0.2],
-    )
+    value: Number = Field(description="; ".join(f"{kind}: {kind.measure}" for kind in FaultKind), examples=[-0.2])
     z: Number = Field(default=None, description="in standard errors; null where no chance is involved", examples=[41.0])
 
 

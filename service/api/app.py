@@ -130,8 +130,7 @@ def _add_machine_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         """The machine file as it is in use, defaults filled in, and what was trained or commissioned for it."""
         view = found_machine(service, site, machine)
         return MachineConfiguration(
-            **view.identity,
-            file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json"),
+            **view.identity, file=MachineFile.model_validate(view.machine.model_dump()).model_dump(mode="json")
         )
 
     @app.get(f"{PLACE}/health", responses=responses(Health, 404, 422), **common)
@@ -152,11 +151,7 @@ def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> N
         return Alive(alive=True)
 
     @app.get(
-        "/readyz",
-        tags=["service"],
-        dependencies=[guard.read],
-        responses=responses(Readiness),
-        response_model=Readiness,
+        "/readyz", tags=["service"], dependencies=[guard.read], responses=responses(Readiness), response_model=Readiness
     )
     def readyz(request: Request) -> Readiness | JSONResponse:
         """Whether the service can do its work, and if not, why; a machine without data is listed, not counted."""

@@ -69,8 +69,7 @@ class _Picture:
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Picture to write: .png or .svg.")]
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there already.")] = False
     key: Annotated[
-        str | None,
-        typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several."),
+        str | None, typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several.")
     ] = None
     from_: FromOption = None
     to: ToOption = None
@@ -189,8 +188,7 @@ def spectrum(
     picture: _Picture,
     at: _AtOption = None,
     channel: Annotated[
-        list[str] | None,
-        typer.Option("--channel", metavar="NAME", help="Repeatable; all displacements if left out."),
+        list[str] | None, typer.Option("--channel", metavar="NAME", help="Repeatable; all displacements if left out.")
     ] = None,
     window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")] = 20.0,
     resolution: _ResolutionOption = 0.5,

@@ -42,8 +42,7 @@ _OF_A_MACHINE_MB = 100
 """Little of it is memory: stacks of threads and what libraries set aside."""
 
 HistoryOption = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts."),
+    Path | None, typer.Option("--config", metavar="FILE", help="Settings (TOML) of the monitor; \\[history] counts.")
 ]
 ConnectOption = Annotated[
     list[str] | None,

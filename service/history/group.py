@@ -106,8 +106,7 @@ def _new_events(connection: Connection, claim: Claim, events: Sequence[StoredEve
     log = alarm_events.c
     new = {event.sequence: event for event in events}
     query = select(log.sequence, log.id).where(
-        log.machine_id == claim.machine_id,
-        or_(log.sequence >= min(new), log.id.in_([event.id for event in events])),
+        log.machine_id == claim.machine_id, or_(log.sequence >= min(new), log.id.in_([event.id for event in events]))
     )
     for sequence, identifier in connection.execute(query):
         event = new.pop(sequence, None)

@@ -13,13 +13,7 @@ from service.history.alarm_log import EVENT
 from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
 from service.history.errors import StoreError
-from service.history.records import (
-    Checkpoint,
-    CheckpointHead,
-    Step,
-    StoredEvent,
-    StoredReport,
-)
+from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evaluations, readings, reports, series
 from service.history.trend import trend
 from service.history.writer import Writer
@@ -168,12 +162,7 @@ class MachineStore:
         return tuple(StoredEvent(*row) for row in self._database.rows(query))
 
     def reports(
-        self,
-        *,
-        since_ns: int | None = None,
-        until_ns: int | None = None,
-        before: int | None = None,
-        limit: int = 100,
+        self, *, since_ns: int | None = None, until_ns: int | None = None, before: int | None = None, limit: int = 100
     ) -> tuple[tuple[int, StoredReport], ...]:
         """Reports in the order of arrival, newest first, each with its number.
 

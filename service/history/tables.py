@@ -137,11 +137,7 @@ buckets = sa.Table(
 
 # Those that are being filled: beside each other, where the others lie far apart, and each would cost a page.
 open_buckets = sa.Table(
-    "open_buckets",
-    metadata,
-    *_reduced(),
-    sa.PrimaryKeyConstraint("series_id"),
-    sqlite_with_rowid=False,
+    "open_buckets", metadata, *_reduced(), sa.PrimaryKeyConstraint("series_id"), sqlite_with_rowid=False
 )
 
 checkpoints = sa.Table(

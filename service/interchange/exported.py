@@ -249,9 +249,7 @@ def _stream_batches(
 
 
 def _batch(
-    pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]],
-    factors: Sequence[float],
-    table: Table,
+    pending: list[tuple[npt.NDArray[np.int64], SampleBlock, slice]], factors: Sequence[float], table: Table
 ) -> pa.RecordBatch:
     times = np.concatenate([time_ns[rows] for time_ns, _, rows in pending])
     samples = np.concatenate([block.samples[rows] for _, block, rows in pending])

@@ -34,10 +34,7 @@ class LimitSettings(BaseModel):
     body_bytes: int = Field(default=1_000_000, ge=1_000, le=1_000_000_000, description="largest request body, in bytes")
     requests_per_minute: int = Field(default=600, ge=1, le=1_000_000, description="most requests of one caller")
     failures_per_minute: int = Field(
-        default=10,
-        ge=1,
-        le=100_000,
-        description="most attempts with a wrong token, and of an address with wrong ones",
+        default=10, ge=1, le=100_000, description="most attempts with a wrong token, and of an address with wrong ones"
     )
     streams_per_caller: int = Field(default=5, ge=1, le=10_000, description="most open event streams of one caller")
     streams: int = Field(default=50, ge=1, le=100_000, description="most open event streams in all")

@@ -59,8 +59,7 @@ class WebhookSettings(BaseModel):
         default=(), description="only of these severities; all if left out"
     )
     annunciated_only: bool = Field(
-        default=False,
-        description="leave out what happens to alarms that are shelved, suppressed or out of service",
+        default=False, description="leave out what happens to alarms that are shelved, suppressed or out of service"
     )
     timeout_s: float = Field(
         default=10.0, ge=0.1, le=300.0, description="how long one attempt may take altogether, in seconds"

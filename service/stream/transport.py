@@ -414,12 +414,7 @@ def _verbatim(sample: zenoh.Sample) -> RecordedMessage:
         publish_time_ns = sample.timestamp.get_time_as_ntp64().as_nanos()
     attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
     return RecordedMessage(
-        str(sample.key_expr),
-        sample.payload.to_bytes(),
-        attachment,
-        str(sample.encoding),
-        log_time_ns,
-        publish_time_ns,
+        str(sample.key_expr), sample.payload.to_bytes(), attachment, str(sample.encoding), log_time_ns, publish_time_ns
     )
 
 

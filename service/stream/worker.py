@@ -449,9 +449,7 @@ class MachineWorker:
             self._warn("history", "the history cannot be written; what happened waits in memory and is published")
         tally = self.tally
         self.tally = replace(
-            tally,
-            windows=tally.windows + len(windows),
-            commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s,
+            tally, windows=tally.windows + len(windows), commit_s=tally.commit_s + self._clocks.monotonic_s() - begin_s
         )
         return reports, told
 

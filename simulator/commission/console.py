@@ -11,12 +11,7 @@ from simulator.commission.verdict import VERDICT_TEXT, budget_sentences, dominan
 
 __all__ = ["print_report"]
 
-_COLOURS = {
-    "commissioned": "bold green",
-    "passed": "green",
-    "limited": "bold yellow",
-    "refused": "bold red",
-}
+_COLOURS = {"commissioned": "bold green", "passed": "green", "limited": "bold yellow", "refused": "bold red"}
 _WIDE = 100
 
 

@@ -8,13 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.sensors import (
-    SensorFault,
-    SensorReference,
-    implicated,
-    learn_sensor_reference,
-    sensor_findings,
-)
+from models.diagnosis.sensors import SensorFault, SensorReference, implicated, learn_sensor_reference, sensor_findings
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine

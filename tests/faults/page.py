@@ -98,8 +98,5 @@ def written(found: Mapping[str, Sequence[Outcome]], seeds: Sequence[int], loads:
     )
     text += "".join(_row(row, found[row.name]) for row in ROWS)
     return text + _WORDS.format(
-        compared=len(compared),
-        unaccounted=sum(compared),
-        doubled=sum(one.doubled for one in outcomes),
-        wrong=said,
+        compared=len(compared), unaccounted=sum(compared), doubled=sum(one.doubled for one in outcomes), wrong=said
     )

@@ -151,11 +151,7 @@ def test_reports_and_alarms_are_tables(tmp_path: Path) -> None:
     with (tmp_path / "alarms.csv").open(newline="", encoding="utf-8") as file:
         (event,) = list(csv.DictReader(file))
     said = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))
-    assert (event["name"], event["kind"], int(event["time_ns"])) == (
-        said.data.name,
-        said.data.kind,
-        said.data.time_ns,
-    )
+    assert (event["name"], event["kind"], int(event["time_ns"])) == (said.data.name, said.data.kind, said.data.time_ns)
     assert event["text"] == said.data.text
     export(Selection((tmp_path / "run.mcap",)), "reports", "mat", tmp_path / "reports.mat")
     content = loadmat(tmp_path / "reports.mat", simplify_cells=True)["data"]

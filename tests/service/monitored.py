@@ -54,9 +54,7 @@ def fed(folder: Path, access: AccessSettings = OPEN, *lines: tuple[str, str]) ->
     """The lab machine, which gets the blocks that a test puts; gaps of a second are an alarm at once."""
     address = endpoint()
     file = machine_file(
-        folder,
-        ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]"),
-        *lines,
+        folder, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]"), *lines
     )
     plan = settings(address, file, when_full="wait")
     with running(plan.model_copy(update={"access": access})) as runtime, open_session(address) as session:

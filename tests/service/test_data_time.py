@@ -83,11 +83,7 @@ def test_what_was_recorded_with_a_block_goes_with_it(quick: Path, tmp_path: Path
     other = replace(report, key="weather")
     source = RecordingSource([write(tmp_path / "more.mcap", [*messages[:201], report, other, *messages[201:]])])
     timed = {message.key: time_ns for time_ns, message in source.timed() if message.key != LAB.keys.stream}
-    assert timed == {
-        LAB.keys.descriptor: START_NS,
-        LAB.keys.report: START_NS + round(19.9 * S),
-        "weather": late,
-    }
+    assert timed == {LAB.keys.descriptor: START_NS, LAB.keys.report: START_NS + round(19.9 * S), "weather": late}
 
 
 def test_reports_without_samples_have_times_of_the_data(tmp_path: Path) -> None:

@@ -36,9 +36,7 @@ from tests.service.live import (
     service,
     until,
 )
-from tests.service.live import (
-    settings as plan_for,
-)
+from tests.service.live import settings as plan_for
 from tests.service.monitored import client
 from tests.service.test_alarm_trouble import bench, block, named, order, watched
 
@@ -178,9 +176,7 @@ def test_what_the_monitor_dropped_itself_is_no_fault_of_the_stream(
     assert raised(monitor) == {OVERLOADED, GAP}
 
 
-def test_overload_clears_when_the_monitor_keeps_up(
-    stuffed: tuple[MachineMonitor, Callable[[int, int], None]],
-) -> None:
+def test_overload_clears_when_the_monitor_keeps_up(stuffed: tuple[MachineMonitor, Callable[[int, int], None]]) -> None:
     monitor = stuffed[0]
     stream = scenario_blocks(100.0)
     events: list[AlarmEvent] = []

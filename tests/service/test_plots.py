@@ -227,10 +227,7 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
     path = recording(
         tmp_path / "runup.mcap",
         machine_blocks(
-            {
-                "theta": lambda t: (2 * np.pi * turns(t)) % (2 * np.pi),
-                "y1": lambda t: 5 * np.cos(2 * np.pi * turns(t)),
-            },
+            {"theta": lambda t: (2 * np.pi * turns(t)) % (2 * np.pi), "y1": lambda t: 5 * np.cos(2 * np.pi * turns(t))},
             60.0,
             without=range(300, 330),
         ),

@@ -25,17 +25,7 @@ from service.recordings.leftovers import is_locked
 from service.recordings.recorder import MachineRecorder
 from service.runtime import running
 from service.settings.service import RecordingSettings, ServiceSettings
-from tests.service.live import (
-    LAB,
-    ROOT,
-    Feed,
-    Program,
-    endpoint,
-    open_session,
-    program,
-    settings,
-    until,
-)
+from tests.service.live import LAB, ROOT, Feed, Program, endpoint, open_session, program, settings, until
 
 KEYS = LAB.keys
 NOW_NS = 1_795_271_130_000_000_000  # 2026-11-21 14:25:30 UTC

@@ -127,10 +127,7 @@ def test_nothing_that_was_safe_is_lost_when_the_recorder_is_killed_again_and_aga
 
 
 def check(
-    victim: Victim,
-    sent: list[tuple[bytes, bytes]],
-    before: dict[Path, list[tuple[bytes, bytes]]],
-    scratch: Path,
+    victim: Victim, sent: list[tuple[bytes, bytes]], before: dict[Path, list[tuple[bytes, bytes]]], scratch: Path
 ) -> int:
     """Compare what is on the disk with what was sent; how many messages were lost."""
     found = on_disk(victim.folder, scratch)

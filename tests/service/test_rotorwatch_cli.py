@@ -113,10 +113,7 @@ def test_signal_that_another_thread_receives_stops_the_program_too(tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [
-        (("run", "--config", "missing.toml"), "missing.toml"),
-        (("check-config", "missing.toml"), "missing.toml"),
-    ],
+    [(("run", "--config", "missing.toml"), "missing.toml"), (("check-config", "missing.toml"), "missing.toml")],
 )
 def test_unusable_files_and_arguments_exit_with_2(arguments: tuple[str, ...], named: str) -> None:
     found = run(*arguments)
@@ -168,10 +165,7 @@ def test_help_shows_the_names_of_tables() -> None:
 
 def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
     address = endpoint()
-    file = machine_file(
-        tmp_path,
-        ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
-    )
+    file = machine_file(tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"))
     watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")
     with (
         service(address, file, when_full="wait") as (runtime, worker),

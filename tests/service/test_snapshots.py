@@ -242,11 +242,7 @@ def test_a_part_of_the_band() -> None:
 def test_nothing_is_known_of_the_machine() -> None:
     reason = "the machine's parameters are not known, so there is no theory to predict from"
     data, made = LatestData(latest().window, 1.0, (), "", stream(SECONDS, SEED)[-20:]), snapshots_of(NOTHING)
-    correlations, spectra, orbits = (
-        made.correlations(data),
-        made.spectra(data, (), ["y1"]),
-        made.orbits(data, 2),
-    )
+    correlations, spectra, orbits = (made.correlations(data), made.spectra(data, (), ["y1"]), made.orbits(data, 2))
     known = snapshots_of(LAB).correlations(latest())
     assert [pair.measured for pair in correlations.pairs] == [pair.measured for pair in known.pairs]
     for snapshot in (correlations, spectra, orbits):

@@ -76,9 +76,7 @@ def written(machine: MachineStore, step: Step) -> None:
     until(lambda: machine.waiting == 0, "step in the database")
 
 
-def test_nothing_is_lost_while_the_database_is_away(
-    parts: Parts,
-) -> None:
+def test_nothing_is_lost_while_the_database_is_away(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url) as store:
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
@@ -105,9 +103,7 @@ def test_nothing_is_lost_while_the_database_is_away(
         assert [part for _, part in restored.parts] == [b"part 38", b"part 39", b"part 40"]
 
 
-def test_what_waits_is_bounded_and_events_are_never_dropped(
-    parts: Parts,
-) -> None:
+def test_what_waits_is_bounded_and_events_are_never_dropped(parts: Parts) -> None:
     url, fail, mend = parts
     with opened(url, waiting_reports=5) as store:
         lab = store.machine("demo", "lab")

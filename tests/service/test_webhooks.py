@@ -168,10 +168,7 @@ def test_trouble_is_followed_by_ever_longer_pauses_and_nothing_is_left_out(tmp_p
     def answer(_: Got) -> tuple[int, Mapping[str, str]]:
         return (statuses.pop(0), {}) if statuses else (200, {})
 
-    with (
-        hook(answer) as receiver,
-        turned(settings_for(receiver, tmp_path, longest_pause_s=20.0), history) as webhook,
-    ):
+    with hook(answer) as receiver, turned(settings_for(receiver, tmp_path, longest_pause_s=20.0), history) as webhook:
         history.happen(*(alarm_event(number) for number in range(3)))
         history.happen(alarm_event(0, "demo/pump"), place="demo/pump")
         pauses = []

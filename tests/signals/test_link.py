@@ -66,10 +66,7 @@ def inserted(link: LinkSettings) -> zenoh.Config:
         ({"tls": {"root_certificate": "a", "mutual": True}}, "mutual needs"),
         ({"grants": [GRANT], "connect": ENDPOINT}, "no listen endpoint"),
         ({"grants": [GRANT], "listen": ENDPOINT}, "expected passwords_file or tls.mutual"),
-        (
-            {"grants": [GRANT], "listen": ENDPOINT, "connect": ENDPOINT, "passwords_file": "a"},
-            "do not go together",
-        ),
+        ({"grants": [GRANT], "listen": ENDPOINT, "connect": ENDPOINT, "passwords_file": "a"}, "do not go together"),
         (
             {
                 "grants": [GRANT],

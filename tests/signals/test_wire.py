@@ -29,14 +29,7 @@ from hypothesis.extra.numpy import arrays
 from models.errors import WireError
 from models.signals.block import SampleBlock
 from models.signals.channels import UNIT_TO_SI, ChannelDescriptor
-from models.signals.wire import (
-    ARROW_ENCODING,
-    BLOCK_ENCODING,
-    HEADER_BYTES,
-    decode_block,
-    encode_arrow,
-    encode_block,
-)
+from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, HEADER_BYTES, decode_block, encode_arrow, encode_block
 from tests.loopback import endpoint
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
@@ -63,11 +56,7 @@ def _header(**fields: float) -> bytes:
 
 _samples = st.one_of(
     [
-        arrays(
-            dtype,
-            st.tuples(st.integers(1, 40), st.integers(1, 64)),
-            elements=elements,
-        )
+        arrays(dtype, st.tuples(st.integers(1, 40), st.integers(1, 64)), elements=elements)
         for dtype, elements in ((np.float32, st.floats(width=32)), (np.float64, st.floats(width=64)))
     ]
 )
@@ -84,13 +73,7 @@ _samples = st.one_of(
     schema_hash=st.sampled_from(["", "0123456789ab"]),
 )
 def test_any_block_survives_the_round_trip(
-    encode: Encoder,
-    samples: npt.NDArray[Any],
-    start_ns: int,
-    sequence: int,
-    run: int,
-    rate_hz: float,
-    schema_hash: str,
+    encode: Encoder, samples: npt.NDArray[Any], start_ns: int, sequence: int, run: int, rate_hz: float, schema_hash: str
 ) -> None:
     sent = SampleBlock(start_ns, sequence, run, rate_hz, samples)
     received, received_hash = decode_block(*encode(sent, schema_hash))

@@ -132,10 +132,7 @@ def test_unusable_files_are_refused_with_file_field_and_value(tmp_path: Path, te
     ("event", "message"),
     [
         ("speed_rpm = 900.0", r"events\.0\.at_s: missing"),
-        (
-            "at_s = 1.0",
-            "one of parameter, speed_rpm, source, sensor, excitation_level, anomaly; found none",
-        ),
+        ("at_s = 1.0", "one of parameter, speed_rpm, source, sensor, excitation_level, anomaly; found none"),
         ('at_s = 1.0\nanomaly = "looseness"\nsize = 0.1', "'looseness' is not one of crack, rub, added_mass"),
         ('at_s = 1.0\nanomaly = "crack"', "anomaly crack without size"),
         ('at_s = 1.0\nanomaly = "crack"\nsize = 0.9', "size of anomaly crack is 0.9, expected 0 to 0.8"),

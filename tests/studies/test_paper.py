@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.studies.paper import (
-    PAPER_EQUATIONS,
-    full_correlation,
-    phase_correlation,
-)
+from benchmarks.studies.paper import PAPER_EQUATIONS, full_correlation, phase_correlation
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
 from models.physics.lyapunov import correlation, stationary_covariance, synchronous_correlation, synchronous_response

@@ -11,13 +11,7 @@ from scipy.special import chdtrc, ndtri
 from models.diagnosis.baseline.excitation import one_source
 from models.diagnosis.baseline.gain import gain_suspicion
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
-from models.diagnosis.baseline.learned import (
-    Baseline,
-    coefficient_slices,
-    learned_rows,
-    positive,
-    unsuitable,
-)
+from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
 from models.diagnosis.baseline.relation import Relation, RowChange, read_row
 from models.diagnosis.baseline.rows import ROWS, Row, parameters_of
 from models.diagnosis.baseline.unbalance import (

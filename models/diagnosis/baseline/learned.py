@@ -68,9 +68,7 @@ def coefficient_slices(rows: Sequence[Row]) -> tuple[slice, ...]:
 
 
 def learn_baseline(
-    windows: Sequence[WindowStatistics],
-    conditions: Sequence[Hashable] | None = None,
-    rows: Sequence[Row] = ROWS,
+    windows: Sequence[WindowStatistics], conditions: Sequence[Hashable] | None = None, rows: Sequence[Row] = ROWS
 ) -> Baseline:
     """Learn a baseline from healthy windows.
 

@@ -199,11 +199,7 @@ class LikelihoodFit:
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
         read = self._read(window, model, found.whitened.point, structural, speed)
         return replace(
-            read,
-            misfit_z=goodness.misfit_z,
-            suspect=goodness.suspect,
-            unexplained=unexplained,
-            steps=found.steps,
+            read, misfit_z=goodness.misfit_z, suspect=goodness.suspect, unexplained=unexplained, steps=found.steps
         )
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:

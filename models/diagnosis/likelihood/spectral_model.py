@@ -111,12 +111,7 @@ class SpectralModel:
     """
 
     def __init__(
-        self,
-        machine: Machine,
-        motions: Motions,
-        groups: BinGroups,
-        force_scale: float = 1.0,
-        shapes: int = SHAPES,
+        self, machine: Machine, motions: Motions, groups: BinGroups, force_scale: float = 1.0, shapes: int = SHAPES
     ) -> None:
         rotor = machine.rotor
         self.n = motions.n

@@ -148,10 +148,7 @@ class NetworkDiagnostician:
             synchronous = None if synchronous is None else synchronous[columns]
         basis, features, speed = self._amortised.basis, self._features, np.array([window.speed_rad_s])
         with np.errstate(divide="ignore", invalid="ignore"):  # a dead channel shows as novelty
-            parts = [
-                basis.condensed(features.series(features.force(spectrum))),
-                features.consistency(spectrum, speed),
-            ]
+            parts = [basis.condensed(features.series(features.force(spectrum))), features.consistency(spectrum, speed)]
             if synchronous is not None and basis.centre.size > basis.n_common:
                 parts.append(features.unbalance(spectrum, synchronous[None], speed))
             return basis.standardised(np.concatenate(parts, axis=1))

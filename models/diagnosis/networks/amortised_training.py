@@ -199,9 +199,7 @@ class _Buffer:
 
 
 def calibrate_networks(
-    machine: Machine,
-    trained: AmortisedNetworks,
-    groups: Sequence[Iterable[tuple[WindowStatistics, dict[str, float]]]],
+    machine: Machine, trained: AmortisedNetworks, groups: Sequence[Iterable[tuple[WindowStatistics, dict[str, float]]]]
 ) -> AmortisedNetworks:
     """Measure bias and true size of the standard errors on windows simulated in time.
 

@@ -256,10 +256,7 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
         title="bearing, horizontal",
         target=Term("y1_dot", rate_reference=True),
         inputs=(Term("y1"), Term("y2"), Term("y1_dot"), Term("y2_dot", rate_reference=True)),
-        signatures={
-            "k_by": _stiffness_y,
-            "c_by": _damping_y,
-        },
+        signatures={"k_by": _stiffness_y, "c_by": _damping_y},
     ),
     SynchronousEquation(number="29", title="unbalance at the disc"),
     Equation(
@@ -274,10 +271,7 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
         title="bearing, vertical",
         target=Term("z1_dot", rate_reference=True),
         inputs=(Term("z1"), Term("z2"), Term("z1_dot"), Term("z2_dot", rate_reference=True)),
-        signatures={
-            "k_bz": _stiffness_z,
-            "c_bz": _damping_z,
-        },
+        signatures={"k_bz": _stiffness_z, "c_bz": _damping_z},
     ),
 )
 """The equations in the paper's order; adding a row here is all it takes."""

@@ -6,11 +6,4 @@ from models.diagnosis.sensors.reference import SensorReference, learn_sensor_ref
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-__all__ = [
-    "FaultKind",
-    "SensorFault",
-    "SensorReference",
-    "implicated",
-    "learn_sensor_reference",
-    "sensor_findings",
-]
+__all__ = ["FaultKind", "SensorFault", "SensorReference", "implicated", "learn_sensor_reference", "sensor_findings"]

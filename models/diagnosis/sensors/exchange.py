@@ -85,10 +85,7 @@ def swapped(
 
 
 def _guilty(
-    window: WindowStatistics,
-    sides: list[tuple[int, int]],
-    broken: list[MotionPair],
-    reference: SensorReference | None,
+    window: WindowStatistics, sides: list[tuple[int, int]], broken: list[MotionPair], reference: SensorReference | None
 ) -> int | None:
     """Which side was exchanged: the one that breaks two pairs of a chain of three, or whose rotation is the other's."""
     for number, side in enumerate(sides):

@@ -179,11 +179,7 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
     h, variance, bias = _transfer(bands, incoherent)
     level, _, cross = _even(bands)
     delay_s, total = _turned(bands.w, cross)
-    start = _Start(
-        1 if total >= 0 else -1,
-        float(np.log(max(abs(total) / level, _FLOOR))),
-        delay_s,
-    )
+    start = _Start(1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR))), delay_s)
     alone = _fitted(pair, start, bands.w, h, variance, bias)
     rotation = _rotation(window, pair)
     line = None if rotation is None else _line(rotation, window, bands, incoherent)

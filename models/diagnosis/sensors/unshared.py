@@ -17,16 +17,7 @@ from models.diagnosis.sensors.kinematics import Banded, PairReading
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-__all__ = [
-    "ChannelNoise",
-    "PairNoise",
-    "channel_noise",
-    "channel_rms",
-    "floor",
-    "matched",
-    "pair_noise",
-    "single",
-]
+__all__ = ["ChannelNoise", "PairNoise", "channel_noise", "channel_rms", "floor", "matched", "pair_noise", "single"]
 
 _FLAT = 2.0
 """Bands within this factor of the lowest lie on the floor."""

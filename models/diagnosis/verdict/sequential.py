@@ -302,11 +302,7 @@ class SequentialTest:
         else:
             self._note(isolation.changed, every, clean, verdicts)
         current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
-        isolation = replace(
-            isolation,
-            outside=bool(unexplained) or outside,
-            outside_confidence=confidence,
-        )
+        isolation = replace(isolation, outside=bool(unexplained) or outside, outside_confidence=confidence)
         self.unexplained = unexplained
         findings = () if unexplained else self.state.findings
         detected = bool(verdicts) and not unexplained

@@ -176,12 +176,7 @@ def _at_least(own: FloatArray, total: FloatArray) -> FloatArray:
 
 
 def _stretch(
-    start_ns: int,
-    end_ns: int,
-    known: list[int],
-    values: FloatArray,
-    covariance: FloatArray,
-    misfit_z: float | None,
+    start_ns: int, end_ns: int, known: list[int], values: FloatArray, covariance: FloatArray, misfit_z: float | None
 ) -> Stretch:
     n = len(PARAMETERS)
     information, vector = np.zeros((n, n)), np.zeros(n)

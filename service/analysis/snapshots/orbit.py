@@ -45,12 +45,7 @@ class _Vectors:
     absolute: bool
 
 
-def orbit_snapshot(
-    subject: Subject,
-    data: LatestData,
-    revolutions: int = 0,
-    units: Units = "channel",
-) -> OrbitSnapshot:
+def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
     """Orbits at every place where displacements are measured in both directions.
 
     Parameters

@@ -11,13 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
-from rotorwatch.records.history import (
-    AlarmEventList,
-    AuditList,
-    AuditRecord,
-    ReadingList,
-    ReportList,
-)
+from rotorwatch.records.history import AlarmEventList, AuditList, AuditRecord, ReadingList, ReportList
 from service.access.guard import Guard
 from service.access.problems import responses
 from service.api.views import (
@@ -76,10 +70,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     common: dict[str, Any] = {"tags": ["history"], "dependencies": [guard.read]}
 
     @app.get(
-        f"{PLACE}/alarms/events",
-        responses=responses(AlarmEventList, 404, 422),
-        response_model=AlarmEventList,
-        **common,
+        f"{PLACE}/alarms/events", responses=responses(AlarmEventList, 404, 422), response_model=AlarmEventList, **common
     )
     def alarm_events(
         site: SiteName,

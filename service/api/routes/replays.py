@@ -213,10 +213,7 @@ def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> N
     problems = (400, 404, 413, 415, 422)
 
     @router.post(
-        "",
-        status_code=201,
-        dependencies=guarded,
-        responses=responses(ReplayJob, *problems, 409, status_code=201),
+        "", status_code=201, dependencies=guarded, responses=responses(ReplayJob, *problems, 409, status_code=201)
     )
     def start_replay(
         request: Annotated[ReplayRequest, Body(openapi_examples=_shown("an hour of yesterday", ReplayRequest))],

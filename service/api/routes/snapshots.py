@@ -33,11 +33,7 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 
     @app.get(f"{PLACE}/correlations", responses=responses(CorrelationSnapshot, 404, 422), **common)
     def correlations(
-        site: SiteName,
-        machine: MachineName,
-        first: _First = _NONE,
-        second: _Second = _NONE,
-        units: _Units = "channel",
+        site: SiteName, machine: MachineName, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
     ) -> CorrelationSnapshot:
         """Correlation functions of the latest window, measured and as theory predicts them; a few pairs by default."""
         view = found_machine(service, site, machine)

@@ -92,12 +92,7 @@ def owed_after(state: AlarmState, *, latching: bool) -> AlarmState:
 
 
 def follow(
-    state: AlarmState,
-    happening: Happening,
-    *,
-    present: bool,
-    latching: bool,
-    owed: AlarmState = AlarmState.NORMAL,
+    state: AlarmState, happening: Happening, *, present: bool, latching: bool, owed: AlarmState = AlarmState.NORMAL
 ) -> AlarmState | None:
     """The state an alarm goes to.
 

@@ -82,9 +82,7 @@ class OfflineReplay:
         return self._differences
 
     def run(
-        self,
-        control: Control | None = None,
-        on_progress: Callable[[ReplayProgress], None] | None = None,
+        self, control: Control | None = None, on_progress: Callable[[ReplayProgress], None] | None = None
     ) -> OfflineSummary:
         """Replay, until the end or until `control` says stop.
 
