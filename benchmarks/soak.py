@@ -21,7 +21,9 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice, zip_longest
+from http import HTTPStatus
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -48,7 +50,7 @@ _PLACE = "demo/lab"
 _BLOCK_S = 0.5
 _START_NS = 1_767_225_600_000_000_000
 _AHEAD = 80
-"""Blocks that may be on their way; a publisher keeps 300."""
+"""Blocks that may be on their way; a publisher keeps 1200."""
 _PATIENCE_S = 30.0
 _FAULTS = {"k_by": (-0.35, -0.2, 0.4), "k_bz": (-0.35, 0.4), "c_by": (-0.5, 0.8), "c_bz": (-0.5, 0.8), "e": (0.5, 1.0)}
 _PAGE = 1000
@@ -192,7 +194,7 @@ class Plant:
         self.kills += 1
         self.start()
         while True:
-            health = httpx.get(f"{self.url}/api/v1/machines/{_PLACE}/health", trust_env=False).json()
+            health = _health(self.url)
             if health["quality"]["accepted_blocks"] or health["quality"]["refused_blocks"] or health["filled"]:
                 break
             time.sleep(0.05)
@@ -385,6 +387,16 @@ def _tell_memory(plant: Plant, hours: float) -> None:
         print(f"slope {slope:+.2f} MB/h of data")
 
 
+def _health(url: str) -> dict[str, Any]:
+    """Health over HTTP, asked again where too many have asked."""
+    while True:
+        answer = httpx.get(f"{url}/api/v1/machines/{_PLACE}/health", trust_env=False)
+        if answer.status_code != HTTPStatus.TOO_MANY_REQUESTS:
+            health: dict[str, Any] = answer.raise_for_status().json()
+            return health
+        time.sleep(0.5)
+
+
 def _windows(history: MachineStore) -> list[int]:
     """Ends of all windows that were evaluated live, in order."""
     ends: list[int] = []
@@ -399,7 +411,7 @@ def _last_window(plant: Plant, end_ns: int) -> None:
     """Wait until the monitor has evaluated the last window; what it has not, the comparison shows."""
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
-        health = httpx.get(f"{plant.url}/api/v1/machines/{_PLACE}/health", trust_env=False).json()
+        health = _health(plant.url)
         if (health["report"] or {"end_ns": 0})["end_ns"] >= end_ns:
             return
         time.sleep(0.1)

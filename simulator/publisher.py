@@ -31,7 +31,8 @@ __all__ = ["DEFAULT_CONNECT", "PublishError", "PublishSettings", "publish"]
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 
 _LOCAL = LinkSettings(connect=(DEFAULT_CONNECT,))
-_CACHE_BLOCKS = 300
+_CACHE_BLOCKS = 1200
+"""Two minutes in blocks of 0.1 s: a window, and the time that a monitor takes to come back."""
 _CACHE_TRUTH = 100
 _HEARTBEAT_S = 0.5
 _POLL_S = 0.02

@@ -101,7 +101,7 @@ class QueueSettings(BaseModel):
 
     model_config = _STRICT
 
-    blocks: int = Field(default=600, ge=1, le=1_000_000, description="most blocks that wait, per machine")
+    blocks: int = Field(default=1500, ge=1, le=1_000_000, description="most blocks that wait, per machine")
     mb: float = Field(default=64.0, gt=0, le=100_000, description="most megabytes that wait, per machine")
     when_full: Literal["drop", "wait"] = Field(default="drop", description="what happens to a block beyond that")
 

@@ -37,7 +37,8 @@ __all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap",
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0
-_CACHED_BLOCKS = 300
+_CACHED_BLOCKS = 1200
+"""Fewer than a queue takes by default: what comes at once after a restart must not overflow it."""
 _CACHED_EVENTS = 200
 _QUERY_TIMEOUT_S = 10.0
 _QUICK_CONNECT_S = 3.0

@@ -41,7 +41,7 @@ _WORDS = """
 - An alarm is published also while the history cannot be written. What operators do meanwhile is done, and waits in
   memory like everything else: a monitor that is killed before the history is back has lost it. `/readyz` says for
   how long that is so; look at it before you end a monitor.
-- Blocks that were sent while the monitor was away come out of the publisher's cache. `rotorsim` keeps 300;
+- Blocks that were sent while the monitor was away come out of the publisher's cache. `rotorsim` keeps 1200;
   publishers of your own should keep as many as they send in the longest time in which a monitor may be away
   ([wire format](wire.md)). On a busy computer a new block may overtake those of the cache, which are then not
   fetched: the gap is stated, and the data are missing.

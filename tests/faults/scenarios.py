@@ -98,7 +98,7 @@ ROWS = (
     Row(
         "The network link is cut",
         "the router between publisher and monitor is killed, and started again once the stream counts as lost",
-        "nothing, as long as the publisher's cache (300 blocks, here 60 s) holds what was not sent",
+        "nothing, as long as the publisher's cache (1200 blocks, here 240 s) holds what was not sent",
         "alarm `stream-lost`, state `no-data`",
         "data come, the alarm has cleared",
         faults.link_cut,
