@@ -20,8 +20,8 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import islice, zip_longest
 from http import HTTPStatus
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any
 
