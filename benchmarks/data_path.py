@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import hop_moments, plan_for
 from models.diagnosis.networks.amortised import NetworkDiagnostician

@@ -23,7 +23,7 @@ from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from service.history.retention import Retention

@@ -31,7 +31,7 @@ import zenoh
 
 import models
 from models.alarm_names import STREAM_LOST
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings

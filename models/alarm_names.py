@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from models.physics.parameters import PARAMETER_TEXT
+from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.sensor_faults import FaultKind
 
 __all__ = [

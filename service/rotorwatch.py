@@ -171,8 +171,7 @@ def router(
     [cyan]rotorwatch router --listen tcp/0.0.0.0:7447 --without-grants[/cyan]
     """
     with exit_codes():
-        from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
-        from models.signals.link import LinkSettings  # noqa: PLC0415
+        from models.signals.link import LinkSettings, load_link  # noqa: PLC0415  # keeps --help quick
         from service.stream.transport import route  # noqa: PLC0415
         from service.terminal.stopping import stop_request  # noqa: PLC0415
 
@@ -245,7 +244,7 @@ def _overridden(
         pairs = [text.partition("@") for text in machines]
         update["machines"] = tuple(MachineEntry(file=file, bundle=bundle or None) for file, _, bundle in pairs)
     if link is not None:
-        from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
+        from models.signals.link import load_link  # noqa: PLC0415  # keeps --help quick
 
         update["link"] = load_link(link)
     if listen or connect:
@@ -270,9 +269,9 @@ def _overridden(
 
 def _checked(file: Path) -> str:
     """Check one file and say what it describes."""
-    from models.commissioning.installed import install  # noqa: PLC0415  # keeps --help quick
+    from models.commissioning.commissioned import install  # noqa: PLC0415  # keeps --help quick
+    from models.errors import read_toml  # noqa: PLC0415
     from models.machine import load_machine_file  # noqa: PLC0415
-    from models.mistakes import read_toml  # noqa: PLC0415
     from service.history.store import Store  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415
 

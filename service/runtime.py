@@ -23,7 +23,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.machine import MachineFile
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage

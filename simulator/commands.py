@@ -1,11 +1,24 @@
-"""What ``rotorsim`` and ``rotortrain`` share: how an argument that is refused is told."""
+"""What ``rotorsim`` and ``rotortrain`` share: refused arguments, ``--version``, and progress bars on stderr."""
 
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from typer.core import TyperGroup
 
-__all__ = ["Commands"]
+__all__ = ["Commands", "VersionOption", "bars", "labelled_bars"]
 
 
 class Commands(TyperGroup):
@@ -16,7 +29,58 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            from models.mistakes import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
+            from models.errors import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
 
             error.message = argument_text(error) or error.message
             raise
+
+
+def _say_version(context: typer.Context, wanted: bool) -> None:
+    if wanted:
+        from rotorwatch import __version__  # noqa: PLC0415  # brings pydantic, which nothing else here waits for
+
+        typer.echo(f"{context.find_root().info_name} {__version__}")
+        raise typer.Exit
+
+
+VersionOption = Annotated[
+    bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Say the version, and nothing else.")
+]
+
+
+def bars(*, remaining: bool = False) -> Progress:
+    """Bars that are not started yet, with the time taken and, if wanted, the time that remains."""
+    columns: list[ProgressColumn] = [
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    ]
+    if remaining:
+        columns.append(TimeRemainingColumn())
+    return Progress(*columns, console=Console(stderr=True))
+
+
+@contextmanager
+def labelled_bars(*, remaining: bool = False) -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar for every label that progress is told of.
+
+    Parameters
+    ----------
+    remaining : bool
+        Also show the time that remains.
+
+    Yields
+    ------
+    callable
+        Takes what is being done, how much of it is done, and how much there is.
+    """
+    with bars(remaining=remaining) as shown:
+        tasks: dict[str, TaskID] = {}
+
+        def progress(label: str, done: int, total: int) -> None:
+            if label not in tasks:
+                tasks[label] = shown.add_task(label, total=total)
+            shown.update(tasks[label], completed=done)
+
+        yield progress

@@ -24,7 +24,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.machine import MachineFile
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
-from simulator.messages import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
+from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
 __all__ = ["DEFAULT_CONNECT", "PublishError", "PublishSettings", "publish"]
 

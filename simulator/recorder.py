@@ -7,7 +7,7 @@ from threading import Event
 
 from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter
-from simulator.messages import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
+from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
 __all__ = ["record"]
 

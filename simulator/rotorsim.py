@@ -16,15 +16,13 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
 from models.errors import MachineFileError, RotorwatchError
-from models.link_file import load_link
 from models.machine import Machine, load_machine
-from models.signals.link import LinkSettings
-from simulator.commands import Commands
+from models.signals.link import LinkSettings, load_link
+from simulator.commands import Commands, VersionOption
 from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_scenarios
-from simulator.version import VersionOption
 
 if TYPE_CHECKING:  # the stream imports scipy, which --help must not wait for
-    from simulator.messages import BlockStream, RunSummary
+    from simulator.stream import BlockStream, RunSummary
 
 __all__ = ["app"]
 

@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from models.errors import RotorwatchError
-from simulator.commands import Commands
-from simulator.version import VersionOption
+from simulator.commands import Commands, VersionOption
 
 __all__ = ["app"]
 

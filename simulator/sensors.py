@@ -9,10 +9,10 @@ import numpy.typing as npt
 import scipy.signal
 
 from models.machine import Machine
-from models.physics.matrices import STATE_INDEX
+from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, state_name
-from simulator.integrator import PlantSamples
+from simulator.plant import PlantSamples
 from simulator.scenario import Sensors, SensorSettings
 from simulator.timeline import SWAPPED_WITH, SensorFaults
 

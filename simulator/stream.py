@@ -1,4 +1,4 @@
-"""A scenario as a stream of sample blocks and truth records.
+"""A scenario as a stream of sample blocks and truth records, and the messages they are sent or recorded as.
 
 The same scenario and seed give bit-identical samples whatever the length of the blocks: samples are made in pieces on a
 grid of their own and only then cut into blocks. The pieces end at changes of the plant but not at those of a sensor,
@@ -7,20 +7,121 @@ so that a sensor's fault or setting never changes how the machine moves.
 
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
 
-from models.machine import Machine
+from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
-from simulator.integrator import Plant, theoretical_rms
-from simulator.nonlinear_plant import NONLINEAR, NonlinearPlant
-from simulator.scenario import Scenario
+from models.signals.wire import encode_arrow, encode_block
+from simulator.plant import NONLINEAR, NonlinearPlant, Plant, theoretical_rms
+from simulator.scenario import NamedSource, Scenario
 from simulator.sensors import SensorBank
 from simulator.timeline import Condition, compile_timeline
-from simulator.truth import TruthRecord
 
-__all__ = ["DEFAULT_START_NS", "blocks"]
+__all__ = [
+    "DEFAULT_START_NS",
+    "JSON_ENCODING",
+    "BlockEncoding",
+    "BlockStream",
+    "RunSummary",
+    "TruthRecord",
+    "block_message",
+    "blocks",
+    "descriptor_payload",
+]
+
+
+class TruthRecord(BaseModel):
+    """The true condition from one time on; sent at the start, at every change, and every second during a ramp."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    time_ns: int = Field(description="acquisition time of the first sample this is true for, ns since 1970 UTC")
+    data_s: float = Field(description="the same, seconds from the first sample")
+    run: int
+    machine: str
+    scenario: str
+    seed: int
+    relative_changes: dict[str, float] = Field(description="every parameter's change from the original machine")
+    speed_rpm: float
+    sources: tuple[NamedSource, ...]
+    excitation_level: float = Field(default=1.0, description="factor on the white noise that drives all sources")
+    anomalies: dict[str, float] = Field(default={}, description="size of a crack, a rub, added mass; absent if none")
+    sensor_faults: dict[str, dict[str, float | None]] = Field(
+        description="by channel the active faults and their values, null where the kind has none"
+    )
+    ramping: tuple[str, ...] = Field(
+        description="what is still on its way: parameters, sources, sensors, anomalies, 'speed', …"
+    )
+
+    @property
+    def text(self) -> str:
+        """One short line for a progress display.
+
+        Examples
+        --------
+        >>> TruthRecord(time_ns=0, data_s=0, run=1, machine="lab", scenario="s", seed=1, speed_rpm=1320, sources=(),
+        ...             relative_changes={"k_by": -0.2}, sensor_faults={}, ramping=()).text
+        'k_by -20 %'
+        """
+        parts = [f"{name} {change:+.3g} %" for name, change in self._percent() if change]
+        parts += [f"{kind.replace('_', ' ')} {100 * size:.3g} %" for kind, size in self.anomalies.items()]
+        parts += [f"{channel} {'+'.join(faults)}" for channel, faults in self.sensor_faults.items()]
+        return ", ".join(parts) or "no fault"
+
+    def _percent(self) -> list[tuple[str, float]]:
+        return [(name, round(100 * change, 6)) for name, change in self.relative_changes.items()]
+
+
+JSON_ENCODING = "application/json"
+
+BlockEncoding = Literal["raw", "arrow"]
+
+BlockStream = Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]
+"""What `simulator.stream.blocks` returns."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """What has been sent or recorded so far.
+
+    Attributes
+    ----------
+    data_s : float
+        Data seconds in these blocks.
+    elapsed_s : float
+        Seconds since the first block.
+    truth : TruthRecord or None
+        The latest one.
+    heard : bool or None
+        Whether somebody subscribes to the stream; None as long as it is not known, and for a recording.
+    """
+
+    blocks: int = 0
+    data_s: float = 0.0
+    elapsed_s: float = 0.0
+    truth: TruthRecord | None = None
+    heard: bool | None = None
+
+    @property
+    def pace(self) -> float:
+        """Data seconds per second."""
+        return self.data_s / self.elapsed_s if self.elapsed_s > 0 else 0.0
+
+
+def block_message(block: SampleBlock, schema_hash: str, encoding: BlockEncoding) -> tuple[bytes, bytes, str]:
+    """Payload, attachment and encoding string of a block."""
+    return encode_block(block, schema_hash) if encoding == "raw" else encode_arrow(block, schema_hash)
+
+
+def descriptor_payload(machine: MachineFile) -> bytes:
+    """Encode the channel descriptor as JSON."""
+    return machine.descriptor.model_dump_json().encode()
+
 
 DEFAULT_START_NS = 1_767_225_600_000_000_000
 """2026-01-01T00:00:00Z: a fixed start, so that the same scenario makes the same bytes."""

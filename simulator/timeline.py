@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import get_args
 
 from models.machine import Machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from simulator.scenario import ANOMALIES, SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Rub, Scenario, SensorFault
 
 __all__ = ["RAMP_STEP_S", "SWAPPED_WITH", "Condition", "SensorFaults", "Timeline", "compile_timeline"]

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.finite_elements.assembly import Equations
-from models.physics.discretise import advance, discretise
 from models.physics.excitation import ColouringFilter, Source, colouring_filter
-from models.physics.lyapunov import stationary_covariance
+from models.physics.response import advance, discretise, stationary_covariance
 from models.signals.block import FloatArray
 
 __all__ = ["Force", "covariance_under", "force_samples", "forced"]

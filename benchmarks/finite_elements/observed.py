@@ -19,7 +19,7 @@ from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage, RecordingWriter
-from simulator.messages import JSON_ENCODING, block_message
+from simulator.stream import JSON_ENCODING, block_message
 
 __all__ = [
     "MOTION",

@@ -22,7 +22,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
-from models.diagnosis.networks.relation_training import train_network
+from models.diagnosis.networks.training import train_network
 from models.diagnosis.readings import Diagnostician
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError

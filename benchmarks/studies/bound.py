@@ -14,14 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.likelihood.bins import BinGroups
-from models.diagnosis.likelihood.motions import Motions
+from models.diagnosis.likelihood.motions import BinGroups, Motions
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SHAPES, STRUCTURAL, SpectralModel
 from models.diagnosis.likelihood.unbalance import estimate_unbalance
 from models.machine import Machine
-from models.physics.lyapunov import synchronous_response
-from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import changed
+from models.physics.response import synchronous_response
+from models.physics.rotor import STATE_INDEX, changed
 from models.signals.block import FloatArray
 
 __all__ = ["TrueCondition", "cramer_rao"]

@@ -18,16 +18,15 @@ from benchmarks.studies.evaluate import true_condition
 from benchmarks.studies.opinions import LAYOUTS, SEVERAL
 from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
-from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.likelihood.fit import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
-from models.diagnosis.verdict.determined import determined
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
-from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
+from models.diagnosis.verdict.stretch import Stretch, determined, stretch_of, to_scale
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition

@@ -28,14 +28,12 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import plan_for
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.readings import Z95
-from models.diagnosis.verdict.calibration import window_thresholds
-from models.diagnosis.verdict.detectable import detectable_changes
+from models.diagnosis.verdict.calibration import detectable_changes, window_thresholds
 from models.diagnosis.verdict.stretch import stretch_of, to_scale
 from models.machine import Machine, load_machine
 from models.physics.excitation import source_spectrum
-from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import PARAMETERS
-from simulator.integrator import theoretical_rms
+from models.physics.rotor import PARAMETERS, STATE_INDEX
+from simulator.plant import theoretical_rms
 from simulator.scenario import Scenario
 from simulator.timeline import Condition
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, draw_condition, simulate_scenario

@@ -15,7 +15,7 @@ from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Layout
 
 RATES = (0.01, 0.001)

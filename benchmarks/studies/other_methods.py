@@ -18,7 +18,7 @@ import scipy.stats
 from models.diagnosis.moments import plan_for
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.matrices import STATE_INDEX, system_A
+from models.physics.rotor import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 
 __all__ = ["FeatureVector", "Hotelling", "SubspaceModes", "reference_modes"]

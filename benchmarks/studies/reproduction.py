@@ -23,8 +23,8 @@ from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.lyapunov import stochastic_covariance, synchronous_response
-from models.physics.matrices import STATE_INDEX
+from models.physics.response import stochastic_covariance, synchronous_response
+from models.physics.rotor import STATE_INDEX
 from simulator.scenario import Event, NamedSource, Scenario, Sensors
 from simulator.training.draws import Purpose, simulate_scenario, with_tilt
 

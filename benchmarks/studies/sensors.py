@@ -10,14 +10,14 @@ from benchmarks.studies.opinions import opinion
 from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, commissioned, subject_named
-from models.commissioning.knowledge import KnowledgeLevel
+from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
 from models.errors import MachineFileError
 from models.machine import Machine
-from models.physics.matrices import STATE_INDEX
+from models.physics.rotor import STATE_INDEX
 from models.signals.channels import Channel, Quantity, state_name
-from simulator.integrator import theoretical_rms
+from simulator.plant import theoretical_rms
 from simulator.scenario import Event, Scenario
 from simulator.timeline import compile_timeline
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_scenario

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value
 from models.errors import MachineFileError, RecordingError
 from models.machine import Machine, load_machine
-from simulator.training.progress import labelled_bars
+from simulator.commands import labelled_bars
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")

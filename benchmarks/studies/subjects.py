@@ -16,13 +16,13 @@ from benchmarks.finite_elements.machines import ROTORS, rotor_named
 from benchmarks.finite_elements.observed import WindowSizes, machine_of, plan, sampled, windows_of
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
+from models.commissioning.commissioned import KnowledgeLevel
 from models.commissioning.identified import identify
-from models.commissioning.knowledge import KnowledgeLevel
 from models.commissioning.levels import learned_baseline
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis, Diagnostician
-from models.diagnosis.verdict.determined import determined, with_shared_error
+from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import ConditionRange, Machine, MachineFile, load_machine

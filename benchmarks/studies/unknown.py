@@ -13,7 +13,7 @@ from benchmarks.studies.opinions import LAYOUTS, changed_in, judged, opinion, re
 from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SUBJECTS, commissioned, subject_named
-from models.commissioning.knowledge import KnowledgeLevel
+from models.commissioning.commissioned import KnowledgeLevel
 from models.errors import MachineFileError
 from simulator.training.draws import Layout
 

@@ -7,14 +7,13 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.commissioning.healthy import HealthyRecording
-from models.commissioning.lines import foreign_lines
-from models.diagnosis.baseline.excitation import one_source
+from models.commissioning.healthy import HealthyRecording, foreign_lines
+from models.diagnosis.baseline.relation import one_source
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
-from models.physics.parameters import PARAMETER_TEXT
+from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.windows import SensorFault
 
 __all__ = [

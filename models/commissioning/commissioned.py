@@ -1,4 +1,4 @@
-"""The commissioned bundle: what was learned on a healthy machine, in one JSON file. No code in it, no pickle.
+"""What a machine is monitored with: what its file tells, and the bundle that was learned on it when healthy, as JSON.
 
 ::
 
@@ -14,35 +14,173 @@ A commissioning is frozen: another one is another version, which names what it r
 
 import hashlib
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from models.commissioning.conditions import OperatingRange
-from models.commissioning.knowledge import KnowledgeLevel
 from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.fallback.shape import HealthyShape
+from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.sensors.reference import SensorReference
-from models.errors import BundleError
+from models.diagnosis.shape import HealthyShape
+from models.diagnosis.window import WindowStatistics
+from models.errors import BundleError, mistakes
 from models.machine import Machine, MachineFile
-from models.mistakes import mistakes
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
 __all__ = [
     "FILE",
+    "LEVEL_MARGIN",
+    "SPEED_MARGIN",
     "Commissioned",
     "ConditionBaseline",
     "IdentifiedRecord",
+    "Installed",
+    "Knowledge",
+    "KnowledgeLevel",
+    "OperatingRange",
     "RecordingEntry",
     "described",
+    "install",
+    "knowledge_of",
     "load_commissioned",
 ]
 
-FILE = "commissioned.json"
 _STRICT = ConfigDict(extra="forbid", frozen=True)
+
+_GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
+"""What cannot be identified beside stiffness and damping: masses and shaft."""
+
+
+class KnowledgeLevel(StrEnum):
+    """How much is known."""
+
+    FULL = "full"
+    PARTIAL = "partial"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True)
+class Knowledge:
+    """Level of knowledge of a machine.
+
+    Attributes
+    ----------
+    text : str
+        Why, in a sentence.
+    """
+
+    level: KnowledgeLevel
+    text: str
+
+
+def knowledge_of(machine: MachineFile) -> Knowledge:
+    """Level of knowledge that a machine file gives.
+
+    Examples
+    --------
+    >>> from models.machine import load_machine_file
+    >>> knowledge_of(load_machine_file("lab")).level.value
+    'full'
+    """
+    rotor = machine.rotor
+    if isinstance(machine, Machine):
+        return Knowledge(KnowledgeLevel.FULL, "the machine file gives all parameters of the rotor")
+    if rotor is None:
+        return Knowledge(
+            KnowledgeLevel.NONE, "the machine file has no [rotor]: everything is learned from the recordings"
+        )
+    lacking = [name for name in _GEOMETRY if name in rotor.unknown]
+    if lacking:
+        return Knowledge(
+            KnowledgeLevel.NONE,
+            f"[rotor] lacks {', '.join(lacking)}: without masses and shaft nothing of it can be used, everything is "
+            "learned from the recordings",
+        )
+    tables = [f"[{name}]" for name in ("operation", "condition") if getattr(machine, name) is None]
+    if rotor.unknown:
+        return Knowledge(
+            KnowledgeLevel.PARTIAL,
+            f"[rotor] gives masses and shaft; {', '.join(rotor.unknown)} are identified from the recordings",
+        )
+    return Knowledge(
+        KnowledgeLevel.PARTIAL,
+        f"[rotor] is complete, but without {' and '.join(tables)} nothing can be simulated: stiffness, damping and "
+        "unbalance are identified from the recordings",
+    )
+
+
+_RPM = 30 / np.pi
+SPEED_MARGIN = 0.05
+"""The relations hold no speed; a bearing's film and the unbalance response do."""
+LEVEL_MARGIN = 10.0
+"""Random vibration this many times below or above what was seen is another regime: a stopped drive, a mounting come
+loose, a bearing lifted through its clearance."""
+_Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class OperatingRange(BaseModel):
+    """Speeds and levels of random vibration in the healthy windows."""
+
+    model_config = _STRICT
+
+    speed_rpm: tuple[_Positive, _Positive] | None = Field(
+        default=None, description="slowest and fastest mean speed of a window; none without a speed"
+    )
+    rms: dict[str, tuple[_Positive, _Positive]] = Field(
+        description="measured state to the smallest and largest rms of its random part in a window, SI"
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        for name, (low, high) in (("speed_rpm", self.speed_rpm or (0.0, 0.0)), *self.rms.items()):
+            if low > high:
+                raise ValueError(f"{name} is ({low}, {high}), expected from ≤ to")
+        return self
+
+    @classmethod
+    def of(cls, windows: Sequence[WindowStatistics]) -> "OperatingRange":
+        """Range of healthy windows."""
+        speeds = [window.speed_rad_s * _RPM for window in windows if np.isfinite(window.speed_rad_s)]
+        rms = np.array([_rms(window) for window in windows])
+        return cls(
+            speed_rpm=(min(speeds), max(speeds)) if speeds else None,
+            rms={
+                name: (float(low), float(high))
+                for name, low, high in zip(windows[0].states, rms.min(axis=0), rms.max(axis=0), strict=True)
+            },
+        )
+
+    def outside(self, window: WindowStatistics) -> str:
+        """Why a window lies outside the commissioned conditions; empty if it does not."""
+        if self.speed_rpm is not None and np.isfinite(window.speed_rad_s):
+            low, high = self.speed_rpm
+            rpm = window.speed_rad_s * _RPM
+            if not low * (1 - SPEED_MARGIN) <= rpm <= high * (1 + SPEED_MARGIN):
+                seen = f"{low:.0f} rpm" if f"{low:.0f}" == f"{high:.0f}" else f"{low:.0f} to {high:.0f} rpm"
+                return f"speed is {rpm:.0f} rpm, commissioned is {seen} ± {SPEED_MARGIN:.0%}"
+        for name, value in zip(window.states, _rms(window).tolist(), strict=True):
+            if name not in self.rms:
+                continue
+            low, high = self.rms[name]
+            if not low / LEVEL_MARGIN <= value <= high * LEVEL_MARGIN:
+                return (
+                    f"random vibration of {name} is {value:.3g} rms (SI), commissioned is {low:.3g} to {high:.3g}, and "
+                    f"up to {LEVEL_MARGIN:g} times less or more"
+                )
+        return ""
+
+
+def _rms(window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    return np.sqrt(np.maximum(np.diag(window.correlation[0]), 0.0))
+
+
+FILE = "commissioned.json"
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition"}
 
@@ -177,3 +315,71 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
             "commissioned: commission the machine again"
         )
     return found
+
+
+_MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Installed:
+    """One machine and all that its monitor knows of it.
+
+    Attributes
+    ----------
+    bundle : Bundle or None
+        Trained networks.
+    commissioned : Commissioned or None
+        What was learned on the healthy machine.
+    """
+
+    machine: MachineFile
+    bundle: Bundle | None = None
+    commissioned: Commissioned | None = None
+
+    @property
+    def known(self) -> Machine | None:
+        """The machine with all its parameters, given or identified; None where only a baseline is known."""
+        if self.commissioned is not None:
+            return self.commissioned.completed(self.machine)
+        return self.machine if isinstance(self.machine, Machine) else None
+
+    @property
+    def identity(self) -> str | None:
+        """Changes with anything that was trained or commissioned; None where there is neither."""
+        parts = [part.identity for part in (self.bundle, self.commissioned) if part is not None]
+        if len(parts) < 2:
+            return parts[0] if parts else None
+        return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:12]
+
+
+def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
+    """Load what a machine is monitored with.
+
+    Parameters
+    ----------
+    bundle : str or Path, optional
+        Shipped bundle by name, or directory of a trained or commissioned one.
+
+    Raises
+    ------
+    BundleError
+        If it is damaged or of another machine, or if the machine's parameters are not known and it was not
+        commissioned.
+    """
+    place = f"{machine.site}/{machine.name}"
+    directory = None if bundle is None else Path(bundle)
+    if directory is not None and (directory / FILE).is_file():
+        commissioned = load_commissioned(directory, machine)
+        known = commissioned.completed(machine)
+        networks = load_bundle(directory, known) if known is not None and (directory / _MANIFEST).is_file() else None
+        return Installed(machine, networks, commissioned)
+    if not isinstance(machine, Machine):
+        raise BundleError(
+            f"{place}: its machine file does not give all parameters of the rotor, so it must be commissioned from "
+            f"healthy recordings first (rotortrain commission); {_found(directory)}"
+        )
+    return Installed(machine, None if bundle is None else load_bundle(bundle, machine))
+
+
+def _found(directory: Path | None) -> str:
+    return "no bundle is named for it" if directory is None else f"{directory} is not a commissioned bundle"

@@ -17,8 +17,7 @@ from models.diagnosis.verdict.stretch import added, stretch_of
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, MachineFileError
 from models.machine import ConditionRange, Machine, MachineFile, Operation
-from models.physics.matrices import M_matrix, Q_matrix
-from models.physics.parameters import PARAMETERS, RotorParameters, changed
+from models.physics.rotor import PARAMETERS, M_matrix, Q_matrix, RotorParameters, changed
 from models.signals.block import FloatArray
 
 __all__ = ["Identified", "identify"]

@@ -17,22 +17,25 @@ from models.commissioning.checks import (
     check_recordings,
     check_sources,
 )
-from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord
-from models.commissioning.conditions import OperatingRange
+from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord, KnowledgeLevel, OperatingRange
 from models.commissioning.healthy import HealthyRecording
 from models.commissioning.identified import identify
-from models.commissioning.knowledge import KnowledgeLevel
-from models.diagnosis.baseline.determination import disagreements, undetermined
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.kernels import passband_hz
-from models.diagnosis.baseline.kinematics import formation_of
-from models.diagnosis.baseline.learned import Baseline, learn_baseline, learned_rows, unsuitable
-from models.diagnosis.baseline.rows import ROWS, evaluable_rows
+from models.diagnosis.baseline.lag_moments import passband_hz
+from models.diagnosis.baseline.learned import (
+    Baseline,
+    disagreements,
+    learn_baseline,
+    learned_rows,
+    undetermined,
+    unsuitable,
+)
+from models.diagnosis.baseline.rows import ROWS, evaluable_rows, formation_of
 from models.diagnosis.baseline.stored import BaselineRecord
-from models.diagnosis.fallback.shape import HealthyShape, learn_shape
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
-from models.diagnosis.verdict.determined import determined, with_shared_error
+from models.diagnosis.shape import HealthyShape, learn_shape
+from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics, window_statistics
 from models.errors import EstimationError
 from models.machine import Machine, MachineFile

@@ -1,21 +1,142 @@
 """What a diagnostician says about a window: readings of parameters and of equations, or why there are none."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from models.diagnosis.unbalance_vector import UnbalanceVector
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from models.physics.parameters import PARAMETER_TEXT, QUANTITY
-from models.physics.possible import impossible
+from models.physics.rotor import PARAMETER_TEXT, QUANTITY, impossible
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation, Parameter
 from rotorwatch.records.windows import UnbalanceVector as VectorRecord
 
-__all__ = ["Z95", "Diagnosis", "Diagnostician", "interval_95", "no_reading", "parameter_reading", "possible_reading"]
+__all__ = [
+    "Z95",
+    "Diagnosis",
+    "Diagnostician",
+    "UnbalanceVector",
+    "beyond",
+    "interval_95",
+    "no_reading",
+    "parameter_reading",
+    "possible_reading",
+]
+
+_DIGITS, _MOST_DIGITS = 3, 15
+
+
+def beyond(value: float, limit: float) -> tuple[str, str]:
+    """Print a value and the limit it is beyond with so many digits that it is beyond the limit as printed, too.
+
+    Examples
+    --------
+    >>> beyond(7.4449, 5.0)
+    ('7.44', '5')
+    >>> beyond(20.0004, 20.0)
+    ('20.0004', '20')
+    """
+    for digits in range(_DIGITS, _MOST_DIGITS):
+        text = f"{value:.{digits}g}"
+        if (float(text) > limit) == (value > limit) and float(text) != limit:
+            break
+    return text, f"{limit:g}"
+
+
+_SEEN = 3.0
+"""Standard errors from which a vector has a direction."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnbalanceVector:
+    """The unbalance over the nominal one, a complex number ρ: 1 is no change, j the same turned by 90°.
+
+    Angles count from the nominal heavy spot in the direction of rotation.
+
+    Attributes
+    ----------
+    real, imaginary : float
+        Of ρ.
+    variance_real, covariance, variance_imaginary : float
+        Of these two.
+    foreign : str
+        Why what turns with the shaft is not what an unbalance makes, so that none of this should be believed; empty if
+        it is.
+    """
+
+    real: float
+    imaginary: float
+    variance_real: float
+    covariance: float
+    variance_imaginary: float
+    foreign: str = ""
+
+    def widened(self, variance: float) -> "UnbalanceVector":
+        """Return the same with an error added to both parts."""
+        return replace(
+            self, variance_real=self.variance_real + variance, variance_imaginary=self.variance_imaginary + variance
+        )
+
+    @property
+    def magnitude_change(self) -> float:
+        """|ρ| - 1: relative change of the unbalance's size, never below -1."""
+        return math.hypot(self.real, self.imaginary) - 1
+
+    @property
+    def magnitude_error(self) -> float:
+        """Standard error of `magnitude_change`."""
+        return self._error(self.real, self.imaginary)
+
+    @property
+    def turned_deg(self) -> float | None:
+        """Angle of the heavy spot from where it was, -180 to 180; None where so little is left that it has none."""
+        return self._angle(self.real, self.imaginary)
+
+    @property
+    def turned_error_deg(self) -> float | None:
+        """Standard error of `turned_deg`."""
+        if self.turned_deg is None:
+            return None
+        return math.degrees(self._error(-self.imaginary, self.real) / math.hypot(self.real, self.imaginary))
+
+    @property
+    def change(self) -> float:
+        """|ρ - 1|: size of the vector by which the unbalance changed, over the nominal unbalance."""
+        return math.hypot(self.real - 1, self.imaginary)
+
+    @property
+    def change_error(self) -> float:
+        """Standard error of `change`, along the vector."""
+        return self._error(self.real - 1, self.imaginary)
+
+    @property
+    def change_angle_deg(self) -> float | None:
+        """Direction of that vector, from the nominal heavy spot; None where the change is within its errors."""
+        return self._angle(self.real - 1, self.imaginary)
+
+    @property
+    def sentence(self) -> str:
+        """The change in words."""
+        if self.change_angle_deg is None:
+            return "no change of its vector"
+        where = f"{self.change_angle_deg:.0f}° from the heavy spot".replace("-", "−")
+        size = f"size {100 * self.magnitude_change:+.0f} %".replace("-", "−")
+        turned = "" if self.turned_deg is None else f", turned by {self.turned_deg:.0f}°".replace("-", "−")
+        return f"a vector of {100 * self.change:.0f} % of the nominal unbalance at {where} ({size}{turned})"
+
+    def _error(self, x: float, y: float) -> float:
+        """Standard error along a direction."""
+        length = math.hypot(x, y)
+        x, y = (x / length, y / length) if length > 0 else (1.0, 0.0)
+        along = x**2 * self.variance_real + 2 * x * y * self.covariance + y**2 * self.variance_imaginary
+        return math.sqrt(max(along, 0.0))
+
+    def _angle(self, x: float, y: float) -> float | None:
+        seen = math.hypot(x, y) > _SEEN * max(self._error(x, y), self._error(-y, x))
+        return math.degrees(math.atan2(y, x)) if seen else None
+
 
 Z95 = 1.959964
 """Standard errors on either side of a 95 % interval."""
@@ -35,7 +156,7 @@ def parameter_reading(
     Parameters
     ----------
     name : str
-        One of ``models.physics.parameters.PARAMETERS``.
+        One of ``models.physics.rotor.PARAMETERS``.
     by : str
         Who says so: ``likelihood``, ``network`` (amortised), ``relation`` or ``baseline``.
     change, standard_error : float

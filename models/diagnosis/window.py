@@ -13,16 +13,19 @@ import numpy as np
 import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.diagnosis.moments import ComplexArray, HopMoments, Plan, hop_moments
-from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
-from models.diagnosis.synchronous import (
+from models.diagnosis.moments import (
+    ComplexArray,
+    HopMoments,
+    Plan,
     Rotation,
     SpeedSource,
     hop_coefficients,
+    hop_moments,
     regression,
     relative_vectors,
     rotation_of,
 )
+from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
 from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
 from models.errors import CheckpointError
 from models.signals.block import FloatArray
@@ -79,7 +82,7 @@ class WindowStatistics:
     waveforms : tuple of Waveform
         What the samples of each hop look like: of each of `states` and, last, of the shaft angle if there is one.
     pair_powers : tuple of ndarray, each shape (n_pairs, n_bands, 3)
-        Powers of the motions that are measured twice, of each hop (`models.diagnosis.pairs`).
+        Powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`).
     """
 
     states: tuple[str, ...]

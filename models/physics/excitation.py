@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from models.physics.matrices import M_matrix, system_A
-from models.physics.parameters import RotorParameters
+from models.physics.rotor import M_matrix, RotorParameters, system_A
 from models.signals.block import FloatArray
 
 __all__ = [

@@ -1,11 +1,28 @@
-"""Names of the Zenoh keys of one machine; ``docs/topics.md`` lists them with example payloads."""
+"""Names of the Zenoh keys of one machine, and who may do what with them: grants, and the access control they stand for.
+
+``docs/topics.md`` lists the keys with example payloads. Zenoh judges every message at the program that has the rules,
+by its kind, its direction and its key. *Ingress* is what comes from the partner, *egress* what goes to it::
+
+    partner          publisher              monitor                      viewer
+    ingress   put, reply, token:     put, reply, token: report,   subscribe, query,
+              stream, descriptor,    health, alarms;              liveliness: report,
+              truth                  subscribe, query: all        health, alarms
+    egress    who listens, who asks  put, reply, token: all       put, reply, token of these
+
+A late joiner fetches what it missed below ``<key>/@adv/``: whoever may publish or read a key may do so there too. In
+keys, ``**`` does not stand for a part that begins with ``@``, so both are written out.
+"""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from models.errors import MachineFileError
 
-__all__ = ["PREFIX", "MachineKeys"]
+__all__ = ["PREFIX", "Grant", "MachineKeys", "access_control"]
 
 PREFIX = "rotorwatch"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
@@ -85,3 +102,154 @@ class MachineKeys:
     def replay_alive(self) -> str:
         """Liveliness token of a replay on the machine's own keys, which monitors state and do not evaluate."""
         return f"{self.root}/alive/replay"
+
+
+_Flow = Literal["ingress", "egress"]
+_USER = re.compile(r"[^\s:]+")
+_PLACE = re.compile(r"(\*|[A-Za-z0-9][A-Za-z0-9_-]{0,63})/(\*|[A-Za-z0-9][A-Za-z0-9_-]{0,63})")
+
+_MODEL = MachineKeys("s", "m")
+
+
+def _topics(*keys: str) -> tuple[str, ...]:
+    return tuple(key.removeprefix(_MODEL.root) for key in keys)
+
+
+_SENT = _topics(_MODEL.stream, _MODEL.descriptor, _MODEL.truth)
+_FOUND = _topics(_MODEL.report, _MODEL.health, _MODEL.alarm_event, _MODEL.alarm_state)
+_HEALTH = _topics(_MODEL.health)
+_PUBLISHER_ALIVE = _topics(_MODEL.publisher_alive)
+_MONITOR_ALIVE = _topics(_MODEL.monitor_alive)
+_ALIVE = ("/alive/**",)
+_ALL = ("/**", "/**/@adv/**")
+_EVERYWHERE = (f"{PREFIX}/**", f"{PREFIX}/**/@adv/**")
+
+_LISTENED = ("declare_subscriber", "query")
+_LIVELINESS = ("declare_liveliness_subscriber", "liveliness_query")
+_INTERESTS = (*_LISTENED, "declare_queryable", *_LIVELINESS)
+"""What tells a partner who listens and who asks. Nothing is read or written by it, and without it nothing is sent."""
+
+
+def _name(text: str) -> str:
+    if not _USER.fullmatch(text):
+        raise ValueError("expected a user name or the common name of a certificate, without spaces and colons")
+    return text
+
+
+def _place(text: str) -> str:
+    if not _PLACE.fullmatch(text):
+        raise ValueError('expected "site/machine", where * alone stands for any, such as "demo/lab" or "demo/*"')
+    return text
+
+
+_Places = tuple[Annotated[str, AfterValidator(_place)], ...]
+
+
+class Grant(BaseModel):
+    """What some users, or owners of certificates, may do; everything else is refused to them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    who: tuple[Annotated[str, AfterValidator(_name)], ...] = Field(
+        min_length=1, description="user names, where there are passwords; else common names of certificates"
+    )
+    publishes: _Places = Field(default=(), description="machines whose stream, descriptor and truth they may send")
+    views: _Places = Field(default=(), description="machines whose reports, health and alarms they may read")
+    monitors: _Places = Field(
+        default=(), description="machines of which they may read everything and say how they are: for monitors"
+    )
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if not (self.publishes or self.views or self.monitors):
+            raise ValueError("the grant allows nothing: expected publishes, views or monitors")
+        return self
+
+
+def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert_common_names"]) -> dict[str, object]:
+    """Zenoh's ``access_control`` for these grants: what none of them allows is dropped.
+
+    Parameters
+    ----------
+    known_by : {"usernames", "cert_common_names"}
+        What the names in `Grant.who` are.
+    """
+    rules: list[dict[str, object]] = []
+    allowed: dict[str, list[str]] = {}
+    for grant in grants:
+        begin = len(rules)
+        for flow, messages, keys in _rules(grant):
+            rules.append(
+                {
+                    "id": f"rule {len(rules)}",
+                    "permission": "allow",
+                    "flows": [flow],
+                    "messages": list(messages),
+                    "key_exprs": list(keys),
+                }
+            )
+        for name in grant.who:
+            allowed.setdefault(name, []).extend(f"rule {number}" for number in range(begin, len(rules)))
+    # One subject for each name: of several that fit a partner, Zenoh would take one.
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [{"id": name, known_by: [name]} for name in allowed],
+        "policies": [{"subjects": [name], "rules": list(dict.fromkeys(ids))} for name, ids in allowed.items()],
+    }
+
+
+def _rules(grant: Grant) -> list[tuple[_Flow, tuple[str, ...], list[str]]]:
+    publishes, views, monitors = _roots(grant.publishes), _roots(grant.views), _roots(grant.monitors)
+    rules: list[tuple[_Flow, tuple[str, ...], list[str]]] = []
+    if publishes:
+        rules += [
+            ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(publishes, _SENT)),
+            ("ingress", ("liveliness_token",), _at(publishes, _PUBLISHER_ALIVE) + _recovery(publishes, _SENT, "pub")),
+            # An answer to this says that a monitor has received what was sent before it.
+            ("ingress", ("query",), _at(publishes, _HEALTH)),
+            ("egress", ("reply",), _at(publishes, _HEALTH)),
+        ]
+    if views:
+        rules += [
+            ("ingress", _LISTENED, _with_recovery(views, _FOUND)),
+            ("egress", ("put", "reply", "declare_queryable"), _with_recovery(views, _FOUND)),
+            ("ingress", _LIVELINESS, _at(views, _ALIVE) + _recovery(views, _FOUND)),
+            ("egress", ("liveliness_token",), _at(views, _ALIVE) + _recovery(views, _FOUND)),
+            ("ingress", ("liveliness_token",), _recovery(views, _FOUND, "sub")),
+        ]
+    if monitors:
+        rules += [
+            ("ingress", (*_LISTENED, *_LIVELINESS), _at(monitors, _ALL)),
+            ("egress", ("put", "reply", "liveliness_token"), _at(monitors, _ALL)),
+            ("ingress", ("put", "reply", "declare_queryable"), _with_recovery(monitors, _FOUND)),
+            (
+                "ingress",
+                ("liveliness_token",),
+                _at(monitors, _MONITOR_ALIVE)
+                + _recovery(monitors, _FOUND, "pub")
+                + _recovery(monitors, (*_SENT, *_FOUND), "sub"),
+            ),
+        ]
+    if publishes or monitors:
+        rules.append(("egress", _INTERESTS, list(_EVERYWHERE)))
+    return rules
+
+
+def _roots(places: Sequence[str]) -> list[str]:
+    return [f"{PREFIX}/{place}" for place in places]
+
+
+def _at(roots: Sequence[str], topics: Sequence[str]) -> list[str]:
+    return [f"{root}{topic}" for root in roots for topic in topics]
+
+
+def _recovery(roots: Sequence[str], topics: Sequence[str], side: Literal["", "pub", "sub"] = "") -> list[str]:
+    """Keys of the caches and heartbeats beside the topics, or the tokens of one side."""
+    below = f"@adv/{side}/**" if side else "@adv/**"
+    return [f"{key}/{below}" for key in _at(roots, topics)]
+
+
+def _with_recovery(roots: Sequence[str], topics: Sequence[str]) -> list[str]:
+    return _at(roots, topics) + _recovery(roots, topics)

@@ -1,23 +1,189 @@
-"""How a program connects to Zenoh: settings and the configuration they stand for. Opens nothing itself.
+"""How a program connects to Zenoh: endpoints, settings and the configuration they stand for. Opens nothing itself.
 
-Settings hold names of files and variables, never a password: secrets are read when a session is opened.
+Settings hold names of files and variables, never a password: secrets are read when a session is opened, never kept.
 """
 
+import ipaddress
 import json
 import os
 import re
+import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from models.errors import MachineFileError
-from models.signals.endpoint import endpoint_fault, is_local
-from models.signals.link_access import Grant, access_control
-from models.signals.link_files import check_certificate, check_key, read_password, read_user_names
+from models.errors import MachineFileError, checked, did_you_mean, read_toml
+from models.signals.keys import Grant, access_control
 
-__all__ = ["NAMESPACE_PATTERN", "LinkSettings", "TlsSettings"]
+__all__ = [
+    "NAMESPACE_PATTERN",
+    "LinkSettings",
+    "TlsSettings",
+    "check_certificate",
+    "check_key",
+    "endpoint_fault",
+    "is_address",
+    "is_local",
+    "is_loopback",
+    "load_link",
+    "read_password",
+    "read_user_names",
+]
+
+_OF_HOSTS = ("tcp", "udp", "tls", "quic", "ws")
+_WITHIN = ("unixsock-stream", "unixpipe")
+_OTHERS = (*_WITHIN, "serial", "vsock")
+_LOCAL = "127.0.0.1"
+_HIGHEST_PORT = 65535
+
+
+def is_address(name: str) -> bool:
+    """Whether a host is given as an address."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def is_loopback(host: str) -> bool:
+    """Whether nobody outside this computer reaches what listens on `host`."""
+    return host == "localhost" or (is_address(host) and ipaddress.ip_address(host).is_loopback)
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether nobody outside this computer reaches what listens on an endpoint.
+
+    Examples
+    --------
+    >>> is_local("tcp/[::1]:7447"), is_local("tcp/10.0.0.5:7447")
+    (True, False)
+    """
+    protocol, _, rest = endpoint.partition("/")
+    host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")
+    return protocol in _WITHIN or (protocol in _OF_HOSTS and is_loopback(host))
+
+
+def endpoint_fault(text: str) -> str | None:
+    """What is wrong with an endpoint; None if it can be used.
+
+    Examples
+    --------
+    >>> endpoint_fault("localhost:7447")
+    "'localhost:7447': expected PROTOCOL/HOST:PORT; did you mean tcp/localhost:7447?"
+    """
+    protocol, slash, rest = text.partition("/")
+    address = re.split(r"[?#]", rest)[0]
+    if slash and protocol in _OTHERS and address:
+        return None
+    host = r"(\[[^][\s]+\]|[^][:/\s]+)"
+    match = re.fullmatch(rf"{host}:(\d+)", address)
+    if slash and protocol in _OF_HOSTS and match is not None:
+        wrong = int(match[2]) > _HIGHEST_PORT
+        return f"{text!r}: the port is {match[2]}, expected 0 to {_HIGHEST_PORT}" if wrong else None
+    portless = re.fullmatch(rf"{host}(:[^:/]*)?", address)
+    if slash and protocol in _OF_HOSTS and portless is not None:
+        meant = f"{protocol}/{portless[1]}:7447"
+        return f"{text!r}: expected a port, a number, after the host; did you mean {meant}?"
+    known = [name for name in _OF_HOSTS if did_you_mean(protocol.rstrip(":"), [name])] or ["tcp"]
+    place = re.fullmatch(rf"(?:[\w-]*:?/+)?(?:{host}:)?(\d+)", text)
+    meant = "tcp/127.0.0.1:7447" if place is None else f"{known[0]}/{place[1] or _LOCAL}:{place[2]}"
+    if re.fullmatch(r"[A-Za-z][\w.-]*", text):
+        meant = f"tcp/{text}:7447"
+    return f"{text!r}: expected PROTOCOL/HOST:PORT; did you mean {meant}?"
+
+
+def read_password(field: str, path: Path) -> str:
+    """The password that is alone in a file.
+
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be read, others may read it, or it is not one line.
+    """
+    lines = _secret(field, path).splitlines()
+    if len(lines) != 1 or not lines[0].strip():
+        raise MachineFileError(f"link.{field}: {path}: expected one line with the password, found {len(lines)} lines")
+    return lines[0].strip()
+
+
+def read_user_names(field: str, path: Path) -> frozenset[str]:
+    """Names of the users in a file with a line ``name:password`` for each.
+
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be read, others may read it, or a line is none of these.
+    """
+    names: list[str] = []
+    for number, line in enumerate(_secret(field, path).splitlines(), start=1):
+        name, colon, password = line.partition(":")
+        if not (name and colon and password) or line != line.strip() or " " in name:
+            # Never the line itself: there is a password in it.
+            raise MachineFileError(
+                f"link.{field}: {path}: line {number}: expected name:password, without spaces around them, "
+                "comments or empty lines"
+            )
+        if name in names:
+            raise MachineFileError(f"link.{field}: {path}: line {number}: the user {name} has a line already")
+        names.append(name)
+    if not names:
+        raise MachineFileError(f"link.{field}: {path}: no users, expected a line name:password for each")
+    return frozenset(names)
+
+
+def check_certificate(field: str, path: Path) -> None:
+    """Check that a file has a certificate.
+
+    Raises
+    ------
+    MachineFileError
+        If it cannot be read, or is not PEM.
+    """
+    if "-----BEGIN CERTIFICATE-----" not in _text(field, path):
+        raise MachineFileError(f"link.{field}: {path}: expected a certificate in PEM (-----BEGIN CERTIFICATE-----)")
+
+
+def check_key(field: str, path: Path) -> None:
+    """Check that a file has a private key that others may not read.
+
+    Raises
+    ------
+    MachineFileError
+        If it cannot be read, others may read it, it is not PEM, or needs a passphrase.
+    """
+    text = _secret(field, path)
+    if "ENCRYPTED" in text:
+        raise MachineFileError(
+            f"link.{field}: {path}: the private key needs a passphrase, which nobody is there to enter; expected none"
+        )
+    if "PRIVATE KEY-----" not in text:
+        raise MachineFileError(f"link.{field}: {path}: expected a private key in PEM (-----BEGIN PRIVATE KEY-----)")
+
+
+def _secret(field: str, path: Path) -> str:
+    try:
+        mode = stat.S_IMODE(path.stat().st_mode)
+    except OSError as error:
+        raise MachineFileError(f"link.{field}: {path}: cannot be read ({error.strerror})") from error
+    if os.name == "posix" and mode & stat.S_IRWXO:
+        raise MachineFileError(
+            f"link.{field}: {path}: every user of this computer may read or change it (mode {mode:04o}); "
+            f"protect it with: chmod 600 {path}"
+        )
+    return _text(field, path)
+
+
+def _text(field: str, path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise MachineFileError(f"link.{field}: {path}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise MachineFileError(f"link.{field}: {path}: not a text file") from error
+
 
 NAMESPACE_PATTERN = r"^([A-Za-z0-9][A-Za-z0-9_.-]*(/[A-Za-z0-9][A-Za-z0-9_.-]*)*)?$"
 """Key segments that could begin any key: no wildcards, no empty ones."""
@@ -301,3 +467,24 @@ class LinkSettings(BaseModel):
         known_by: Literal["usernames", "cert_common_names"]
         known_by = "cert_common_names" if self.passwords_file is None else "usernames"
         return {"access_control": json.dumps(access_control(self.grants, known_by))}
+
+
+class _LinkFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
+
+    link: LinkSettings
+
+
+def load_link(path: Path) -> LinkSettings:
+    """Load a link file; files named in it are taken from its folder.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field and what was expected. Passwords, certificates and keys are read and checked when a
+        session is opened.
+    """
+    link = checked(_LinkFile, read_toml(path), path).link
+    if not link.listen and not link.connect:
+        raise MachineFileError(f"{path}: link: expected endpoints in listen or connect, found neither")
+    return link.beside(path.parent)

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 
-from models.signals.endpoint import is_address
+from models.signals.link import is_address
 
 __all__ = ["SAFE_METHODS", "check_body_type", "check_origin"]
 

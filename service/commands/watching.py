@@ -70,8 +70,7 @@ def watch(
     with exit_codes():
         if machine.count("/") != 1:
             raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
-        from models.link_file import load_link  # noqa: PLC0415  # keeps --help quick
-        from models.signals.link import LinkSettings  # noqa: PLC0415
+        from models.signals.link import LinkSettings, load_link  # noqa: PLC0415  # keeps --help quick
         from service.stream.transport import follow  # noqa: PLC0415
         from service.terminal.stopping import stop_request  # noqa: PLC0415
 

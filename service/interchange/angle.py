@@ -7,9 +7,8 @@ import numpy as np
 
 from models.machine import MachineFile
 from models.signals.block import FloatArray
-from models.signals.channels import Quantity
+from models.signals.channels import Quantity, time_unit_ns
 from models.signals.keyphasor import EdgeDetector, PulseTrain, pulse_train, shaft_angle
-from models.signals.units import time_unit_ns
 from service.interchange.clock import Clock
 from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Piece, Read, Signal, pieces

@@ -9,7 +9,7 @@ import numpy as np
 
 from models.machine import MachineFile
 from models.signals.block import FloatArray
-from models.signals.units import time_unit_ns
+from models.signals.channels import time_unit_ns
 from service.interchange.mapping import TimeBase
 from service.interchange.source import Array, Reference, Source, SourceError, Timing
 

@@ -9,11 +9,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from models.errors import MachineFileError
+from models.errors import MachineFileError, checked, did_you_mean, read_toml
 from models.machine import MachineFile
-from models.mistakes import checked, did_you_mean, read_toml
-from models.signals.channels import Channel, Quantity
-from models.signals.units import time_unit_ns, unit_factor
+from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from service.interchange.formats import Format
 
 __all__ = ["Column", "CsvFormat", "Keyphasor", "Mapping", "TimeBase", "load_mapping"]

@@ -11,8 +11,7 @@ from typing import Protocol
 import numpy as np
 from scipy.signal import resample_poly
 
-from models.signals.block import FloatArray
-from models.signals.integration import integrated, settling_s
+from models.signals.block import FloatArray, integrated, settling_s
 from service.interchange.samples import Piece, Signal
 
 __all__ = ["Integration", "Overlap", "Resampling", "WindowFilter"]

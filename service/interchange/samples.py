@@ -8,8 +8,7 @@ import numpy.typing as npt
 
 from models.machine import MachineFile
 from models.signals.block import FloatArray
-from models.signals.channels import Quantity
-from models.signals.units import same_unit, unit_factor
+from models.signals.channels import Quantity, same_unit, unit_factor
 from service.interchange.clock import Clock, check_order
 from service.interchange.mapping import Column, Mapping
 from service.interchange.source import Array, Reference, Source, SourceError, as_numbers

@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from models.signals.integration import lowest_valid_hz, settling_s
+from models.signals.block import lowest_valid_hz, settling_s
 from service.interchange.importing import Imported
 from service.interchange.samples import Gap
 

@@ -1,8 +1,8 @@
 """Turns the monitor's records into the records of `rotorwatch`."""
 
-from models.diagnosis.verdict.detectable import length_to_find
+from models.diagnosis.verdict.calibration import length_to_find
 from models.machine import MachineFile
-from models.physics.parameters import PARAMETER_TEXT
+from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.health import Health, HealthState, StreamStatus
 from rotorwatch.records.machines import Channel, DetectableChanges, DetectableParameter, MachineDescription
 from service.monitor.alarm_conversion import alarm_entries, rfc3339

@@ -14,24 +14,21 @@ import numpy as np
 from scipy.special import ndtr
 
 from models.checkpoint import checked, prefixed, unprefixed
-from models.commissioning.commissioned import Commissioned, IdentifiedRecord
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Commissioned, IdentifiedRecord, Installed
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.rows import evaluable_rows
-from models.diagnosis.likelihood.lengths import LengthFits
-from models.diagnosis.limits import beyond
+from models.diagnosis.likelihood.fit import LengthFits
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
-from models.diagnosis.readings import Diagnosis, Diagnostician, no_reading
-from models.diagnosis.verdict.agreement import agreements
-from models.diagnosis.verdict.calibration import month_thresholds
-from models.diagnosis.verdict.determined import determined, with_shared_error
+from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
+from models.diagnosis.verdict.calibration import agreements, month_thresholds
 from models.diagnosis.verdict.sequential import SequentialSettings
+from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
 from models.errors import BundleError, CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine, MachineFile
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.windows import Equation, Opinion, Shape

@@ -17,19 +17,18 @@ from dataclasses import replace
 import numpy as np
 
 from models.alarm_names import SHAPE
-from models.arrivals import Arrivals, Arrived
+from models.arrivals import Arrivals, Arrived, Senders
 from models.checkpoint import checked, prefixed, texts, unprefixed
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import no_reading
 from models.diagnosis.sensors.check import sensor_findings
-from models.diagnosis.verdict.detectable import detectable_changes
+from models.diagnosis.verdict.calibration import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
 from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Admission, Gate, Reason
-from models.senders import Senders
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Evidence, Severity

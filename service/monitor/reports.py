@@ -5,7 +5,7 @@ import json
 from dataclasses import dataclass
 from typing import TypedDict
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.health import HealthState, Quality, Report

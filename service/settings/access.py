@@ -7,7 +7,7 @@ from typing import Self
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from models.errors import MachineFileError
-from models.signals.endpoint import is_loopback
+from models.signals.link import is_loopback
 
 __all__ = ["AccessSettings", "LimitSettings", "TlsSettings", "check_access"]
 

@@ -6,7 +6,7 @@ from urllib.parse import SplitResult, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from models.signals.endpoint import is_loopback
+from models.signals.link import is_loopback
 
 __all__ = ["WebhookKind", "WebhookSettings", "repeated_name"]
 

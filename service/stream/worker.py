@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report, StreamStatus

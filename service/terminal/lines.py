@@ -4,7 +4,7 @@ import re
 from datetime import UTC, datetime
 
 from models.diagnosis.readings import Z95
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict

@@ -7,12 +7,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from models.commissioning.healthy import HealthyRecording
-from models.commissioning.lines import Line, foreign_lines
+from models.commissioning.healthy import HealthyRecording, Line, foreign_lines
 from models.diagnosis.window import WindowStatistics, window_statistics
 from models.signals.block import FloatArray
-from simulator.commission.svg import BAND, COLOURS, GREY, INK, WIDTH_IN
-from simulator.commission.units import channel_text, channel_unit
+from simulator.commission.plots import BAND, COLOURS, GREY, INK, WIDTH_IN
+from simulator.commission.verdict import channel_text, channel_unit
 
 __all__ = ["Portrait", "draw_levels", "draw_spectra", "ordered", "portrait"]
 

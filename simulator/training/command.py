@@ -13,20 +13,18 @@ from rich.progress import Progress, TaskID
 from rich.table import Table
 
 from models.diagnosis.networks.amortised import AmortisedNetworks
-from models.diagnosis.networks.amortised_training import calibrate_networks, train_networks
 from models.diagnosis.networks.bundle import Training, save_bundle
 from models.diagnosis.networks.equations import EQUATIONS, missing
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import EquationNetwork
-from models.diagnosis.networks.relation_training import calibrate, train_network
+from models.diagnosis.networks.training import calibrate, calibrate_networks, train_network, train_networks
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine, load_machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from rotorwatch import __version__
+from simulator.commands import bars
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
-from simulator.training.feature_draws import FeatureDraws, batches
-from simulator.training.progress import bars
-from simulator.training.spectral_draws import LOG_RATIO
+from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 
 __all__ = ["train_bundle", "train_for"]
 

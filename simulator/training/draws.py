@@ -17,12 +17,10 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.lyapunov import stochastic_covariance, synchronous_response
-from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import PARAMETERS, changed
+from models.physics.response import stochastic_covariance, synchronous_response
+from models.physics.rotor import PARAMETERS, STATE_INDEX, changed
 from models.signals.channels import Channel, Quantity
-from simulator.integrator import theoretical_rms
-from simulator.nonlinear_plant import NonlinearPlant
+from simulator.plant import NonlinearPlant, theoretical_rms
 from simulator.scenario import Event, NamedSource, Rub, Scenario, Sensors
 from simulator.stream import blocks
 from simulator.timeline import Condition

@@ -3,7 +3,7 @@
 import pytest
 
 from models.commissioning.commission import Commissioning
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from rotorwatch.records.windows import Parameter
 from service.monitor.evaluation import Evaluation, evaluator_for
 from simulator.scenario import Event

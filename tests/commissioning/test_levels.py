@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 
 from models.commissioning.commission import Commissioning
-from models.commissioning.commissioned import FILE, Commissioned, load_commissioned
-from models.commissioning.conditions import OperatingRange
-from models.commissioning.installed import install
-from models.commissioning.knowledge import KnowledgeLevel, knowledge_of
+from models.commissioning.commissioned import (
+    FILE,
+    Commissioned,
+    KnowledgeLevel,
+    OperatingRange,
+    install,
+    knowledge_of,
+    load_commissioned,
+)
 from models.errors import BundleError
-from models.physics.parameters import FAULT_FIELDS, PARAMETERS
+from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
 

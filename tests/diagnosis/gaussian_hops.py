@@ -7,7 +7,7 @@ import numpy as np
 
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, to_scale
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
 __all__ = ["DelayStudy", "GaussianHops", "detection_delays"]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from models.diagnosis.readings import Diagnosis, parameter_reading
-from models.diagnosis.verdict.agreement import agreements
-from models.physics.parameters import PARAMETERS
+from models.diagnosis.verdict.calibration import agreements
+from models.physics.rotor import PARAMETERS
 
 SEED = 88_400
 

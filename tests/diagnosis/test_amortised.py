@@ -12,7 +12,7 @@ from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window, with_tilt
 from simulator.training.spectral_draws import SpectralDraws
 

@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from models.diagnosis.baseline.determination import disagreements, undetermined
-from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.gain import gain_suspicion
-from models.diagnosis.baseline.learned import Baseline, learn_baseline, learned_rows
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician, gain_suspicion
+from models.diagnosis.baseline.learned import Baseline, disagreements, learn_baseline, learned_rows, undetermined
 from models.diagnosis.baseline.rows import ROWS
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.readings import Diagnosis, parameter_reading

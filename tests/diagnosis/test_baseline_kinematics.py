@@ -7,10 +7,18 @@ import numpy as np
 import pytest
 
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.kernels import gain, kernels, passband_hz, shape_for
-from models.diagnosis.baseline.kinematics import Source, formation_of, not_measured
+from models.diagnosis.baseline.lag_moments import gain, kernels, passband_hz, shape_for
 from models.diagnosis.baseline.learned import learn_baseline
-from models.diagnosis.baseline.rows import ROWS, Own, Row, evaluable_rows, parameters_of
+from models.diagnosis.baseline.rows import (
+    ROWS,
+    Own,
+    Row,
+    Source,
+    evaluable_rows,
+    formation_of,
+    not_measured,
+    parameters_of,
+)
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics

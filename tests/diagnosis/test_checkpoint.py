@@ -11,17 +11,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from models.checkpoint import checked, from_bytes, prefixed, to_bytes, unprefixed
-from models.commissioning.installed import install
-from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.commissioning.commissioned import install
+from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
-from models.diagnosis.likelihood.lengths import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.sequential import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError
 from models.ingest import Admission, Gate, Reason
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from service.monitor.monitor import MachineMonitor

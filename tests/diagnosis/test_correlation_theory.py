@@ -7,8 +7,8 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response
-from models.physics.matrices import STATE_INDEX
+from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.rotor import STATE_INDEX
 from simulator.scenario import Scenario
 from simulator.stream import blocks
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition

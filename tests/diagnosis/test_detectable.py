@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from models.diagnosis.verdict.calibration import month_thresholds, window_thresholds
-from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
+from models.diagnosis.verdict.calibration import detectable_changes, length_to_find, month_thresholds, window_thresholds
 from models.diagnosis.verdict.isolation import isolate
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from tests.diagnosis.test_isolation import covariance, window
 

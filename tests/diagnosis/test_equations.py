@@ -6,9 +6,8 @@ import pytest
 from models.diagnosis.networks.equations import EQUATIONS, Equation, StatisticsView, SynchronousEquation, missing
 from models.machine import Machine, load_machine
 from models.physics.excitation import Source, expanded_A, expanded_B
-from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response
-from models.physics.matrices import STATES
-from models.physics.parameters import PARAMETERS, changed
+from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.rotor import PARAMETERS, STATES, changed
 from models.signals.block import FloatArray
 
 LAGS_S = np.arange(60, 126, 3) / 1000  # beyond the memory of a 150 Hz excitation: e^-40

@@ -11,10 +11,10 @@ from scipy.stats import binomtest, norm
 from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import WindowSizes, plan, sampled, windows_of
 from benchmarks.finite_elements.scenes import COMMISSIONED, SceneRange, SourceLayout, drawn_condition
-from models.diagnosis.fallback.shape import FEWEST_WINDOWS, HealthyShape, learn_shape
+from models.diagnosis.shape import FEWEST_WINDOWS, HealthyShape, learn_shape
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 
 PROBES = ("y1", "z1", "y2_ddot")
 LENGTH_S = 20.0

@@ -6,8 +6,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.likelihood.lengths import LengthFits
+from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
 from models.diagnosis.moments import plan_for
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow, WindowStatistics

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.likelihood.integrated import integrated
+from models.diagnosis.likelihood.motions import integrated
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray

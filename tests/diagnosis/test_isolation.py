@@ -6,7 +6,7 @@ import pytest
 from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
 from models.diagnosis.verdict.isolation import Isolation, isolate_window, outside_confidence
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
 SEED = 88_100

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.studies.bound import TrueCondition, cramer_rao
-from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN, BinGroups, group_bins
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.likelihood.motions import Motions
+from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins
 from models.diagnosis.likelihood.scoring import FisherScoring
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed
 from models.diagnosis.moments import plan_for

@@ -8,15 +8,14 @@ import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.likelihood.goodness import Alternative, Goodness
-from models.diagnosis.limits import beyond
 from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
-from models.diagnosis.readings import Diagnosis, parameter_reading, possible_reading
-from models.diagnosis.verdict.determined import determined
+from models.diagnosis.readings import Diagnosis, beyond, parameter_reading, possible_reading
+from models.diagnosis.verdict.stretch import determined
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError, UnexplainedError
 from models.machine import load_machine
-from models.physics.possible import impossible
+from models.physics.rotor import impossible
 from service.monitor.evaluation import KnownMachineEvaluator
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 

@@ -8,11 +8,13 @@ import pytest
 from pydantic import ValidationError
 
 from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.sensors import SensorFault, SensorReference, implicated, learn_sensor_reference, sensor_findings
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.reference import SensorReference, implicated, learn_sensor_reference
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
+from rotorwatch.records.windows import SensorFault
 from simulator.scenario import NamedSource, Scenario, Sensors
 from simulator.stream import blocks
 

@@ -9,7 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from models.diagnosis.moments import Plan, plan_for
-from models.diagnosis.sensors import SensorReference, learn_sensor_reference, sensor_findings
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray

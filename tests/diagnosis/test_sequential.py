@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
-from models.diagnosis.verdict.detectable import detectable_changes, length_to_find
+from models.diagnosis.verdict.calibration import MONTH_S, detectable_changes, length_to_find, month_thresholds
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Verdict
 from tests.diagnosis.gaussian_hops import GaussianHops, detection_delays

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.unbalance_vector import UnbalanceVector
+from models.diagnosis.readings import UnbalanceVector
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import load_machine

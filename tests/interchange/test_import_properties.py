@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.machine import Machine
-from models.signals.units import unit_factor
+from models.signals.channels import unit_factor
 from service.interchange.source import SourceError
 from tests.interchange.material import RATE_HZ, START, START_NS, imported, machine, signals, stretches
 

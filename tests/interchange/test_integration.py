@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from models.errors import MachineFileError
-from models.signals.integration import integrated, lowest_valid_hz, settling_s
-from models.signals.units import unit_factor
+from models.signals.block import integrated, lowest_valid_hz, settling_s
+from models.signals.channels import unit_factor
 from service.interchange.summary import summary_lines
 from tests.interchange.material import START, START_NS, imported, stretches
 

@@ -5,10 +5,9 @@ import pytest
 import scipy.signal
 
 from models.machine import load_machine
-from models.physics.discretise import advance, discretise
 from models.physics.excitation import Source, colouring_filter, expanded_A, expanded_B, source_spectrum, unit_spectrum
-from models.physics.lyapunov import stationary_covariance
-from models.physics.matrices import M_matrix, P_matrix, Q_matrix
+from models.physics.response import advance, discretise, stationary_covariance
+from models.physics.rotor import M_matrix, P_matrix, Q_matrix
 
 DIRECTION = (0.2, 0.7, 0.01, 0.5, 1.0, 0.02)
 SHAPES = {

@@ -5,16 +5,17 @@ import pytest
 
 from models.errors import EstimationError
 from models.machine import load_machine
-from models.physics.discretise import advance, discretise
 from models.physics.excitation import Source, expanded_A, expanded_B, low_pass, low_pass_slopes, unit_spectrum
-from models.physics.lyapunov import (
+from models.physics.response import (
+    advance,
     correlation,
+    discretise,
     stationary_covariance,
     stochastic_covariance,
     synchronous_correlation,
     synchronous_response,
 )
-from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix, system_A
+from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, system_A
 
 SOURCES = (
     Source(cutoff_hz=80, direction=(1, 0, 0, 0, 0, 0), force_rms_N=5),

@@ -8,9 +8,8 @@ import pytest
 
 from models.errors import MachineFileError
 from models.machine import Machine, load_machine
-from models.physics.lyapunov import synchronous_response
-from models.physics.matrices import system_A
-from models.physics.parameters import PARAMETERS, changed
+from models.physics.response import synchronous_response
+from models.physics.rotor import PARAMETERS, changed, system_A
 
 LAB = (Path(__file__).parents[2] / "models" / "machines" / "lab.toml").read_text(encoding="utf-8")
 

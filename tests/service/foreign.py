@@ -7,7 +7,7 @@ import numpy as np
 
 from models.machine import Machine
 from models.signals.block import FloatArray, SampleBlock
-from models.signals.units import unit_factor
+from models.signals.channels import unit_factor
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 

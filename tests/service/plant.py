@@ -8,9 +8,8 @@ from typing import Literal
 
 import zenoh
 
-from models.signals.keys import MachineKeys
+from models.signals.keys import Grant, MachineKeys
 from models.signals.link import LinkSettings
-from models.signals.link_access import Grant
 from tests.service.live import endpoint, until
 
 __all__ = ["GRANTS", "PUMP", "Plant", "at_once", "kept", "opened", "plant"]

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow, WindowStatistics

@@ -10,9 +10,8 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from models.signals.keys import MachineKeys
+from models.signals.keys import Grant, MachineKeys
 from models.signals.link import LinkSettings
-from models.signals.link_access import Grant
 from rotorwatch.client.alarm_log import follow_alarms
 from rotorwatch.client.errors import ClientError, LogReplaced
 from rotorwatch.client.log_order import LogOrder

@@ -10,7 +10,7 @@ import pytest
 
 from models.alarm_names import CLOCK, FAULT, GAP, STREAM_LOST
 from models.checkpoint import from_bytes, to_bytes
-from models.commissioning.installed import Installed, install
+from models.commissioning.commissioned import Installed, install
 from models.errors import CheckpointError
 from models.ingest import Reason
 from models.machine import AlarmSettings, IngestSettings, Machine

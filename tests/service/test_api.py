@@ -8,7 +8,7 @@ import pytest
 
 from models.alarm_names import ALARMS
 from models.machine import Machine, load_machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import Alarm, AlarmStates
 from rotorwatch.records.health import MEASURES, Health
 from rotorwatch.records.history import AlarmEventList, AuditList, ReadingList, ReportList

@@ -8,7 +8,7 @@ from typing import Any
 import httpx
 import pytest
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmState, AlarmStates, EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Quality, Report, StreamStatus

@@ -19,8 +19,7 @@ from service.runtime import running
 from service.stream.transport import route
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import load_scenario, parse_fault
-from simulator.stream import blocks
-from simulator.truth import TruthRecord
+from simulator.stream import TruthRecord, blocks
 from tests.service.asyncapi import asyncapi
 from tests.service.live import LAB, ROOT, START_NS, endpoint, machine_file, open_session, settings, until
 

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.errors import BundleError
 from models.machine import AlarmSettings, MachineFile
 from models.signals.block import SampleBlock

@@ -3,9 +3,9 @@
 import pytest
 
 from models.alarm_names import DATA, MODEL
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.machine import load_machine
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor

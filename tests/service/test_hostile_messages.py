@@ -14,7 +14,7 @@ import structlog
 import zenoh
 
 from models.alarm_names import CONFLICT, STREAM_LOST, alarm_kind
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, BLOCK_ENCODING, REPLAY_MARK, encode_arrow, encode_block, sender_of

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from models.commissioning.installed import Installed, install
+from models.commissioning.commissioned import Installed, install
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block

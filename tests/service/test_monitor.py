@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.ingest import Reason
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report

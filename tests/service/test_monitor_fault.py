@@ -9,10 +9,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from models.alarm_names import FAULT, GAP, OVERLOADED, STREAM_LOST
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.machine import Machine
-from models.signals.arrow import write_arrow
-from models.signals.wire import ARROW_ENCODING, encode_block
+from models.signals.wire import ARROW_ENCODING, encode_block, write_arrow
 from rotorwatch.records.alarms import EventKind, Evidence
 from rotorwatch.records.health import HealthState
 from service.history.errors import StoreError

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.diagnosis.networks.bundle import load_bundle
 from models.errors import MachineFileError, RotorwatchError
 from models.machine import Machine
-from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
+from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent

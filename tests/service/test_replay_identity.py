@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from models.alarm_names import STREAM_LOST
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from models.signals.recording import read_recording

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from models.alarm_names import STREAM_LOST
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.errors import BundleError, MachineFileError
 from models.machine import load_machine
 from models.signals.link import LinkSettings

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from models.machine import Machine
-from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
+from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import SampleBlock
 from service.analysis.snapshots.heading import LatestData
 from simulator.scenario import load_scenario

@@ -10,9 +10,8 @@ from pydantic import BaseModel
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.physics.excitation import Source, expanded_A, expanded_B
-from models.physics.lyapunov import correlation, stationary_covariance
-from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import changed
+from models.physics.response import correlation, stationary_covariance
+from models.physics.rotor import STATE_INDEX, changed
 from models.signals.block import SampleBlock
 from models.signals.channels import state_name
 from rotorwatch.records.example import example

@@ -19,7 +19,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
 from service.settings.service import ServiceSettings, load_settings
-from simulator.truth import TruthRecord
+from simulator.stream import TruthRecord
 from tests.service.live import LAB, ROOT, Feed, endpoint, open_session, service, until
 
 PAGE = ROOT / "docs" / "topics.md"

@@ -11,7 +11,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from models.commissioning.installed import install
+from models.commissioning.commissioned import install
 from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from models.link_file import load_link
+from models.signals.link import load_link
 from service.runtime import running
 from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
 from service.stream.transport import Link, TopicMessage, follow

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from models.errors import MachineFileError
 from models.machine import load_machine
-from models.physics.matrices import STATES
+from models.physics.rotor import STATES
 from models.signals.channels import ACCELERATIONS, UNIT_TO_SI, Channel, ChannelDescriptor, Quantity, state_name
 from models.signals.keys import PREFIX, MachineKeys
 from models.signals.link import LinkSettings

@@ -13,10 +13,8 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from models.errors import MachineFileError
-from models.link_file import load_link
-from models.signals.keys import MachineKeys
-from models.signals.link import LinkSettings, TlsSettings
-from models.signals.link_access import Grant, access_control
+from models.signals.keys import Grant, MachineKeys, access_control
+from models.signals.link import LinkSettings, TlsSettings, load_link
 
 ROOT = Path(__file__).parents[2]
 ENDPOINT = ("tcp/127.0.0.1:7447",)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from models.senders import Senders
+from models.arrivals import Senders
 from models.signals.block import SampleBlock
 
 S = 10**9

@@ -13,15 +13,23 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from models.commissioning.commission import Commissioning
+from models.commissioning.commission import Commissioning, CommissioningReport, ParameterSummary
 from models.commissioning.healthy import HealthyRecording
-from models.commissioning.report import CommissioningReport, ParameterSummary
 from models.errors import RecordingError
 from models.machine import MachineFile, Operation
-from simulator.commission.console import print_report
+from simulator.commission.command import print_report
 from simulator.commission.page import HTML, JSON, write_report
-from simulator.commission.units import channel_text, duration, parameter_value, percent
-from simulator.commission.verdict import budget_sentences, dominant, headline, next_steps, smallest_change
+from simulator.commission.verdict import (
+    budget_sentences,
+    channel_text,
+    dominant,
+    duration,
+    headline,
+    next_steps,
+    parameter_value,
+    percent,
+    smallest_change,
+)
 from tests.commissioning.rotor_kit import (
     LAB,
     NOTHING,

@@ -6,7 +6,7 @@ import pytest
 from models.errors import EstimationError
 from models.machine import load_machine
 from models.signals.block import FloatArray
-from simulator.integrator import rotor_in
+from simulator.plant import rotor_in
 from simulator.scenario import Event, Scenario
 from simulator.stream import blocks
 from simulator.timeline import compile_timeline

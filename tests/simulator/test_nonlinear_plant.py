@@ -8,12 +8,10 @@ from scipy.integrate import solve_ivp
 
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
-from models.physics.lyapunov import synchronous_response
-from models.physics.matrices import M_matrix, P_matrix, Q_matrix, Q_shaft
-from models.physics.parameters import PARAMETERS
+from models.physics.response import synchronous_response
+from models.physics.rotor import PARAMETERS, M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
-from simulator.integrator import Plant
-from simulator.nonlinear_plant import NonlinearPlant, crack_stiffness
+from simulator.plant import NonlinearPlant, Plant, crack_stiffness
 from simulator.scenario import Rub, load_scenario
 from simulator.timeline import Condition
 

@@ -13,11 +13,10 @@ from scipy.integrate import solve_ivp
 
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.lyapunov import correlation, stationary_covariance, synchronous_response
-from models.physics.matrices import STATE_INDEX, STATES, H_matrix, M_matrix, system_A
-from models.physics.parameters import PARAMETERS, RotorParameters, changed
+from models.physics.response import correlation, stationary_covariance, synchronous_response
+from models.physics.rotor import PARAMETERS, STATE_INDEX, STATES, H_matrix, M_matrix, RotorParameters, changed, system_A
 from models.signals.block import FloatArray
-from simulator.integrator import Plant, theoretical_rms
+from simulator.plant import Plant, theoretical_rms
 from simulator.scenario import NamedSource, load_scenario
 from simulator.timeline import Condition
 

@@ -17,11 +17,9 @@ from models.machine import Machine
 from models.signals.channels import ChannelDescriptor
 from models.signals.link import LinkSettings
 from models.signals.wire import ARROW_ENCODING, decode_block
-from simulator.messages import RunSummary
 from simulator.publisher import PublishError, PublishSettings, publish
 from simulator.scenario import Scenario, load_scenario, parse_fault
-from simulator.stream import blocks
-from simulator.truth import TruthRecord
+from simulator.stream import RunSummary, TruthRecord, blocks
 from tests.loopback import endpoint
 
 

@@ -17,8 +17,7 @@ from models.signals.recording import read_recording, summarize_recording
 from models.signals.wire import decode_block
 from simulator.rotorsim import app
 from simulator.scenario import load_scenario
-from simulator.stream import DEFAULT_START_NS, blocks
-from simulator.truth import TruthRecord
+from simulator.stream import DEFAULT_START_NS, TruthRecord, blocks
 from tests.loopback import endpoint
 
 ROOT = Path(__file__).parents[2]

@@ -10,9 +10,8 @@ from pydantic import BaseModel
 
 from models.errors import MachineFileError
 from models.machine import Machine
-from models.physics.lyapunov import stochastic_covariance, synchronous_response
-from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import PARAMETERS
+from models.physics.response import stochastic_covariance, synchronous_response
+from models.physics.rotor import PARAMETERS, STATE_INDEX
 from simulator.scenario import (
     ANOMALIES,
     ChannelSettings,
@@ -26,7 +25,7 @@ from simulator.scenario import (
     parse_fault,
     shipped_scenarios,
 )
-from simulator.truth import TruthRecord
+from simulator.stream import TruthRecord
 
 PAGE = (Path(__file__).parents[2] / "docs" / "scenario.md").read_text(encoding="utf-8")
 

@@ -5,10 +5,10 @@ import numpy.typing as npt
 import pytest
 
 from models.machine import Machine, load_machine
-from models.physics.matrices import STATES
+from models.physics.rotor import STATES
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from simulator.integrator import PlantSamples
+from simulator.plant import PlantSamples
 from simulator.scenario import ChannelSettings, Sensors, SensorSettings
 from simulator.sensors import Sensor, SensorBank
 from simulator.timeline import SensorFaults

@@ -7,8 +7,7 @@ from models.errors import MachineFileError
 from models.machine import Machine, load_machine
 from models.signals.block import FloatArray
 from simulator.scenario import ChannelSettings, Event, Scenario, Sensors, load_scenario
-from simulator.stream import DEFAULT_START_NS, blocks
-from simulator.truth import TruthRecord
+from simulator.stream import DEFAULT_START_NS, TruthRecord, blocks
 
 EVENTS = (
     Event(at_s=1.0, ramp_s=2.5, parameter="k_by", relative_change=-0.3),

@@ -8,18 +8,16 @@ import numpy as np
 import pytest
 
 from models.diagnosis.networks.amortised import OWN, Calibration
-from models.diagnosis.networks.amortised_training import calibrate_networks, train_networks
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import read_equation
-from models.diagnosis.networks.relation_training import calibrate, train_network
+from models.diagnosis.networks.training import calibrate, calibrate_networks, train_network, train_networks
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
 from simulator.training.command import train_for
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
-from simulator.training.feature_draws import FeatureDraws, batches
-from simulator.training.spectral_draws import LOG_RATIO
+from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,8 @@ import pytest
 from benchmarks.studies.paper import PAPER_EQUATIONS, full_correlation, phase_correlation
 from models.machine import Machine, load_machine
 from models.physics.excitation import expanded_A, expanded_B
-from models.physics.lyapunov import correlation, stationary_covariance, synchronous_correlation, synchronous_response
-from models.physics.matrices import STATE_INDEX
+from models.physics.response import correlation, stationary_covariance, synchronous_correlation, synchronous_response
+from models.physics.rotor import STATE_INDEX
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, simulate_window, with_tilt
 
 _SEED = 4711

@@ -15,7 +15,7 @@ from benchmarks.studies.reproduction import CONDITIONS, own_equations
 from benchmarks.studies.results import Chart, Goal, Record, Table, Value, at_least, rate
 from benchmarks.studies.study import Cell, Options, Over, Study, read, run
 from benchmarks.studies.subjects import SHIPPED, SUBJECTS, subject_named
-from models.commissioning.knowledge import KnowledgeLevel, knowledge_of
+from models.commissioning.commissioned import KnowledgeLevel, knowledge_of
 from models.errors import RecordingError
 from models.machine import load_machine
 

@@ -1,23 +1,173 @@
-"""The baseline of a machine without parameters: what its healthy windows teach."""
+"""The baseline of a machine without parameters: what healthy windows teach, and how well they agree."""
 
 import itertools
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc, ndtri
 
-from models.diagnosis.baseline.consistency import LeftOut, allowance_of, left_out
-from models.diagnosis.baseline.kernels import LONGEST_LAG_STEP_S
-from models.diagnosis.baseline.kinematics import not_measured, state_of
-from models.diagnosis.baseline.lag_moments import LagMoments, RowWindow, row_window, shared_covariance
-from models.diagnosis.baseline.relation import Contribution, Relation, lags_of, learn_row
-from models.diagnosis.baseline.rows import ROWS, Row
+from models.diagnosis.baseline.lag_moments import (
+    LONGEST_LAG_STEP_S,
+    LagMoments,
+    RowWindow,
+    row_window,
+    shared_covariance,
+)
+from models.diagnosis.baseline.relation import Contribution, Relation, RowChange, change_of, lags_of, learn_row
+from models.diagnosis.baseline.rows import ROWS, Row, not_measured, state_of
 from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
+from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray
 
-__all__ = ["Baseline", "coefficient_slices", "learn_baseline", "learned_rows", "positive", "unsuitable"]
+__all__ = [
+    "Baseline",
+    "HeldOutReading",
+    "LeftOut",
+    "allowance_of",
+    "coefficient_slices",
+    "disagreements",
+    "learn_baseline",
+    "learned_rows",
+    "left_out",
+    "positive",
+    "undetermined",
+    "unsuitable",
+]
+
+_FOLDS = 6
+_FEWEST_OTHERS = 2
+_BEYOND = 2.0  # standard deviations of a mean beyond which it is taken for more than scatter
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutReading:
+    """One parameter of one healthy window, read against the relation that the other conditions teach.
+
+    Attributes
+    ----------
+    change, standard_error : float
+        Relative change and its standard error, the relation's included.
+    """
+
+    parameter: str
+    change: float
+    standard_error: float
+
+    @property
+    def z(self) -> float:
+        """Change in standard errors: standard normal if one relation holds for all."""
+        return self.change / self.standard_error
+
+
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """One healthy window of one row against what the windows of other conditions teach.
+
+    Attributes
+    ----------
+    row : str
+        Name of the row.
+    window : int
+        Number of the window, from 0.
+    condition : str
+        What it belongs to.
+    agreements : tuple of HeldOutReading
+        One for each of the row's own parameters.
+    misfit : float
+        χ² of what is left per degree of freedom.
+    """
+
+    row: str
+    window: int
+    condition: str
+    agreements: tuple[HeldOutReading, ...]
+    misfit: float
+    degrees_of_freedom: int
+
+    @property
+    def misfit_z(self) -> float:
+        """The misfit as a standard normal variable."""
+        tail = float(chdtrc(self.degrees_of_freedom, self.misfit * self.degrees_of_freedom))
+        return -float(ndtri(np.clip(tail, 1e-300, 1 - 1e-16)))
+
+
+def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:
+    """Read every healthy window against the relation learned without its condition.
+
+    Where there is one condition, windows are left out one by one, or in up to six runs of neighbours.
+
+    Parameters
+    ----------
+    parts : sequence of LagMoments
+        One of each healthy window.
+    conditions : sequence
+        What each belongs to.
+
+    Returns
+    -------
+    tuple of LeftOut
+        Without those for which too few others are left or do not determine the relation.
+    """
+    groups = list(dict.fromkeys(conditions))
+    if len(groups) > 1:
+        folds = [[n for n, one in enumerate(conditions) if one == group] for group in groups]
+    else:
+        folds = [list(map(int, run)) for run in np.array_split(np.arange(len(parts)), min(_FOLDS, len(parts)))]
+    found = []
+    for fold in folds:
+        others = [part for number, part in enumerate(parts) if number not in fold]
+        if len(others) < min(_FEWEST_OTHERS, len(parts) - 1) or not others:
+            continue
+        try:
+            relation, _ = learn_row(row, others, widened=False)
+            changes = [(number, change_of(row, relation, parts[number])) for number in fold]
+        except (EstimationError, np.linalg.LinAlgError):
+            continue
+        for number, change in changes:
+            uncertain = change.sensitivity @ relation.covariance @ change.sensitivity.T
+            found.append(_left_out(row, number, str(conditions[number]), change, np.diag(uncertain)))
+    return tuple(sorted(found, key=lambda one: one.window))
+
+
+def _left_out(row: Row, number: int, condition: str, change: RowChange, uncertain: FloatArray) -> LeftOut:
+    noise = change.projection @ change.moments.covariance(change.combination) @ change.projection.T
+    errors = np.sqrt(np.diag(noise) * change.widening + uncertain)
+    return LeftOut(
+        row=row.name,
+        window=number,
+        condition=condition,
+        agreements=tuple(
+            HeldOutReading(own.parameter, float(value), float(error))
+            for own, value, error in zip(row.own, change.change, errors, strict=True)
+        ),
+        misfit=change.chi2 / change.degrees_of_freedom,
+        degrees_of_freedom=change.degrees_of_freedom,
+    )
+
+
+def allowance_of(found: Sequence[LeftOut]) -> float:
+    """Factor on variances that makes what windows of other conditions leave over as large as expected, at least 1.
+
+    A relation that is not quite the machine leaves over more in a condition that it was not learned in. The condition
+    that it fits worst counts.
+    """
+    worst = 1.0
+    for condition in {one.condition for one in found}:
+        own = [one for one in found if one.condition == condition]
+        freedom = sum(one.degrees_of_freedom for one in own)
+        mean = sum(one.misfit * one.degrees_of_freedom for one in own) / freedom
+        if mean > 1 + _BEYOND * np.sqrt(2 / freedom):
+            worst = max(worst, mean)
+        readings = [agreement.z**2 for one in own for agreement in one.agreements]
+        spread = float(np.mean(readings))
+        # neighbouring windows share the relation's error: their readings count as one window
+        if spread > 1 + _BEYOND * np.sqrt(2 / len(own[0].agreements)):
+            worst = max(worst, spread)
+    return worst
+
 
 _SHORTEST_LAG_RANGE_S = 0.1
 _FEWEST_HOPS = 2
@@ -208,3 +358,79 @@ def positive(covariance: FloatArray) -> FloatArray:
     if values[0] > 1e-9:
         return covariance
     return np.asarray((vectors * np.maximum(values, 1e-9)) @ vectors.T * np.outer(scale, scale), dtype=np.float64)
+
+
+_FAR = 3.0  # spreads from what is expected
+_VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
+_DISAGREE = 4.0  # standard errors between conditions
+_RECORD = "record a second condition: another speed, another load, or more broadband excitation at the bearing"
+
+
+def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
+    """Say of every learned row why the healthy windows do not determine it; empty where they do.
+
+    One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
+    damping or inertia is not physical, and no interval around it is honest.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        The table it was learned by.
+
+    Returns
+    -------
+    tuple of str
+        A sentence with what to record instead for each row, in the order of the learned rows; empty if there is no
+        doubt, or if there is no relation (``baseline.reasons`` says why).
+    """
+    found = []
+    for row, relation in zip(learned_rows(rows), baseline.relations, strict=True):
+        reason = "" if relation is None else _reason(row, relation)
+        found.append(f"{row.title}: {reason}; {_RECORD}" if reason else "")
+    return tuple(found)
+
+
+def _reason(row: Row, relation: Relation) -> str:
+    b, spread = relation.coefficients, np.sqrt(np.diag(relation.covariance))
+    for own in row.own:
+        for at in own.terms:
+            if at and spread[at - 1] > _VAGUE * abs(b[at - 1]):
+                error = spread[at - 1] / abs(b[at - 1])
+                return f"the {PARAMETER_TEXT.get(own.parameter, own.parameter)} is known to {error:.0%} only"
+    for number, term in enumerate(row.terms):
+        if term.in_units_of is None or term.spread is None:
+            continue
+        unit, own_value = -b[term.in_units_of - 1], -b[number - 1]
+        if unit <= 0:
+            return "the disc's inertia comes out negative"
+        if abs(own_value / unit - term.about) > _FAR * term.spread:
+            return f"what moves with the bearing comes out at {own_value / unit:.1f} times the disc"
+    return ""
+
+
+def disagreements(baseline: Baseline) -> tuple[str, ...]:
+    """Sentences on conditions in which a parameter reads otherwise than in all others.
+
+    Readings of one condition share the error of the relation: their mean is compared with a standard error that does
+    not fall with their number.
+
+    Returns
+    -------
+    tuple of str
+        Empty if one relation holds for all conditions. Otherwise keep a baseline for each, or widen (which later
+        windows do by `Relation.allowance` in any case).
+    """
+    found = []
+    for condition in dict.fromkeys(one.condition for one in baseline.consistency):
+        own = [each for one in baseline.consistency if one.condition == condition for each in one.agreements]
+        for name in dict.fromkeys(each.parameter for each in own):
+            readings = [each for each in own if each.parameter == name]
+            z = float(np.mean([each.z for each in readings]))
+            if abs(z) > _DISAGREE:
+                change = float(np.mean([each.change for each in readings]))
+                where = condition or "part of the recording"
+                found.append(
+                    f"{where}: {PARAMETER_TEXT.get(name, name)} reads {change:+.0%} against what the others teach "
+                    f"({abs(z):.0f} standard errors)"
+                )
+    return tuple(found)

@@ -3,23 +3,159 @@
 Both are least squares in which every variable has errors: the moments of the terms scatter with the same force as the
 residual. Left alone that pulls the coefficients towards zero (many weak instruments), so the known part of the scatter
 is taken out of the normal equations (k-class estimator, k the smallest root and at most one).
+
+A covariance describes the bottom of the criterion by a parabola. Where windows determine a direction weakly the
+criterion is flatter than that: the estimate moves to where the noise of the terms hides the misfit, and the parabola is
+drawn there. The interval is then taken from the criterion itself, which is right however weak the instruments are.
+
+References
+----------
+J. H. Stock and J. H. Wright, "GMM with weak identification", Econometrica 68 (2000).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from scipy.linalg import eigh
 
-from models.diagnosis.baseline.excitation import lag_beyond_memory
-from models.diagnosis.baseline.flatness import relation_criterion, stretching
-from models.diagnosis.baseline.lag_moments import LAG_FROM_S, LagMoments, RowWindow, inverse
+from models.diagnosis.baseline.lag_moments import (
+    LAG_FROM_S,
+    LONGEST_LAG_FROM_S,
+    SHORTEST_LAG_FROM_S,
+    LagMoments,
+    RowWindow,
+    inverse,
+)
 from models.diagnosis.baseline.rows import Row
+from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["Contribution", "Relation", "RowChange", "change_of", "fit_row", "lags_of", "learn_row", "read_row"]
+__all__ = [
+    "Contribution",
+    "Relation",
+    "RowChange",
+    "change_of",
+    "fit_row",
+    "lag_beyond_memory",
+    "lags_of",
+    "learn_row",
+    "one_source",
+    "read_row",
+    "relation_criterion",
+    "stretching",
+]
+
+_RISE = 4.0
+"""What the criterion gains at two standard errors if the covariance is right."""
+_STEPS = 2.0 * 1.4 ** np.arange(10)
+"""Distances that are tried, standard errors: to about twenty times what the covariance says."""
+
+
+def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Matrix A that stretches errors e with the given covariance to A e, whose covariance is what the criterion says.
+
+    Parameters
+    ----------
+    criterion : callable
+        χ² at an estimate.
+    b : ndarray, shape (n,)
+        Estimate.
+    covariance : ndarray, shape (n, n)
+        Its own.
+    """
+    spread = np.sqrt(np.diag(covariance))
+    values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
+    lowest = criterion(b)
+    scales = np.ones(b.size)
+    for number, (value, vector) in enumerate(zip(np.maximum(values, 1e-12), vectors.T, strict=True)):
+        step = np.sqrt(value) * vector * spread
+        for sign in (1, -1):
+            for distance in _STEPS:
+                if criterion(b + sign * distance * step) - lowest >= _RISE:
+                    break
+                scales[number] = max(scales[number], distance / np.sqrt(_RISE))
+    return np.asarray((vectors * scales) @ vectors.T * np.outer(spread, 1 / spread), dtype=np.float64)
+
+
+def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatArray) -> float:
+    """Left-over moments of healthy windows, weighted as at these coefficients, less what scatter explains.
+
+    Parameters
+    ----------
+    parts : sequence of LagMoments
+        One of each healthy window.
+    prior : ndarray, shape (n, n)
+        Precision of what was expected of the coefficients.
+    b : ndarray, shape (n,)
+        Coefficients.
+    """
+    combination = np.concatenate([[1.0], -b])
+    total = float(b @ prior @ b)
+    for part in parts:
+        W, kept = inverse(part.covariance(combination))
+        left = part.values @ combination
+        total += float(left @ W @ left) / max(1.0, part.scatter(combination, W, kept)) - kept
+    return total
+
+
+_MEMORY = 1.1
+_CUTOFFS_HZ = np.geomspace(10.0, 300.0, 40)
+_NOISES = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 25)])
+_LOWEST_RAISED_HZ = 8.0
+_COHERENT = 0.9
+"""Share of the coherence that one source explains: 0.97 to 1 with one, 0.6 to 0.85 with several."""
+
+
+def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:
+    """Shortest lag, s, at which a force of this residual's colour has forgotten all but a few per cent.
+
+    The residual is the force, and the noise of the accelerations on top. A second-order roll-off and a noise that
+    rises with f⁴ are fitted by Whittle's likelihood on a grid. A wrong guess costs sharpness or shows in the misfit.
+    Where the row was differentiated, that is undone first; the sensors' noise at the lowest frequencies is left out.
+    """
+    raised = row.formation.raised
+    f = row.window.frequencies_hz
+    used = f >= _LOWEST_RAISED_HZ if raised else np.ones(f.size, dtype=bool)
+    f = f[used]
+    density = row.residual_spectrum(combination)[used] / f ** (2 * raised)
+    logarithm, inverse_model = _models(f.tobytes())
+    cost = logarithm + np.log(inverse_model @ density / f.size)
+    cutoff_hz = _CUTOFFS_HZ[int(np.argmin(cost)) // _NOISES.size]
+    return float(np.clip(_MEMORY / cutoff_hz, SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S))
+
+
+def one_source(window: WindowStatistics) -> bool:
+    """Whether one source moves all channels: their coherence matrices have one large eigenvalue.
+
+    Frequencies count by their power. Rates of one motion are coherent whatever moves it, so one channel of each
+    coordinate is looked at.
+    """
+    columns = list({name.split("_")[0]: number for number, name in enumerate(window.states)}.values())
+    if len(columns) < 2:
+        return False
+    spectra = window.spectrum[:, columns][:, :, columns]
+    power = np.einsum("fii->fi", spectra).real
+    if not np.all(power.sum(axis=0) > 0):
+        return False
+    root = np.sqrt(np.maximum(power, np.finfo(float).tiny))
+    largest = np.linalg.eigvalsh(spectra / root[:, :, None] / root[:, None, :])[:, -1]
+    weight = np.mean(power / power.sum(axis=0), axis=1)
+    return bool(weight @ largest > _COHERENT * len(columns))
+
+
+@lru_cache(maxsize=8)
+def _models(frequencies: bytes) -> tuple[FloatArray, FloatArray]:
+    """Mean logarithm of every spectrum on the grid, shape (n,), and its inverse, shape (n, n_bins)."""
+    ratio = np.frombuffer(frequencies)[None, :] / _CUTOFFS_HZ[:, None]
+    force = 1 / (1 + ratio**2) ** 2
+    noise = (ratio / 10) ** 4
+    model = force[:, None, :] + _NOISES[None, :, None] * noise[:, None, :]
+    flat = model.reshape(-1, model.shape[-1])
+    return np.log(flat).mean(axis=-1), 1 / flat
+
 
 _ITERATIONS = 8
 _FITS = 3.0  # standard deviations of χ² within which a relation is taken to fit

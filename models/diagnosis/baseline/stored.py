@@ -9,9 +9,8 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from models.diagnosis.baseline.consistency import HeldOutReading, LeftOut
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
-from models.diagnosis.baseline.learned import Baseline
+from models.diagnosis.baseline.learned import Baseline, HeldOutReading, LeftOut
 from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import SynchronousVectors
 from models.signals.block import FloatArray

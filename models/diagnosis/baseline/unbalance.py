@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.baseline.kinematics import lowest, state_of
-from models.diagnosis.baseline.rows import Row
+from models.diagnosis.baseline.rows import Row, lowest, state_of
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray

@@ -14,25 +14,28 @@ import numpy as np
 import numpy.typing as npt
 
 from models.checkpoint import checked, prefixed, texts, unprefixed
-from models.diagnosis.likelihood.bins import BinGroups, group_bins
-from models.diagnosis.likelihood.explained import MOST_MISFIT, unexplained_at, unseen
 from models.diagnosis.likelihood.following import Linearised
-from models.diagnosis.likelihood.goodness import goodness_of_fit
-from models.diagnosis.likelihood.integrated import integrated
-from models.diagnosis.likelihood.motions import Motions
+from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, unexplained_at, unseen
+from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened, Workspace
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, ModelPoint, SpectralModel
-from models.diagnosis.likelihood.start import starting_point
+from models.diagnosis.likelihood.spectral_model import (
+    COLUMNS,
+    ROWS,
+    STRUCTURAL,
+    ModelPoint,
+    SpectralModel,
+    starting_point,
+)
 from models.diagnosis.likelihood.unbalance import Unbalance, estimate_unbalance, estimate_unbalance_by_hop
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.readings import Diagnosis, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine
-from models.physics.matrices import STATE_INDEX
+from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 
-__all__ = ["LikelihoodFit"]
+__all__ = ["LengthFits", "LikelihoodFit"]
 
 _COLD_STEPS, _WARM_STEPS = 100, 15
 _NEAR, _GAIN = 0.15, 3.0
@@ -416,3 +419,74 @@ def _dead(states: tuple[str, ...], power: FloatArray) -> list[str]:
     rates = np.array([name.endswith("_dot") for name in states])
     largest = np.where(rates, power[rates].max(initial=0.0), power[~rates].max(initial=0.0))
     return [name for name, dead in zip(states, ~(power > 1e-6 * largest), strict=True) if dead]
+
+
+class LengthFits:
+    """One fit for the window, and one for every shorter length that has news."""
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self._window = LikelihoodFit(machine, follow=True)
+        self._short: dict[int, LikelihoodFit] = {}
+        self._searched: dict[int, int] = {}
+        self._hop = 0
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything that the next hops' readings depend on, as named arrays."""
+        found = {
+            "hop": np.array(self._hop, dtype=np.int64),
+            "searched": np.array(list(self._searched.items()), dtype=np.int64).reshape(-1, 2),
+            **prefixed("window", self._window.checkpoint()),
+        }
+        for hops, fit in self._short.items():
+            found |= prefixed(f"short_{hops}", fit.checkpoint())
+        return found
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called: the next readings are the same to the last bit.
+
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+
+        Raises
+        ------
+        CheckpointError
+            If they are not those of this machine; nothing is changed then.
+        """
+        hop = int(checked(arrays, "hop", np.int64, ()))
+        searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
+        window = LikelihoodFit(self._machine, follow=True)
+        window.restore(unprefixed("window", arrays))
+        short = {hops: LikelihoodFit(self._machine) for hops in searched}
+        for hops, fit in short.items():
+            fit.restore(unprefixed(f"short_{hops}", arrays))
+        self._hop, self._searched, self._window, self._short = hop, searched, window, short
+
+    def window(self, window: WindowStatistics) -> Diagnosis:
+        """Estimate the parameters of the window at the next hop.
+
+        Raises
+        ------
+        EstimationError
+            As `LikelihoodFit.diagnose`.
+        """
+        self._hop += 1
+        return self._window.diagnose(window)
+
+    def short(self, hops: int, stretch: WindowStatistics) -> Diagnosis:
+        """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
+
+        Raises
+        ------
+        EstimationError
+            As `LikelihoodFit.diagnose`.
+        """
+        seen = self._window.glance(stretch)
+        if seen is not None:
+            return seen
+        fit = self._short.setdefault(hops, LikelihoodFit(self._machine))
+        if self._searched.get(hops) != self._hop - 1:
+            fit.start_near(self._window)
+        self._searched[hops] = self._hop
+        return fit.diagnose(stretch)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN
+from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint, SpectralModel, packed
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray

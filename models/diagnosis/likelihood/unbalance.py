@@ -12,11 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from models.diagnosis.likelihood.bins import BinGroups
+from models.diagnosis.likelihood.motions import BinGroups
 from models.diagnosis.likelihood.spectral_model import STRUCTURAL, ModelPoint, SpectralModel
-from models.diagnosis.limits import beyond
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.unbalance_vector import UnbalanceVector
+from models.diagnosis.readings import UnbalanceVector, beyond
 from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.limits import beyond
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
-from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
+from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.signals.block import FloatArray

@@ -16,8 +16,7 @@ import numpy as np
 from models.diagnosis.moments import ComplexArray
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.matrices import H_matrix, M_matrix, P_matrix, Q_matrix
-from models.physics.parameters import RotorParameters
+from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, RotorParameters
 from models.signals.block import FloatArray
 
 __all__ = ["EQUATIONS", "Equation", "EquationRows", "StatisticsView", "SynchronousEquation", "Term", "missing"]

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from models.diagnosis.moments import ComplexArray, plan_for
 from models.machine import Machine
 from models.physics.excitation import Source
-from models.physics.lyapunov import stochastic_covariance
-from models.physics.matrices import STATE_INDEX, M_matrix, P_matrix, Q_matrix
+from models.physics.response import stochastic_covariance
+from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray
 
 __all__ = ["FeatureBasis", "Float32Array", "ForceFeatures", "fit_basis", "principal_directions"]

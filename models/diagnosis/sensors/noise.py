@@ -11,12 +11,11 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.pairs import MotionPair
-from models.diagnosis.sensors.finding import Naming
 from models.diagnosis.sensors.kinematics import Banded, PairReading
-from models.diagnosis.sensors.reference import SensorReference
-from models.diagnosis.sensors.unshared import (
+from models.diagnosis.sensors.reference import (
     ChannelNoise,
+    Naming,
+    SensorReference,
     channel_noise,
     channel_rms,
     floor,
@@ -24,6 +23,7 @@ from models.diagnosis.sensors.unshared import (
     pair_noise,
     single,
 )
+from models.diagnosis.waveform import MotionPair
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.diagnosis.moments import ComplexArray
-from models.diagnosis.sensors.finding import Naming
-from models.diagnosis.sensors.reference import SensorReference
+from models.diagnosis.sensors.reference import Naming, SensorReference
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind

@@ -1,21 +1,29 @@
-"""Declared false-alarm rates, and the thresholds on standard normal test values that keep them.
-
-Per window, several parameters are tested at once. Per month, the same test is repeated at every hop on windows that
-overlap, so that neighbouring test values hang together: only a new crossing of the threshold is a new alarm.
-
-References
-----------
-D. Siegmund, Sequential Analysis (Springer, 1985), chapters IV and X; D. Siegmund and E. S. Venkatraman, "Using the
-generalized likelihood ratio statistic for sequential detection of a change-point", Annals of Statistics 23 (1995).
-"""
+"""Declared false-alarm rates, thresholds that keep them, changes that they let show, and diagnosticians that differ."""
 
 import math
 from dataclasses import dataclass
+from typing import Literal
 
+import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr, ndtri
 
-__all__ = ["MONTH_S", "Thresholds", "crossing_rate", "month_thresholds", "overshoot_correction", "window_thresholds"]
+from models.diagnosis.readings import Diagnosis
+from models.diagnosis.verdict.stretch import Stretch, from_scale, to_scale
+from models.physics.rotor import PARAMETERS
+from rotorwatch.records.windows import Agreement, Detectable, Parameter
+
+__all__ = [
+    "MONTH_S",
+    "Thresholds",
+    "agreements",
+    "crossing_rate",
+    "detectable_changes",
+    "length_to_find",
+    "month_thresholds",
+    "overshoot_correction",
+    "window_thresholds",
+]
 
 MONTH_S = 30 * 86400.0
 """The month of "false alarms per month", s."""
@@ -162,3 +170,101 @@ def _crossed(per_hop: float, overlap: int) -> float:
     if crossing_rate(low, overlap) <= per_hop:
         return low
     return float(brentq(lambda b: math.log(crossing_rate(b, overlap) / per_hop), low, high, xtol=1e-10))
+
+
+_RATE = 1e-3
+"""Probability that two diagnosticians who are both right are said to disagree in a window, about any parameter."""
+
+
+def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
+    """Compare two diagnosticians parameter by parameter.
+
+    Parameters
+    ----------
+    first, second : Diagnosis
+        Of the same window.
+
+    Returns
+    -------
+    tuple of Agreement
+        One per parameter that at least one of them could read, in the order of `PARAMETERS`.
+    """
+    one, other = ({reading.name: reading for reading in diagnosis.evaluable} for diagnosis in (first, second))
+    between = (first.by, second.by)
+    common = sum(name in one and name in other for name in PARAMETERS)
+    threshold = window_thresholds(_RATE, max(1, common)).first
+    found = []
+    for name in PARAMETERS:
+        if name in one and name in other:
+            z = _difference_z(one[name], other[name])
+            verdict: Literal["agree", "disagree"] = "agree" if abs(z) <= threshold else "disagree"
+            found.append(Agreement(name=name, between=between, verdict=verdict, difference_z=z))
+        elif name in one or name in other:
+            found.append(Agreement(name=name, between=between, verdict="only-one"))
+    return tuple(found)
+
+
+def _difference_z(one: Parameter, other: Parameter) -> float:
+    difference = (other.relative_change or 0.0) - (one.relative_change or 0.0)
+    error = math.hypot(one.standard_error or 0.0, other.standard_error or 0.0)
+    return difference / error if error > 0 else math.inf * difference if difference else 0.0
+
+
+_POWER = 0.95
+
+
+def detectable_changes(
+    stretch: Stretch, thresholds: Thresholds, length_s: float, power: float = _POWER
+) -> tuple[Detectable, ...]:
+    """Minimum detectable changes of a stretch of data, from its own information.
+
+    In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
+    error is the one with all other parameters free: the change shall not only be noticed, it shall be told from a
+    change of any other parameter, so where estimates hang together the power is higher than stated.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What the data says; the errors of a parameter hardly depend on its value.
+    thresholds : Thresholds
+        From the declared rate.
+    length_s : float
+        Length of the data in it, s.
+    power : float
+        Probability of finding the change.
+    """
+    distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
+    return tuple(
+        Detectable(
+            name=name,
+            loss=max(-1.0, from_scale(name, -distance * error)),
+            gain=from_scale(name, distance * error),
+            length_s=length_s,
+        )
+        for name, error in zip(stretch.names, errors, strict=True)
+    )
+
+
+def length_to_find(found: Detectable, change: float) -> float:
+    """Data it takes to find another change of the parameter: standard errors fall as one over the root of the length.
+
+    Parameters
+    ----------
+    found : Detectable
+        Smallest change and the length it takes.
+    change : float
+        Relative change that is to be found instead, not 0 and above -1.
+
+    Returns
+    -------
+    float
+        Length, s.
+
+    Raises
+    ------
+    ValueError
+        If the change is 0 or -1 and below.
+    """
+    if change == 0 or not change > -1:
+        raise ValueError(f"change of {found.name} to be found is {change}, expected above -1 and not 0")
+    return found.length_s * (to_scale(found.name, found.gain) / to_scale(found.name, change)) ** 2

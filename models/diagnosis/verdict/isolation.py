@@ -22,7 +22,7 @@ from scipy.special import ndtr
 from models.diagnosis.readings import Diagnosis, possible_reading
 from models.diagnosis.verdict.calibration import Thresholds, window_thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch_of
-from models.physics.parameters import PARAMETERS
+from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 

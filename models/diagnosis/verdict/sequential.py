@@ -27,7 +27,7 @@ from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, r
 from models.diagnosis.verdict.stretch import Stretch, added
 from models.errors import CheckpointError
 from models.machine import MachineFile
-from models.physics.parameters import PARAMETER_TEXT, PARAMETERS
+from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Finding, Parameter, Verdict
 

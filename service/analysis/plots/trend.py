@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.errors import MachineFileError, RotorwatchError
 from models.machine import AlarmSettings
-from models.physics.parameters import PARAMETER_TEXT
+from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray
 from models.signals.keys import PREFIX, MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind

@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 
 from models.alarm_names import MODEL
 from models.machine import AlarmSettings
-from models.physics.parameters import PARAMETER_TEXT
+from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmEventData
 from rotorwatch.records.health import MEASURES
 from service.analysis.plots.style import (

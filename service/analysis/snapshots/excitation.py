@@ -10,19 +10,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.likelihood.bins import AVERAGES_PER_BIN, BinGroups, group_bins
-from models.diagnosis.likelihood.integrated import integrated
-from models.diagnosis.likelihood.motions import Motions
+from models.diagnosis.likelihood.motions import AVERAGES_PER_BIN, BinGroups, Motions, group_bins, integrated
 from models.diagnosis.likelihood.scoring import FisherScoring
-from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SpectralModel
-from models.diagnosis.likelihood.start import starting_point
+from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, SpectralModel, starting_point
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.excitation import low_pass
-from models.physics.matrices import COORDINATES
-from models.physics.parameters import RotorParameters
+from models.physics.rotor import COORDINATES, RotorParameters
 from models.signals.block import FloatArray
 from service.analysis.snapshots.sensor_noise import noise_density, sensor_noise
 

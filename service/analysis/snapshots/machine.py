@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Sequence
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.diagnosis.window import WindowStatistics
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.analysis.snapshots.correlation import correlation_snapshot

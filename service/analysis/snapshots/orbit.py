@@ -8,9 +8,8 @@ import numpy as np
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
-from models.physics.lyapunov import synchronous_response
-from models.physics.matrices import STATE_INDEX
-from models.physics.parameters import RotorParameters, changed
+from models.physics.response import synchronous_response
+from models.physics.rotor import STATE_INDEX, RotorParameters, changed
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
 from service.analysis.snapshots.channels import figures, orbit_pairs

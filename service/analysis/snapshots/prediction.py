@@ -14,13 +14,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.likelihood.bins import group_bins
+from models.diagnosis.likelihood.motions import group_bins
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
-from models.physics.matrices import system_A
-from models.physics.parameters import PARAMETERS, RotorParameters, changed
+from models.physics.rotor import PARAMETERS, RotorParameters, changed, system_A
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 from service.analysis.snapshots.excitation import Excitation, excitation_of

@@ -10,8 +10,7 @@ from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
-from models.signals.endpoint import is_loopback
-from models.signals.link import LinkSettings
+from models.signals.link import LinkSettings, is_loopback
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.fields import JSON

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from models.alarm_names import alarm_kind
 from models.diagnosis.readings import Z95
-from models.physics.parameters import PARAMETER_TEXT
+from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 
 __all__ = ["Alarm", "AlarmEvent"]

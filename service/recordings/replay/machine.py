@@ -3,7 +3,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-from models.commissioning.installed import Installed, install
+from models.commissioning.commissioned import Installed, install
 from models.errors import MachineFileError
 from models.machine import load_machine_file
 from models.signals.keys import MachineKeys

@@ -8,7 +8,7 @@ import json
 import time
 from collections.abc import Callable
 
-from models.commissioning.installed import Installed
+from models.commissioning.commissioned import Installed
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.replays import OfflineSummary, ReplayProgress
