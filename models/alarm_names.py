@@ -50,24 +50,13 @@ def data_alarm(kind: FaultKind) -> str:
 
 @dataclass(frozen=True, slots=True)
 class AlarmKind:
-    """What is to be known of an alarm beside its name.
+    """What is to be known of an alarm beside its name."""
 
-    Attributes
-    ----------
-    text : str
-        What it is about, in words.
-    about : {"machine", "data", "monitor"}
-        What is wrong while it is raised. What is wrong with the data or the monitor says nothing of the machine.
-    cleared : str
-        What is so again once it has cleared.
-    raised : str
-        What is so while it is raised, where nothing more is known of it.
-    """
-
-    text: str
+    text: str  # what it is about, in words
+    # What is wrong while it is raised. What is wrong with the data or the monitor says nothing of the machine.
     about: Literal["machine", "data", "monitor"]
-    cleared: str
-    raised: str = ""
+    cleared: str  # what is so again once it has cleared
+    raised: str = ""  # what is so while it is raised, where nothing more is known of it
 
 
 ALARMS: Mapping[str, AlarmKind] = MappingProxyType(

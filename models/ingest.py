@@ -58,27 +58,13 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Admission:
-    """What became of a block.
+    """What became of a block."""
 
-    Attributes
-    ----------
-    reason : Reason or None
-        Why it was refused; None if it was accepted.
-    text : str
-        A sentence naming machine, field, value and expectation; empty if there is nothing to say.
-    gap_s : float
-        Seconds of data missing before an accepted block (0 = contiguous).
-    clock_step_s : float
-        Seconds by which the data's time is another one from this block on, either way.
-    new_run : bool
-        Whether that is because the publisher was started anew, and not because its clock was set.
-    """
-
-    reason: Reason | None = None
-    text: str = ""
-    gap_s: float = 0.0
-    clock_step_s: float = 0.0
-    new_run: bool = False
+    reason: Reason | None = None  # why it was refused; None if it was accepted
+    text: str = ""  # a sentence naming machine, field, value and expectation; empty if there is nothing to say
+    gap_s: float = 0.0  # seconds of data missing before an accepted block (0 = contiguous)
+    clock_step_s: float = 0.0  # seconds by which the data's time is another one from this block on, either way
+    new_run: bool = False  # whether that is because the publisher was started anew, and not because its clock was set
 
     @property
     def accepted(self) -> bool:
@@ -93,20 +79,13 @@ class Admission:
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """Blocks of one run in which sequence and time went on together: what was received, and what comes next.
-
-    Attributes
-    ----------
-    run : int
-    first, first_ns : int
-        Sequence and time of its first block.
-    sequence, start_ns : int
-        What the next block should start with.
-    """
+    """Blocks of one run in which sequence and time went on together: what was received, and what comes next."""
 
     run: int
+    # Sequence and time of its first block.
     first: int
     first_ns: int
+    # What the next block should start with.
     sequence: int
     start_ns: int
 

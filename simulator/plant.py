@@ -44,18 +44,11 @@ __all__ = ["NONLINEAR", "NonlinearPlant", "Plant", "PlantSamples", "crack_stiffn
 
 @dataclass(frozen=True, slots=True)
 class PlantSamples:
-    """Consecutive samples of the plant.
+    """Consecutive samples of the plant."""
 
-    Attributes
-    ----------
-    states : ndarray, shape (n_samples, 12)
-        Displacements, tilts and their rates in the order of `models.physics.rotor.STATES`, SI.
-    theta_rad : ndarray, shape (n_samples,)
-        Shaft angle in [0, 2π).
-    """
-
+    # (n_samples, 12): displacements, tilts and their rates in the order of `models.physics.rotor.STATES`, SI
     states: FloatArray
-    theta_rad: FloatArray
+    theta_rad: FloatArray  # (n_samples,), shaft angle in [0, 2π)
 
 
 class Plant:

@@ -46,29 +46,15 @@ class PublishError(RotorwatchError):
 
 @dataclass(frozen=True, slots=True)
 class PublishSettings:
-    """How to publish.
+    """How to publish."""
 
-    Attributes
-    ----------
-    link : LinkSettings
-        Endpoints; connects to a local monitor by default.
-    pace : float or None
-        Data seconds per second; None is as fast as the subscribers take it.
-    encoding : {"raw", "arrow"}
-    wait_for_subscriber_s : float or None
-        Hold the first block back until someone subscribes, at most this long.
-    linger_s : float
-        How long the session stays open after the last block, so that a subscriber can fetch what it missed.
-    drain_s : float
-        How long a monitor may take to catch up with an unpaced stream before the session closes.
-    """
-
-    link: LinkSettings = _LOCAL
-    pace: float | None = 1.0
+    link: LinkSettings = _LOCAL  # endpoints; connects to a local monitor by default
+    pace: float | None = 1.0  # data seconds per second; None is as fast as the subscribers take it
     encoding: BlockEncoding = "raw"
-    wait_for_subscriber_s: float | None = None
+    wait_for_subscriber_s: float | None = None  # hold the first block back until someone subscribes, at most this long
+    # How long the session stays open after the last block, so that a subscriber can fetch what it missed.
     linger_s: float = 2.0
-    drain_s: float = 60.0
+    drain_s: float = 60.0  # how long a monitor may take to catch up with an unpaced stream before the session closes
 
 
 def publish(

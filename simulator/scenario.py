@@ -114,50 +114,33 @@ class Rub(BaseModel):
 
 
 class Event(BaseModel):
-    """One change at one time: of a parameter, the speed, the excitation, a source, a sensor, or outside the model.
-
-    Attributes
-    ----------
-    at_s : float
-        Start of the change, data seconds from the first sample.
-    ramp_s : float
-        Duration of the change; 0 is a step. Ramps advance in steps of 0.1 s.
-    parameter, relative_change
-        One of k_by, c_by, k_bz, c_bz, e, EI, and its change from the *original* machine.
-    speed_rpm : float
-        New speed.
-    source, cutoff_hz, force_rms_N, direction
-        Name of a source, and exactly one new setting of it.
-    excitation_level : float
-        Factor on the white noise that drives all sources; 1 at the start.
-    anomaly, size
-        "crack", "rub" or "added_mass" and how much of it: relative loss of the shaft's bending stiffness across the
-        open crack; stiffness of the contact over the shaft's 3EI/L³; relative increase of the disc's mass. 0 is none.
-    sensor, sensor_fault, value_SI
-        Channel name, kind of fault ("none" ends all faults of the channel), and its value: in the SI unit of the
-        channel for offset and clip, a plain ratio for gain and noise_relative, seconds for delay.
-    swapped_with : str
-        The other channel of a swap, of the same quantity and unit.
-    """
+    """One change at one time: of a parameter, the speed, the excitation, a source, a sensor, or outside the model."""
 
     model_config = _STRICT
 
-    at_s: float = Field(ge=0)
-    ramp_s: float = Field(default=0.0, ge=0)
+    at_s: float = Field(ge=0)  # start of the change, data seconds from the first sample
+    ramp_s: float = Field(default=0.0, ge=0)  # duration of the change; 0 is a step. Ramps advance in steps of 0.1 s
+    # One of k_by, c_by, k_bz, c_bz, e, EI, and its change from the *original* machine.
     parameter: str | None = None
     relative_change: float | None = Field(default=None, gt=-1, le=100)
-    speed_rpm: float | None = Field(default=None, gt=0, le=1e6)
+    speed_rpm: float | None = Field(default=None, gt=0, le=1e6)  # new speed
+    # Name of a source, and exactly one new setting of it.
     source: str | None = None
     cutoff_hz: float | None = Field(default=None, gt=0, le=1e5)
     force_rms_N: float | None = Field(default=None, ge=0, le=1e9)
     direction: tuple[float, float, float, float, float, float] | None = None
+    # Factor on the white noise that drives all sources; 1 at the start.
     excitation_level: float | None = Field(default=None, ge=0, le=1e3)
+    # "crack", "rub" or "added_mass" and how much of it: relative loss of the shaft's bending stiffness across the open
+    # crack; stiffness of the contact over the shaft's 3EI/L³; relative increase of the disc's mass. 0 is none.
     anomaly: str | None = None
     size: float | None = Field(default=None, ge=0)
+    # Channel name, kind of fault ("none" ends all faults of the channel), and its value: in the SI unit of the channel
+    # for offset and clip, a plain ratio for gain and noise_relative, seconds for delay.
     sensor: str | None = None
     sensor_fault: SensorFault | None = None
     value_SI: float | None = None
-    swapped_with: str | None = None
+    swapped_with: str | None = None  # the other channel of a swap, of the same quantity and unit
 
     @model_validator(mode="after")
     def _one_change(self) -> Self:

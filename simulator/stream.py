@@ -87,24 +87,13 @@ BlockStream = Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """What has been sent or recorded so far.
-
-    Attributes
-    ----------
-    data_s : float
-        Data seconds in these blocks.
-    elapsed_s : float
-        Seconds since the first block.
-    truth : TruthRecord or None
-        The latest one.
-    heard : bool or None
-        Whether somebody subscribes to the stream; None as long as it is not known, and for a recording.
-    """
+    """What has been sent or recorded so far."""
 
     blocks: int = 0
-    data_s: float = 0.0
-    elapsed_s: float = 0.0
-    truth: TruthRecord | None = None
+    data_s: float = 0.0  # data seconds in these blocks
+    elapsed_s: float = 0.0  # seconds since the first block
+    truth: TruthRecord | None = None  # the latest one
+    # Whether somebody subscribes to the stream; None as long as it is not known, and for a recording.
     heard: bool | None = None
 
     @property

@@ -36,46 +36,24 @@ _Values = tuple[float, ...]
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What the plant is made of, from one change to the next.
+    """What the plant is made of, from one change to the next."""
 
-    Attributes
-    ----------
-    relative_changes : mapping of str to float
-        Every diagnosed parameter's change from the original machine.
-    sources : tuple of NamedSource
-        Always as many and in the same order, so that the state carries over.
-    excitation_level : float
-        Factor on the white noise that drives all sources.
-    anomalies : mapping of str to float
-        Size of what the diagnosis knows nothing of, by kind; kinds of size 0 are left out.
-    rub : Rub or None
-        Where the disc may touch the casing.
-    """
-
-    relative_changes: Mapping[str, float]
+    relative_changes: Mapping[str, float]  # every diagnosed parameter's change from the original machine
     speed_rpm: float
-    sources: tuple[NamedSource, ...]
-    excitation_level: float = 1.0
+    sources: tuple[NamedSource, ...]  # always as many and in the same order, so that the state carries over
+    excitation_level: float = 1.0  # factor on the white noise that drives all sources
+    # Size of what the diagnosis knows nothing of, by kind; kinds of size 0 are left out.
     anomalies: Mapping[str, float] = field(default_factory=dict)
-    rub: Rub | None = None
+    rub: Rub | None = None  # where the disc may touch the casing
 
 
 @dataclass(frozen=True, slots=True)
 class Timeline:
-    """Everything that happens, by sample number.
+    """Everything that happens, by sample number."""
 
-    Attributes
-    ----------
-    conditions : tuple of (sample number, Condition)
-        Ascending, the first at 0; each holds from its sample on.
-    sensor_faults : mapping of channel name to a tuple of (sample number, SensorFaults)
-        Ascending; channels without events are absent.
-    truth : tuple of (sample number, targets that are ramping then)
-        When a truth record is due: at the start, at every change, and every second during a ramp.
-    """
-
-    conditions: tuple[tuple[int, Condition], ...]
-    sensor_faults: Mapping[str, tuple[tuple[int, SensorFaults], ...]]
+    conditions: tuple[tuple[int, Condition], ...]  # ascending, the first at 0; each holds from its sample on
+    sensor_faults: Mapping[str, tuple[tuple[int, SensorFaults], ...]]  # ascending; channels without events are absent
+    # When a truth record is due: at the start, at every change, and every second during a ramp.
     truth: tuple[tuple[int, tuple[str, ...]], ...]
 
 

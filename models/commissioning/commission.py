@@ -225,19 +225,11 @@ def _readings(name: str, compared: Sequence[tuple[str, int, Diagnosis]]) -> tupl
 
 @dataclass(frozen=True, slots=True)
 class Commissioning:
-    """What came of it.
-
-    Attributes
-    ----------
-    commissioned : Commissioned or None
-        None if it was refused.
-    machine : Machine or None
-        With all parameters, where they are given or identified: networks can be trained for it.
-    """
+    """What came of it."""
 
     report: CommissioningReport
-    commissioned: Commissioned | None
-    machine: Machine | None
+    commissioned: Commissioned | None  # None if it was refused
+    machine: Machine | None  # with all parameters, where they are given or identified: networks can be trained for it
 
 
 def commission(

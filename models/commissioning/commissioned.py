@@ -67,16 +67,10 @@ class KnowledgeLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Knowledge:
-    """Level of knowledge of a machine.
-
-    Attributes
-    ----------
-    text : str
-        Why, in a sentence.
-    """
+    """Level of knowledge of a machine."""
 
     level: KnowledgeLevel
-    text: str
+    text: str  # why, in a sentence
 
 
 def knowledge_of(machine: MachineFile) -> Knowledge:
@@ -322,19 +316,11 @@ _MANIFEST = "manifest.json"
 
 @dataclass(frozen=True, slots=True)
 class Installed:
-    """One machine and all that its monitor knows of it.
-
-    Attributes
-    ----------
-    bundle : Bundle or None
-        Trained networks.
-    commissioned : Commissioned or None
-        What was learned on the healthy machine.
-    """
+    """One machine and all that its monitor knows of it."""
 
     machine: MachineFile
-    bundle: Bundle | None = None
-    commissioned: Commissioned | None = None
+    bundle: Bundle | None = None  # trained networks
+    commissioned: Commissioned | None = None  # what was learned on the healthy machine
 
     @property
     def known(self) -> Machine | None:

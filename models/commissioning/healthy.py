@@ -26,33 +26,15 @@ __all__ = ["HealthyRecording", "Line", "foreign_lines", "healthy_from_blocks", "
 
 @dataclass(frozen=True, slots=True)
 class HealthyRecording:
-    """What a recording gave.
+    """What a recording gave."""
 
-    Attributes
-    ----------
-    name : str
-        Of the file.
-    plan : Plan
-        Sizes of its hops.
-    stretches : tuple of tuple of HopMoments
-        Hops without an interruption between them.
-    gaps : int
-        Interruptions.
-    missing_s : float
-        Data that they cost.
-    refused : mapping of str to int
-        Blocks that could not be used, by reason.
-    last_refusal : str
-        The latest such reason in a sentence.
-    """
-
-    name: str
-    plan: Plan
-    stretches: tuple[tuple[HopMoments, ...], ...]
-    gaps: int = 0
-    missing_s: float = 0.0
-    refused: tuple[tuple[str, int], ...] = ()
-    last_refusal: str = ""
+    name: str  # of the file
+    plan: Plan  # sizes of its hops
+    stretches: tuple[tuple[HopMoments, ...], ...]  # hops without an interruption between them
+    gaps: int = 0  # interruptions
+    missing_s: float = 0.0  # data that they cost
+    refused: tuple[tuple[str, int], ...] = ()  # blocks that could not be used, by reason
+    last_refusal: str = ""  # the latest such reason in a sentence
 
     @property
     def hops(self) -> tuple[HopMoments, ...]:
@@ -176,19 +158,11 @@ _HARMONICS = 12
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line.
+    """A line."""
 
-    Attributes
-    ----------
-    state : str
-        Where it is strongest.
-    share : float
-        Of the power of that channel's random part.
-    """
-
-    state: str
+    state: str  # where it is strongest
     frequency_hz: float
-    share: float
+    share: float  # of the power of that channel's random part
 
 
 def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:

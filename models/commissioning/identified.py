@@ -35,25 +35,14 @@ _SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """A rotor identified on healthy windows.
+    """A rotor identified on healthy windows."""
 
-    Attributes
-    ----------
-    machine : Machine
-        The machine file with every parameter filled in.
-    names : tuple of str
-        Parameters that were identified.
-    covariance : ndarray, shape (6, 6)
-        Of the identified values, in the scale of the errors (`models.diagnosis.verdict.stretch`), in the order of
-        `PARAMETERS`; zero where nothing was identified.
-    diagnoses : tuple of Diagnosis
-        The healthy windows read against it, without its uncertainty.
-    """
-
-    machine: Machine
-    names: tuple[str, ...]
+    machine: Machine  # the machine file with every parameter filled in
+    names: tuple[str, ...]  # parameters that were identified
+    # (6, 6): of the identified values, in the scale of the errors (`models.diagnosis.verdict.stretch`), in the order of
+    # `PARAMETERS`; zero where nothing was identified
     covariance: FloatArray
-    diagnoses: tuple[Diagnosis, ...]
+    diagnoses: tuple[Diagnosis, ...]  # the healthy windows read against it, without its uncertainty
 
 
 def identify(

@@ -50,52 +50,28 @@ ComplexArray = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Sizes and columns derived once from a machine file.
+    """Sizes and columns derived once from a machine file."""
 
-    Attributes
-    ----------
-    rate_hz : float
-        Sampling rate.
-    states : tuple of str
-        Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
-        statistics' columns.
-    columns : ndarray of int
-        Column of the stream for each of `states`.
-    scales : ndarray
-        Factor to SI for each of `states`.
-    angle_column : int or None
-        Column of the shaft angle; without it the regressors are the mean and, where `speed_rad_s` is given, the most
-        likely line near it.
-    hop, preamble, segment : int
-        Samples per hop, samples of history a hop needs before it, samples per spectral segment.
-    lags : ndarray of int
-        Lags of the correlation functions, samples.
-    bins : ndarray of int
-        Frequency bins of a segment's Fourier transform that are kept.
-    hops : int
-        Hops in a full window.
-    max_span_ns : int
-        Oldest data a window may hold.
-    speed_rad_s : float or None
-        Speed to look for where there is no shaft angle; None: the rotation is not looked for.
-    speed_tolerance : float
-        How far the speed may be off, relative.
-    """
-
-    rate_hz: float
+    rate_hz: float  # sampling rate
+    # Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
+    # statistics' columns.
     states: tuple[str, ...]
-    columns: npt.NDArray[np.intp]
-    scales: FloatArray
+    columns: npt.NDArray[np.intp]  # column of the stream for each of `states`
+    scales: FloatArray  # factor to SI for each of `states`
+    # Column of the shaft angle; without it the regressors are the mean and, where `speed_rad_s` is given, the most
+    # likely line near it.
     angle_column: int | None
+    # Samples per hop, samples of history a hop needs before it, samples per spectral segment.
     hop: int
     preamble: int
     segment: int
-    lags: npt.NDArray[np.intp]
-    bins: npt.NDArray[np.intp]
-    hops: int
-    max_span_ns: int
+    lags: npt.NDArray[np.intp]  # lags of the correlation functions, samples
+    bins: npt.NDArray[np.intp]  # frequency bins of a segment's Fourier transform that are kept
+    hops: int  # hops in a full window
+    max_span_ns: int  # oldest data a window may hold
+    # Speed to look for where there is no shaft angle; None: the rotation is not looked for.
     speed_rad_s: float | None = None
-    speed_tolerance: float = 0.0
+    speed_tolerance: float = 0.0  # how far the speed may be off, relative
 
     @property
     def lags_s(self) -> FloatArray:
@@ -158,34 +134,23 @@ def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
 
 @dataclass(frozen=True, slots=True)
 class HopMoments:
-    """Sums over one hop, of the measured states x followed by the regressors n.
+    """Sums over one hop, of the measured states x followed by the regressors n."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Time of the first sample and of the one after the last.
-    products : ndarray, shape (n_lags, n, n)
-        ``products[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the t of the hop, a = (x, n).
-    segments : ndarray, shape (n_segments, n_bins, n)
-        Fourier coefficients of Hann-windowed segments, scaled so that their squared magnitude estimates the two-sided
-        power spectral density per Hz.
-    turned_rad : float
-        Shaft angle covered in the hop (nan without a phase reference).
-    line : RotationLine or None
-        The most likely rotation where there is no phase reference. The regressors follow it, from an unknown angle.
-    waveform : Waveform
-        What the samples of each measured state look like and, last, those of the shaft angle if there is one.
-    pair_powers : ndarray, shape (n_pairs, n_bands, 3)
-        Powers of the motions that are measured twice, their mean taken out (`models.diagnosis.waveform.pair_powers`).
-    """
-
+    # Time of the first sample and of the one after the last.
     start_ns: int
     end_ns: int
+    # (n_lags, n, n): ``products[l, i, j] = Σ_t a_i(t - lag_l) a_j(t)`` over the t of the hop, a = (x, n)
     products: FloatArray
+    # (n_segments, n_bins, n): Fourier coefficients of Hann-windowed segments, scaled so that their squared magnitude
+    # estimates the two-sided power spectral density per Hz
     segments: ComplexArray
-    turned_rad: float
+    turned_rad: float  # shaft angle covered in the hop (nan without a phase reference)
+    # The most likely rotation where there is no phase reference. The regressors follow it, from an unknown angle.
     line: RotationLine | None
+    # What the samples of each measured state look like and, last, those of the shaft angle if there is one.
     waveform: Waveform
+    # (n_pairs, n_bands, 3): powers of the motions that are measured twice, their mean taken out
+    # (`models.diagnosis.waveform.pair_powers`)
     pair_powers: ComplexArray
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -319,35 +284,20 @@ STEADY = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """How fast the machine turned.
+    """How fast the machine turned."""
 
-    Attributes
-    ----------
-    source : str
-        Where the speed is from: ``phase reference``, ``estimated`` from the vibration, or ``unknown``.
-    hop_speed_rad_s : ndarray, shape (n_hops,)
-        Nan where unknown.
-    by_hop : bool
-        Whether every hop has its own coefficients.
-    """
-
+    # Where the speed is from: ``phase reference``, ``estimated`` from the vibration, or ``unknown``.
     source: SpeedSource
-    hop_speed_rad_s: FloatArray
-    by_hop: bool
+    hop_speed_rad_s: FloatArray  # (n_hops,), nan where unknown
+    by_hop: bool  # whether every hop has its own coefficients
 
 
 @dataclass(frozen=True, slots=True)
 class HopCoefficients:
-    """What is taken out hop by hop, on the regressors (1, cos θ, sin θ).
+    """What is taken out hop by hop, on the regressors (1, cos θ, sin θ)."""
 
-    Attributes
-    ----------
-    hops : ndarray, shape (n_hops, n, 3)
-    segments : ndarray, shape (n_segments, n, 3)
-    """
-
-    hops: FloatArray
-    segments: FloatArray
+    hops: FloatArray  # (n_hops, n, 3)
+    segments: FloatArray  # (n_segments, n, 3)
 
 
 def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:

@@ -54,23 +54,17 @@ class UnbalanceVector:
     """The unbalance over the nominal one, a complex number ρ: 1 is no change, j the same turned by 90°.
 
     Angles count from the nominal heavy spot in the direction of rotation.
-
-    Attributes
-    ----------
-    real, imaginary : float
-        Of ρ.
-    variance_real, covariance, variance_imaginary : float
-        Of these two.
-    foreign : str
-        Why what turns with the shaft is not what an unbalance makes, so that none of this should be believed; empty if
-        it is.
     """
 
+    # Of ρ.
     real: float
     imaginary: float
+    # Of these two.
     variance_real: float
     covariance: float
     variance_imaginary: float
+    # Why what turns with the shaft is not what an unbalance makes, so that none of this should be believed; empty if it
+    # is.
     foreign: str = ""
 
     def widened(self, variance: float) -> "UnbalanceVector":
@@ -214,47 +208,29 @@ def _stated(vector: UnbalanceVector) -> VectorRecord:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """One diagnostician's opinion of one window.
+    """One diagnostician's opinion of one window."""
 
-    Attributes
-    ----------
-    by : str
-        Who: ``likelihood``, ``network``, ``relation`` or ``paper``.
-    parameters : tuple of Parameter
-        The parameters it speaks of, evaluable or with the reason why not.
-    equations : tuple of Equation
-        The equations it evaluated; empty for the likelihood.
-    covariance : ndarray, shape (m, m), or None
-        Covariance of the m evaluable `parameters`' changes, in their order; None where a diagnostician knows only
-        single standard errors.
-    unbalance : UnbalanceVector or None
-        Of e, where it is evaluable and there is a phase reference: size and direction.
-    common : ndarray, shape (m, m), or None
-        Part of `covariance` that every window shares, as the error of a commissioning does: further windows do not
-        remove it. None where there is no such part.
-    misfit_z : float or None
-        Over-identification: how far the window is from anything the model can explain, standard normal where the model
-        holds; None where the diagnostician has no such test.
-    suspect : str
-        What explains the misfit best, if one thing does: a sensor's gain, a mass, a shaft unequal in y and z; empty if
-        nothing stands out or there is no such test.
-    unexplained : str
-        Why nothing that is read here should be believed: the window is so far from all the model can explain that
-        parameters fitted to it mean nothing. Empty where the model explains it, however significant a misfit is.
-    steps : int
-        Search steps it took (0 where there is no search).
-    """
-
-    by: str
-    parameters: tuple[Parameter, ...] = ()
-    equations: tuple[Equation, ...] = ()
+    by: str  # who: ``likelihood``, ``network``, ``relation`` or ``paper``
+    parameters: tuple[Parameter, ...] = ()  # the parameters it speaks of, evaluable or with the reason why not
+    equations: tuple[Equation, ...] = ()  # the equations it evaluated; empty for the likelihood
+    # (m, m): covariance of the m evaluable `parameters`' changes, in their order; None where a diagnostician knows only
+    # single standard errors
     covariance: FloatArray | None = None
+    # Of e, where it is evaluable and there is a phase reference: size and direction.
     unbalance: UnbalanceVector | None = None
+    # (m, m): part of `covariance` that every window shares, as the error of a commissioning does: further windows do
+    # not remove it. None where there is no such part.
     common: FloatArray | None = None
+    # Over-identification: how far the window is from anything the model can explain, standard normal where the model
+    # holds; None where the diagnostician has no such test.
     misfit_z: float | None = None
+    # What explains the misfit best, if one thing does: a sensor's gain, a mass, a shaft unequal in y and z; empty if
+    # nothing stands out or there is no such test.
     suspect: str = ""
+    # Why nothing that is read here should be believed: the window is so far from all the model can explain that
+    # parameters fitted to it mean nothing. Empty where the model explains it, however significant a misfit is.
     unexplained: str = ""
-    steps: int = 0
+    steps: int = 0  # search steps it took (0 where there is no search)
 
     @property
     def evaluable(self) -> tuple[Parameter, ...]:

@@ -28,23 +28,13 @@ _DIGEST = 16
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Consecutive samples, known by where they begin and by their digest.
+    """Consecutive samples, known by where they begin and by their digest."""
 
-    Attributes
-    ----------
-    start_ns : int
-        Time of the hop, or of the first pending sample.
-    block_ns, row : int
-        Start of the block that the first sample is of, and its row there.
-    rows : int
-        How many samples, those before the hop included.
-    digest : bytes
-    """
-
-    start_ns: int
+    start_ns: int  # time of the hop, or of the first pending sample
+    # Start of the block that the first sample is of, and its row there.
     block_ns: int
     row: int
-    rows: int
+    rows: int  # how many samples, those before the hop included
     digest: bytes
 
 

@@ -38,21 +38,12 @@ _STRONG, _FEW_HOPS = 15.0, 6
 
 @dataclass(frozen=True, slots=True)
 class RotationLine:
-    """The most likely line of one hop.
+    """The most likely line of one hop."""
 
-    Attributes
-    ----------
-    speed_rad_s : float
-        Its frequency in the middle of the samples.
-    sweep_rad_s2 : float
-        How fast that changes.
-    strength : float
-        Its power over that of its surroundings, mean over the channels; about 1 where there is only noise, and some 3
-        to 8 at the largest peak of noise.
-    """
-
-    speed_rad_s: float
-    sweep_rad_s2: float
+    speed_rad_s: float  # its frequency in the middle of the samples
+    sweep_rad_s2: float  # how fast that changes
+    # Its power over that of its surroundings, mean over the channels; about 1 where there is only noise, and some 3 to
+    # 8 at the largest peak of noise.
     strength: float
 
     def angle(self, t_s: FloatArray) -> FloatArray:

@@ -45,27 +45,16 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class ShapeSpread(BaseModel):
-    """Healthy shape of one channel and its spread.
-
-    Attributes
-    ----------
-    mean : tuple of float
-        ρ at the lags.
-    directions : tuple of tuple of float
-        Each turns a deviation of ρ into a coordinate with unit variance from sampling alone.
-    variance : float
-        tr S of the healthy windows in these coordinates.
-    freedom : float
-        f, between 1 and the number of directions.
-    """
+    """Healthy shape of one channel and its spread."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     channel: str = Field(min_length=1)
-    mean: tuple[_Finite, ...] = Field(min_length=2)
+    mean: tuple[_Finite, ...] = Field(min_length=2)  # ρ at the lags
+    # Each turns a deviation of ρ into a coordinate with unit variance from sampling alone.
     directions: tuple[tuple[_Finite, ...], ...] = Field(min_length=1)
-    variance: float = Field(gt=0, allow_inf_nan=False)
-    freedom: float = Field(ge=1, allow_inf_nan=False)
+    variance: float = Field(gt=0, allow_inf_nan=False)  # tr S of the healthy windows in these coordinates
+    freedom: float = Field(ge=1, allow_inf_nan=False)  # f, between 1 and the number of directions
 
     @model_validator(mode="after")
     def _alike(self) -> "ShapeSpread":
@@ -81,24 +70,14 @@ class ShapeSpread(BaseModel):
 
 
 class HealthyShape(BaseModel):
-    """What the correlation functions of a healthy machine look like.
-
-    Attributes
-    ----------
-    windows : int
-        Healthy windows it was learned from.
-    window_s : float
-        Length of the shortest of them.
-    speed_rad_s : tuple of float or None
-        Slowest and fastest of them; None without a phase reference.
-    """
+    """What the correlation functions of a healthy machine look like."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    windows: int = Field(ge=FEWEST_WINDOWS)
-    window_s: float = Field(gt=0, allow_inf_nan=False)
+    windows: int = Field(ge=FEWEST_WINDOWS)  # healthy windows it was learned from
+    window_s: float = Field(gt=0, allow_inf_nan=False)  # length of the shortest of them
     lags_s: tuple[_Finite, ...] = Field(min_length=2)
-    speed_rad_s: tuple[_Finite, _Finite] | None
+    speed_rad_s: tuple[_Finite, _Finite] | None  # slowest and fastest of them; None without a phase reference
     channels: tuple[ShapeSpread, ...] = Field(min_length=1)
 
     @model_validator(mode="after")

@@ -35,33 +35,21 @@ CountArray = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Waveform:
-    """Statistics of single channels, without any model; shape (n_channels,), or (n_hops, n_channels) hop by hop.
+    """Statistics of single channels, without any model; shape (n_channels,), or (n_hops, n_channels) hop by hop."""
 
-    Attributes
-    ----------
-    n_samples : int
-        Samples each value stands for.
-    mean, rms : ndarray
-        Mean, and root mean square about it, SI units.
-    minimum, maximum : ndarray
-        Smallest and largest sample.
-    at_minimum, at_maximum : ndarray of int
-        Samples exactly at the minimum or maximum that have an equal neighbour: flat tops.
-    longest_run : ndarray of int
-        Most samples in a row that are exactly equal; 1 if no neighbours are.
-    step : ndarray
-        Smallest difference between unequal neighbours: the quantisation step, if there is one. Nan where no neighbours
-        are equal (not quantised) or all are.
-    """
-
-    n_samples: int
+    n_samples: int  # samples each value stands for
+    # Mean, and root mean square about it, SI units.
     mean: FloatArray
     rms: FloatArray
+    # Smallest and largest sample.
     minimum: FloatArray
     maximum: FloatArray
+    # Samples exactly at the minimum or maximum that have an equal neighbour: flat tops.
     at_minimum: CountArray
     at_maximum: CountArray
-    longest_run: CountArray
+    longest_run: CountArray  # most samples in a row that are exactly equal; 1 if no neighbours are
+    # Smallest difference between unequal neighbours: the quantisation step, if there is one. Nan where no neighbours
+    # are equal (not quantised) or all are.
     step: FloatArray
 
     def checkpoint(self) -> dict[str, np.ndarray]:
@@ -180,19 +168,12 @@ _ComplexArray = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class MotionPair:
-    """Two columns that measure one motion.
+    """Two columns that measure one motion."""
 
-    Attributes
-    ----------
-    first, second : int
-        Column of the motion and of its derivative.
-    order : int
-        1 for the first derivative, 2 for the second.
-    """
-
+    # Column of the motion and of its derivative.
     first: int
     second: int
-    order: int
+    order: int  # 1 for the first derivative, 2 for the second
 
 
 def motion_pairs(states: tuple[str, ...]) -> tuple[MotionPair, ...]:

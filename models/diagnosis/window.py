@@ -35,77 +35,42 @@ __all__ = ["SlidingWindow", "WindowStatistics", "window_statistics"]
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:
-    """Everything the diagnosis looks at, for one window.
+    """Everything the diagnosis looks at, for one window."""
 
-    Attributes
-    ----------
-    states : tuple of str
-        State variables of all rows and columns below.
-    start_ns, end_ns : int
-        Oldest and newest data in the window.
-    n_samples, n_segments : int
-        How much data it holds.
-    lags_s : ndarray, shape (n_lags,)
-        Lags of the correlation functions, s.
-    correlation : ndarray, shape (n_lags, n, n)
-        ``correlation[l, i, j]`` estimates R_ij(τ_l) = E{x_i(t) x_j(t+τ_l)} of the part that is neither mean nor
-        rotation-synchronous (Eq. 18), SI units.
-    hop_correlation : ndarray, shape (n_hops, n_lags, n, n)
-        The same of every hop alone (with the window's mean and synchronous part taken out): their scatter gives
-        standard errors.
-    spectrum : ndarray, shape (n_bins, n, n)
-        Hermitian cross-spectral matrices of the same part, two-sided, SI²/Hz.
-    frequencies_hz : ndarray, shape (n_bins,)
-        Their frequencies.
-    synchronous : ndarray of complex, shape (n,) or None
-        q of x_n = Re{q e^{jθ}} over the window; None without a phase reference.
-    hop_synchronous : ndarray of complex, shape (n_hops, n) or None
-        The same of every hop alone.
-    relative_synchronous : ndarray of complex, shape (n_hops, n) or None
-        Where the speed is estimated: the same of every hop, from an angle at which `zero_angle_state` is largest.
-        Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a speed.
-    zero_angle_state : str
-        The state whose angle is zero there; empty otherwise.
-    speed_source : str
-        ``phase reference``, ``estimated`` (from the line in the vibration), or ``unknown``: the rotation was not taken
-        out then.
-    speed_rad_s : float
-        Mean speed (nan if unknown).
-    speed_range : tuple of float
-        Slowest and fastest hop, rad/s (nan if unknown).
-    hop_speed_rad_s : ndarray, shape (n_hops,)
-        Mean speed of each hop (nan if unknown).
-    removed_by_hop : bool
-        Whether the rotation was taken out hop by hop, each with its own amplitude.
-    duration_s : float
-        Length of the data in the window.
-    waveforms : tuple of Waveform
-        What the samples of each hop look like: of each of `states` and, last, of the shaft angle if there is one.
-    pair_powers : tuple of ndarray, each shape (n_pairs, n_bands, 3)
-        Powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`).
-    """
-
-    states: tuple[str, ...]
+    states: tuple[str, ...]  # state variables of all rows and columns below
+    # Oldest and newest data in the window.
     start_ns: int
     end_ns: int
+    # How much data it holds.
     n_samples: int
     n_segments: int
-    lags_s: FloatArray
+    lags_s: FloatArray  # (n_lags,), lags of the correlation functions, s
+    # (n_lags, n, n): ``correlation[l, i, j]`` estimates R_ij(τ_l) = E{x_i(t) x_j(t+τ_l)} of the part that is neither
+    # mean nor rotation-synchronous (Eq. 18), SI units.
     correlation: FloatArray
+    # (n_hops, n_lags, n, n): the same of every hop alone (with the window's mean and synchronous part taken out): their
+    # scatter gives standard errors
     hop_correlation: FloatArray
-    spectrum: ComplexArray
-    frequencies_hz: FloatArray
-    synchronous: ComplexArray | None
-    hop_synchronous: ComplexArray | None
+    spectrum: ComplexArray  # (n_bins, n, n), Hermitian cross-spectral matrices of the same part, two-sided, SI²/Hz
+    frequencies_hz: FloatArray  # (n_bins,), their frequencies
+    synchronous: ComplexArray | None  # (n,), q of x_n = Re{q e^{jθ}} over the window; None without a phase reference
+    hop_synchronous: ComplexArray | None  # (n_hops, n), the same of every hop alone
+    # (n_hops, n): where the speed is estimated: the same of every hop, from an angle at which `zero_angle_state` is
+    # largest. Lengths and angles between channels hold, the angle to the shaft is unknown; zero in hops without a
+    # speed.
     relative_synchronous: ComplexArray | None
-    zero_angle_state: str
+    zero_angle_state: str  # the state whose angle is zero there; empty otherwise
+    # ``phase reference``, ``estimated`` (from the line in the vibration), or ``unknown``: the rotation was not taken
+    # out then
     speed_source: SpeedSource
-    speed_rad_s: float
-    speed_range: tuple[float, float]
-    hop_speed_rad_s: FloatArray
-    removed_by_hop: bool
-    duration_s: float
+    speed_rad_s: float  # mean speed (nan if unknown)
+    speed_range: tuple[float, float]  # slowest and fastest hop, rad/s (nan if unknown)
+    hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
+    removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
+    duration_s: float  # length of the data in the window
+    # What the samples of each hop look like: of each of `states` and, last, of the shaft angle if there is one.
     waveforms: tuple[Waveform, ...]
+    # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`)
     pair_powers: tuple[ComplexArray, ...]
 
     @property

@@ -33,53 +33,32 @@ FILTER_DAMPING = math.sqrt(0.5)
 
 
 class Source(BaseModel):
-    """One independent source of coloured force.
-
-    Attributes
-    ----------
-    cutoff_hz : float
-        Cutoff frequency of the colouring filter.
-    direction : tuple of six floats
-        Column of S (Eq. 15) on (y1, y2, psi, z1, z2, phi): dimensionless on translations, m (lever arm) on tilts.
-    force_rms_N : float
-        Root mean square of the coloured force that `direction` distributes.
-    order : int
-        Order of the Butterworth low-pass, 1 to 4: the force falls by 6 dB per octave and order above the cutoff.
-    hump_share : float
-        Part of the force's variance in a broad hump, 0 to 1; the rest is the low-pass floor. Hump and floor are driven
-        by independent white noise, so that their spectra add.
-    hump_hz, hump_damping : float
-        Centre and damping ratio of the hump, white noise through a second-order band-pass; its half-power width is
-        2 · damping · centre.
-    """
+    """One independent source of coloured force."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    cutoff_hz: float = Field(gt=0, le=1e5)
+    cutoff_hz: float = Field(gt=0, le=1e5)  # cutoff frequency of the colouring filter
+    # Column of S (Eq. 15) on (y1, y2, psi, z1, z2, phi): dimensionless on translations, m (lever arm) on tilts.
     direction: tuple[float, float, float, float, float, float]
-    force_rms_N: float = Field(ge=0, le=1e9)
+    force_rms_N: float = Field(ge=0, le=1e9)  # root mean square of the coloured force that `direction` distributes
+    # Order of the Butterworth low-pass, 1 to 4: the force falls by 6 dB per octave and order above the cutoff.
     order: int = Field(default=2, ge=1, le=4)
+    # Part of the force's variance in a broad hump, 0 to 1; the rest is the low-pass floor. Hump and floor are driven by
+    # independent white noise, so that their spectra add.
     hump_share: float = Field(default=0.0, ge=0, le=1)
+    # Centre and damping ratio of the hump, white noise through a second-order band-pass; its half-power width is 2 ·
+    # damping · centre.
     hump_hz: float = Field(default=80.0, gt=0, le=1e5)
     hump_damping: float = Field(default=0.4, gt=0, le=1)
 
 
 @dataclass(frozen=True, slots=True)
 class ColouringFilter:
-    """ż = R z + S* w, u = output · z, with unit variance of u for white noise of unit intensity (Eqs. 7-8).
+    """ż = R z + S* w, u = output · z, with unit variance of u for white noise of unit intensity (Eqs. 7-8)."""
 
-    Attributes
-    ----------
-    R : ndarray, shape (n, n)
-    S : ndarray, shape (n, p)
-        One column for each of the p independent white drives.
-    output : ndarray, shape (n,)
-        Dimensionless.
-    """
-
-    R: FloatArray
-    S: FloatArray
-    output: FloatArray
+    R: FloatArray  # (n, n)
+    S: FloatArray  # (n, p), one column for each of the p independent white drives
+    output: FloatArray  # (n,), dimensionless
 
 
 def colouring_filter(source: Source) -> ColouringFilter:

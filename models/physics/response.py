@@ -96,18 +96,10 @@ def synchronous_correlation(q1: FloatArray, q2: FloatArray, angle_rad: float) ->
 
 @dataclass(frozen=True, slots=True)
 class DiscreteSystem:
-    """x[k+1] = F x[k] + G w[k], w standard normal.
+    """x[k+1] = F x[k] + G w[k], w standard normal."""
 
-    Attributes
-    ----------
-    F : ndarray, shape (n, n)
-        State transition over one sample.
-    G : ndarray, shape (n, n)
-        Factor of the process-noise covariance.
-    """
-
-    F: FloatArray
-    G: FloatArray
+    F: FloatArray  # (n, n), state transition over one sample
+    G: FloatArray  # (n, n), factor of the process-noise covariance
 
 
 def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:

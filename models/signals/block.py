@@ -22,26 +22,13 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class SampleBlock:
-    """Consecutive samples of all channels of one machine.
+    """Consecutive samples of all channels of one machine."""
 
-    Attributes
-    ----------
-    start_ns : int
-        Acquisition time of the first sample, nanoseconds since 1970-01-01 UTC.
-    sequence : int
-        Counts the blocks of one run of the publisher from 0.
-    run : int
-        Changes each time the publisher starts (0 where a device cannot say).
-    rate_hz : float
-        Samples per second and channel.
-    samples : ndarray, shape (n_samples, n_channels)
-        float32 or float64, in the units of the channel descriptor.
-    """
-
-    start_ns: int
-    sequence: int
-    run: int
-    rate_hz: float
+    start_ns: int  # acquisition time of the first sample, nanoseconds since 1970-01-01 UTC
+    sequence: int  # counts the blocks of one run of the publisher from 0
+    run: int  # changes each time the publisher starts (0 where a device cannot say)
+    rate_hz: float  # samples per second and channel
+    # (n_samples, n_channels): float32 or float64, in the units of the channel descriptor
     samples: npt.NDArray[np.float32] | FloatArray
 
     @property

@@ -77,29 +77,22 @@ ACCELERATIONS: tuple[str, ...] = tuple(
 
 
 class Channel(BaseModel):
-    """One column of a stream.
-
-    Attributes
-    ----------
-    name : str
-        Free name, unique in the stream ("XE-101").
-    quantity, location, direction
-        What is measured, where, and in which plane; tilt in plane y is the paper's psi, in plane z its phi.
-    unit : str
-        One of `UNIT_TO_SI` for the quantity.
-    """
+    """One column of a stream."""
 
     model_config = _STRICT
 
+    # Free name, unique in the stream ("XE-101").
     name: str = Field(
         min_length=1,
         max_length=64,
         pattern=r"^[A-Za-z0-9_.:-]+$",
         description="unique name of letters, digits and _ . : -",
     )
+    # What is measured, where, and in which plane; tilt in plane y is the paper's psi, in plane z its phi.
     quantity: Quantity
     location: Literal["bearing", "disc", "shaft"]
     direction: Literal["y", "z", "rotation"]
+    # One of `UNIT_TO_SI` for the quantity.
     unit: str = Field(
         description="; ".join(f"{', '.join(units)} for {quantity}" for quantity, units in UNIT_TO_SI.items())
     )

@@ -80,24 +80,13 @@ class EdgeDetector:
 
 @dataclass(frozen=True, slots=True)
 class PulseTrain:
-    """Pulses after repair.
+    """Pulses after repair."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (n,)
-        Ascending.
-    counts : ndarray of int, shape (n,)
-        Number of each pulse, with the missing ones counted.
-    known : ndarray of bool, shape (n - 1,)
-        Whether the shaft turned without doubt from this pulse to the next.
-    missing, extra : int
-        Pulses that were missing and are bridged; pulses too many, which are left out.
-    """
-
-    times: FloatArray
-    counts: npt.NDArray[np.int64]
-    known: npt.NDArray[np.bool_]
+    times: FloatArray  # (n,), ascending
+    counts: npt.NDArray[np.int64]  # (n,), number of each pulse, with the missing ones counted
+    known: npt.NDArray[np.bool_]  # (n - 1,), whether the shaft turned without doubt from this pulse to the next
     pulses_per_turn: int
+    # Pulses that were missing and are bridged; pulses too many, which are left out.
     missing: int
     extra: int
 

@@ -60,45 +60,25 @@ DAMAGE = (McapError, CRCValidationError, struct.error, zstandard.ZstdError, Valu
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """One message as it was on the network.
+    """One message as it was on the network."""
 
-    Attributes
-    ----------
-    key : str
-        Zenoh key.
-    payload, attachment : bytes
-        Verbatim; an empty attachment is no attachment.
-    encoding : str
-        Encoding string, with its schema part.
-    log_time_ns : int
-        When it was recorded, nanoseconds since 1970-01-01 UTC.
-    publish_time_ns : int
-        When it was published.
-    """
-
-    key: str
+    key: str  # Zenoh key
+    # Verbatim; an empty attachment is no attachment.
     payload: bytes
     attachment: bytes
-    encoding: str
-    log_time_ns: int
-    publish_time_ns: int
+    encoding: str  # encoding string, with its schema part
+    log_time_ns: int  # when it was recorded, nanoseconds since 1970-01-01 UTC
+    publish_time_ns: int  # when it was published
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingSummary:
-    """What a recording holds.
+    """What a recording holds."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Earliest and latest log time; both 0 in an empty recording.
-    messages : dict of str to int
-        Number of messages by key.
-    """
-
+    # Earliest and latest log time; both 0 in an empty recording.
     start_ns: int
     end_ns: int
-    messages: dict[str, int]
+    messages: dict[str, int]  # number of messages by key
 
 
 class RecordingWriter:

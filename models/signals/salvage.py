@@ -18,37 +18,18 @@ __all__ = ["Salvage", "inspect_recording", "salvage_recording", "salvaged_messag
 
 @dataclass(slots=True)
 class Salvage:
-    """What came out of a damaged recording, and what did not.
+    """What came out of a damaged recording, and what did not."""
 
-    Attributes
-    ----------
-    messages : dict of str to int
-        Number of messages recovered, by key.
-    start_ns, end_ns : int
-        Earliest and latest log time recovered; both 0 if nothing was.
-    size_bytes : int
-        Size of the damaged file.
-    lost_bytes : int
-        Bytes of it that could not be read; what was still in the writer's memory is not among them.
-    damaged_chunks : int
-        Chunks before the end that could not be read and were passed over.
-    unnamed_messages : int
-        Messages that were lost because the chunk that names their key is damaged.
-    complete : bool
-        Whether the file had been closed in order and nothing of it was lost.
-    written_ns : int
-        When the damaged file was last written.
-    """
-
-    messages: dict[str, int] = field(default_factory=dict)
+    messages: dict[str, int] = field(default_factory=dict)  # number of messages recovered, by key
+    # Earliest and latest log time recovered; both 0 if nothing was.
     start_ns: int = 0
     end_ns: int = 0
-    size_bytes: int = 0
-    lost_bytes: int = 0
-    damaged_chunks: int = 0
-    unnamed_messages: int = 0
-    complete: bool = False
-    written_ns: int = 0
+    size_bytes: int = 0  # size of the damaged file
+    lost_bytes: int = 0  # bytes of it that could not be read; what was still in the writer's memory is not among them
+    damaged_chunks: int = 0  # chunks before the end that could not be read and were passed over
+    unnamed_messages: int = 0  # messages that were lost because the chunk that names their key is damaged
+    complete: bool = False  # whether the file had been closed in order and nothing of it was lost
+    written_ns: int = 0  # when the damaged file was last written
 
     @property
     def count(self) -> int:

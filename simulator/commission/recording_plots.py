@@ -27,30 +27,14 @@ _RPM = 30 / np.pi
 
 @dataclass(frozen=True, slots=True)
 class Portrait:
-    """What the pictures show of one recording.
+    """What the pictures show of one recording."""
 
-    Attributes
-    ----------
-    number : int
-        Its number on the page, from 1.
-    statistics : WindowStatistics
-        Of all its hops.
-    density : ndarray, shape (n_bins, n)
-        Amplitude spectral density with the rotation in it, one-sided, SI/√Hz.
-    time_s : ndarray, shape (n_hops,)
-        Middle of each hop from the beginning of the recording.
-    broken : ndarray of bool, shape (n_hops,)
-        Whether a gap lies before the hop.
-    lines : tuple of Line
-        Steady lines that do not belong to the rotation.
-    """
-
-    number: int
-    statistics: WindowStatistics
-    density: FloatArray
-    time_s: FloatArray
-    broken: np.ndarray[tuple[int], np.dtype[np.bool_]]
-    lines: tuple[Line, ...]
+    number: int  # its number on the page, from 1
+    statistics: WindowStatistics  # of all its hops
+    density: FloatArray  # (n_bins, n), amplitude spectral density with the rotation in it, one-sided, SI/√Hz
+    time_s: FloatArray  # (n_hops,), middle of each hop from the beginning of the recording
+    broken: np.ndarray[tuple[int], np.dtype[np.bool_]]  # (n_hops,), whether a gap lies before the hop
+    lines: tuple[Line, ...]  # steady lines that do not belong to the rotation
 
     @property
     def speed_hz(self) -> float:

@@ -99,44 +99,22 @@ _DRIFT_STEPS = 8
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """A recipe for windows.
-
-    Attributes
-    ----------
-    seed : int
-        Of the whole training or study.
-    stream : int
-        Tells apart series of windows of the same purpose (equations, cells of a table).
-    kept_nominal : tuple of str
-        Parameters that do not vary.
-    spread : float
-        The others vary uniformly by up to this relative amount.
-    faults : mapping of str to float
-        Fixed relative changes on top.
-    layout : Layout or None
-        None draws one of them at random for each window.
-    fixed_condition : bool
-        All windows share the condition drawn for number 0; only the realisation of force and noise differs. The number
-        0 itself has another realisation than without.
-    excitation : Excitation
-        Another one leaves everything else of the condition as it is.
-    anomaly : Anomaly
-        The same holds for this.
-    anomaly_size : float or None
-        As `simulator.scenario.Event.size`, for GAIN_DRIFT the relative change of gain; None is the anomaly's own.
-    """
+    """A recipe for windows."""
 
     machine: Machine
-    seed: int
+    seed: int  # of the whole training or study
     purpose: Purpose
-    stream: int = 0
-    kept_nominal: tuple[str, ...] = PARAMETERS
-    spread: float = 0.3
-    faults: dict[str, float] = field(default_factory=dict)
-    layout: Layout | None = None
+    stream: int = 0  # tells apart series of windows of the same purpose (equations, cells of a table)
+    kept_nominal: tuple[str, ...] = PARAMETERS  # parameters that do not vary
+    spread: float = 0.3  # the others vary uniformly by up to this relative amount
+    faults: dict[str, float] = field(default_factory=dict)  # fixed relative changes on top
+    layout: Layout | None = None  # none draws one of them at random for each window
+    # All windows share the condition drawn for number 0; only the realisation of force and noise differs. The number 0
+    # itself has another realisation than without.
     fixed_condition: bool = False
-    excitation: Excitation = Excitation.SECOND_ORDER
-    anomaly: Anomaly = Anomaly.NONE
+    excitation: Excitation = Excitation.SECOND_ORDER  # another one leaves everything else of the condition as it is
+    anomaly: Anomaly = Anomaly.NONE  # the same holds for this
+    # As `simulator.scenario.Event.size`, for GAIN_DRIFT the relative change of gain; None is the anomaly's own.
     anomaly_size: float | None = None
 
 

@@ -52,25 +52,15 @@ _HANN = (np.float32(1 / 6), np.float32(4 / 6), np.float32(1 / 6))
 
 @dataclass(frozen=True, slots=True)
 class DrawnConditions:
-    """A batch of random machines in random conditions.
+    """A batch of random machines in random conditions."""
 
-    Attributes
-    ----------
-    log_ratio : ndarray, shape (n_windows, 6)
-        Logarithm of each of `PARAMETERS` over nominal.
-    speed_rad_s : ndarray, shape (n_windows,)
-    spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
-        Expected cross-spectra of the segments, as `WindowStatistics.spectrum` estimates them, SI²/Hz.
-    synchronous : ndarray of complex, shape (n_windows, n)
-        Rotation-synchronous vectors as of `WindowStatistics.synchronous`, SI.
-    synchronous_factor : ndarray of complex, shape (n_windows, n, n)
-        Factor of the covariance that the stochastic part gives the estimate of `synchronous`.
-    """
-
-    log_ratio: FloatArray
-    speed_rad_s: FloatArray
+    log_ratio: FloatArray  # (n_windows, 6), logarithm of each of `PARAMETERS` over nominal
+    speed_rad_s: FloatArray  # (n_windows,)
+    # (n_windows, n_bins, n, n): expected cross-spectra of the segments, as `WindowStatistics.spectrum` estimates them,
+    # SI²/Hz
     spectrum: ComplexArray
-    synchronous: ComplexArray
+    synchronous: ComplexArray  # (n_windows, n), rotation-synchronous vectors as of `WindowStatistics.synchronous`, SI
+    # (n_windows, n, n): factor of the covariance that the stochastic part gives the estimate of `synchronous`
     synchronous_factor: ComplexArray
 
 
@@ -252,19 +242,12 @@ Batch = tuple[Float32Array, Float32Array]
 
 @dataclass(frozen=True, slots=True)
 class FeatureDraws:
-    """A recipe for batches.
-
-    Attributes
-    ----------
-    conditions : int
-        Conditions per batch; each gives four windows.
-    mean, directions : ndarray
-        Principal directions, see `models.diagnosis.networks.features`.
-    """
+    """A recipe for batches."""
 
     machine: Machine
     seed: int
-    conditions: int
+    conditions: int  # conditions per batch; each gives four windows
+    # Principal directions, see `models.diagnosis.networks.features`.
     mean: Float32Array
     directions: Float32Array
 

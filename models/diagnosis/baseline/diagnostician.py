@@ -39,20 +39,11 @@ _MOST_LOSS = -0.95
 
 @dataclass(frozen=True, slots=True)
 class GainSuspicion:
-    """A common factor that explains the row's own parameters as well as separate changes do.
+    """A common factor that explains the row's own parameters as well as separate changes do."""
 
-    Attributes
-    ----------
-    sentence : str
-        ``gain of y1 or y2``.
-    factor : float
-        Relative change of all of the row's own parameters.
-    z : float
-        The factor in standard errors, as a one-sided normal variable that knows of how many rows it is the largest.
-    """
-
-    sentence: str
-    factor: float
+    sentence: str  # ``gain of y1 or y2``
+    factor: float  # relative change of all of the row's own parameters
+    # The factor in standard errors, as a one-sided normal variable that knows of how many rows it is the largest.
     z: float
 
 
@@ -127,23 +118,12 @@ _SURELY_OUTSIDE = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bearing:
-    """Changes of all rows' own parameters.
+    """Changes of all rows' own parameters."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (n_own,)
-    noise : ndarray, shape (n_own, n_own)
-        Covariance from the window alone.
-    sensitivity : ndarray, shape (n_own, n_coefficients)
-        To the relations' coefficients.
-    common : ndarray, shape (n_own, n_own)
-        Covariance from the commissioning.
-    """
-
-    values: FloatArray
-    noise: FloatArray
-    sensitivity: FloatArray
-    common: FloatArray
+    values: FloatArray  # (n_own,)
+    noise: FloatArray  # (n_own, n_own), covariance from the window alone
+    sensitivity: FloatArray  # (n_own, n_coefficients), to the relations' coefficients
+    common: FloatArray  # (n_own, n_own), covariance from the commissioning
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -53,16 +53,11 @@ _LEAD = 0.375
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """cosᵖ over a width: a sum of cosines of multiples of the width's frequency.
-
-    Attributes
-    ----------
-    lead_s : float
-        From the shortest lag to the first kernel's centre; what lies before it weighs less than a thousandth.
-    """
+    """cosᵖ over a width: a sum of cosines of multiples of the width's frequency."""
 
     power: int
     width_s: float
+    # From the shortest lag to the first kernel's centre; what lies before it weighs less than a thousandth.
     lead_s: float
 
     @property
@@ -96,17 +91,11 @@ def shape_for(deepest: int, band_to_hz: float) -> Shape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kernels:
-    """Kernels over the lags of a window.
+    """Kernels over the lags of a window."""
 
-    Attributes
-    ----------
-    values : tuple of ndarray, each shape (n_kernels, n_lags)
-        Kernels and their derivatives with alternating sign, (-1)ⁿ κ⁽ⁿ⁾, times the lags' spacing.
-    centres_s : ndarray, shape (n_kernels,)
-    """
-
+    # (n_kernels, n_lags): kernels and their derivatives with alternating sign, (-1)ⁿ κ⁽ⁿ⁾, times the lags' spacing
     values: tuple[FloatArray, ...]
-    centres_s: FloatArray
+    centres_s: FloatArray  # (n_kernels,)
 
     @property
     def spacing_s(self) -> float:
@@ -183,20 +172,12 @@ _RANK = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LagMoments:
-    """Moments of one row in one window beyond a shortest lag.
-
-    Attributes
-    ----------
-    values : ndarray, shape (n_moments, n_terms)
-        One row per reference and kernel, SI units.
-    hop_values : ndarray, shape (n_hops, n_moments, n_terms)
-        The same of every hop.
-    """
+    """Moments of one row in one window beyond a shortest lag."""
 
     of: "RowWindow"
     kernels: Kernels
-    values: FloatArray
-    hop_values: FloatArray
+    values: FloatArray  # (n_moments, n_terms), one row per reference and kernel, SI units
+    hop_values: FloatArray  # (n_hops, n_moments, n_terms), the same of every hop
 
     def covariance(self, combination: FloatArray) -> FloatArray:
         """Covariance of the combination's moments where it is unrelated to the past, shape (n_moments, n_moments)."""
@@ -234,32 +215,18 @@ class LagMoments:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowWindow:
-    """One row in one window: what does not depend on the shortest lag.
-
-    Attributes
-    ----------
-    references : tuple of str
-        States that serve as references.
-    terms : ndarray of complex, shape (n_bins, n_states, n_terms)
-        The terms as combinations of the measured states.
-    spectra : ndarray of complex, shape (n_bins, n_terms, n_terms)
-        Cross-spectra of the terms.
-    blocks : ndarray, shape (n_pairs, n_references, n_references, 2 n_distances - 1)
-        Covariance of moments of a pair of terms by references and by distance of the kernels.
-    pairs : ndarray of int, shape (2, n_pairs)
-        The pairs of terms.
-    factors : ndarray, shape (n_terms,)
-        The speed for terms whose coefficient is proportional to it, else one.
-    """
+    """One row in one window: what does not depend on the shortest lag."""
 
     window: WindowStatistics
     formation: Formation
-    references: tuple[str, ...]
-    terms: ComplexArray
-    spectra: ComplexArray
+    references: tuple[str, ...]  # states that serve as references
+    terms: ComplexArray  # (n_bins, n_states, n_terms), the terms as combinations of the measured states
+    spectra: ComplexArray  # (n_bins, n_terms, n_terms), cross-spectra of the terms
+    # (n_pairs, n_references, n_references, 2 n_distances - 1): covariance of moments of a pair of terms by references
+    # and by distance of the kernels
     blocks: FloatArray
-    pairs: npt.NDArray[np.intp]
-    factors: FloatArray
+    pairs: npt.NDArray[np.intp]  # (2, n_pairs), the pairs of terms
+    factors: FloatArray  # (n_terms,), the speed for terms whose coefficient is proportional to it, else one
 
     @property
     def shape(self) -> Shape:

@@ -44,15 +44,10 @@ _BEYOND = 2.0  # standard deviations of a mean beyond which it is taken for more
 
 @dataclass(frozen=True, slots=True)
 class HeldOutReading:
-    """One parameter of one healthy window, read against the relation that the other conditions teach.
-
-    Attributes
-    ----------
-    change, standard_error : float
-        Relative change and its standard error, the relation's included.
-    """
+    """One parameter of one healthy window, read against the relation that the other conditions teach."""
 
     parameter: str
+    # Relative change and its standard error, the relation's included.
     change: float
     standard_error: float
 
@@ -64,27 +59,13 @@ class HeldOutReading:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """One healthy window of one row against what the windows of other conditions teach.
+    """One healthy window of one row against what the windows of other conditions teach."""
 
-    Attributes
-    ----------
-    row : str
-        Name of the row.
-    window : int
-        Number of the window, from 0.
-    condition : str
-        What it belongs to.
-    agreements : tuple of HeldOutReading
-        One for each of the row's own parameters.
-    misfit : float
-        χ² of what is left per degree of freedom.
-    """
-
-    row: str
-    window: int
-    condition: str
-    agreements: tuple[HeldOutReading, ...]
-    misfit: float
+    row: str  # name of the row
+    window: int  # number of the window, from 0
+    condition: str  # what it belongs to
+    agreements: tuple[HeldOutReading, ...]  # one for each of the row's own parameters
+    misfit: float  # χ² of what is left per degree of freedom
     degrees_of_freedom: int
 
     @property
@@ -175,29 +156,16 @@ _FEWEST_HOPS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Baseline:
-    """What was learned on a healthy machine.
+    """What was learned on a healthy machine."""
 
-    Attributes
-    ----------
-    relations : tuple of Relation or None
-        One for each learned row of the table; None where there is none.
-    reasons : tuple of str
-        Why there is no relation; empty where there is one.
-    covariance : ndarray, shape (n, n)
-        Of the coefficients of all rows one after the other; zero where there is no relation.
-    rotations : tuple of SynchronousVectors
-        Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
-    duration_s : float
-        Healthy data.
-    consistency : tuple of LeftOut
-        Every healthy window of every row against what the windows of other conditions teach.
-    """
-
-    relations: tuple[Relation | None, ...]
-    reasons: tuple[str, ...]
+    relations: tuple[Relation | None, ...]  # one for each learned row of the table; None where there is none
+    reasons: tuple[str, ...]  # why there is no relation; empty where there is one
+    # (n, n): of the coefficients of all rows one after the other; zero where there is no relation
     covariance: FloatArray
+    # Synchronous vectors of the healthy machine, one for each distinct speed, slowest first.
     rotations: tuple[SynchronousVectors, ...]
-    duration_s: float
+    duration_s: float  # healthy data
+    # Every healthy window of every row against what the windows of other conditions teach.
     consistency: tuple[LeftOut, ...] = ()
 
     @property

@@ -165,34 +165,18 @@ _CONVERGED = 1e-4  # standard errors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Relation:
-    """What holds between the correlation functions of one row on the healthy machine.
+    """What holds between the correlation functions of one row on the healthy machine."""
 
-    Attributes
-    ----------
-    row : str
-        Name in the table of rows.
-    states : tuple of str
-        Measured states the terms are formed from.
-    references : tuple of str
-        Measured states they were correlated with.
-    coefficients : ndarray, shape (n,)
-        Of every term but the first in term₀ = Σ b term; for the bearing's row -c/k, -m2/k, -m1/k and -s.
-    covariance : ndarray, shape (n, n)
-        Theirs, widened where the relation did not fit.
-    misfit : float
-        χ² of the fit per degree of freedom.
-    allowance : float
-        Factor on the variances of every later window, from how well the relation holds in conditions that it was not
-        learned in; at least 1.
-    """
-
-    row: str
-    states: tuple[str, ...]
-    references: tuple[str, ...]
+    row: str  # name in the table of rows
+    states: tuple[str, ...]  # measured states the terms are formed from
+    references: tuple[str, ...]  # measured states they were correlated with
+    # (n,): of every term but the first in term₀ = Σ b term; for the bearing's row -c/k, -m2/k, -m1/k and -s
     coefficients: FloatArray
-    covariance: FloatArray
-    misfit: float
+    covariance: FloatArray  # (n, n), theirs, widened where the relation did not fit
+    misfit: float  # χ² of the fit per degree of freedom
     degrees_of_freedom: int
+    # Factor on the variances of every later window, from how well the relation holds in conditions that it was not
+    # learned in; at least 1.
     allowance: float = 1.0
 
     @property
@@ -203,61 +187,34 @@ class Relation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contribution:
-    """What one healthy window adds to the coefficients of a row.
-
-    Attributes
-    ----------
-    projection : ndarray, shape (n_coefficients, n_moments)
-        From its moments to the coefficients.
-    """
+    """What one healthy window adds to the coefficients of a row."""
 
     moments: LagMoments
-    projection: FloatArray
+    projection: FloatArray  # (n_coefficients, n_moments), from its moments to the coefficients
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowChange:
-    """What one window says of one row.
+    """What one window says of one row."""
 
-    Attributes
-    ----------
-    change : ndarray, shape (n_own,)
-        Relative change of the row's own parameters.
-    projection : ndarray, shape (n_own, n_moments)
-        From the window's moments to the change, stretched to what the window objects to (`flatness`), and
-        wider where more is left over than chance leaves.
-    sensitivity : ndarray, shape (n_own, n_coefficients)
-        Of the change to the relation's coefficients.
-    combination : ndarray, shape (n_terms,)
-        The window's own force.
-    widening : float
-        Scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance.
-    chi2 : float
-        What the change leaves, in units of all its errors.
-    """
-
-    change: FloatArray
+    change: FloatArray  # (n_own,), relative change of the row's own parameters
+    # (n_own, n_moments): from the window's moments to the change, stretched to what the window objects to (`flatness`),
+    # and wider where more is left over than chance leaves
     projection: FloatArray
-    sensitivity: FloatArray
+    sensitivity: FloatArray  # (n_own, n_coefficients), of the change to the relation's coefficients
     moments: LagMoments
-    combination: FloatArray
-    widening: float
-    chi2: float
+    combination: FloatArray  # (n_terms,), the window's own force
+    widening: float  # scatter from hop to hop over what the spectra expect, at least 1, times the relation's allowance
+    chi2: float  # what the change leaves, in units of all its errors
     degrees_of_freedom: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Least squares over windows.
+    """Least squares over windows."""
 
-    Attributes
-    ----------
-    coefficients : ndarray, shape (n,)
-    covariance : ndarray, shape (n, n)
-    """
-
-    coefficients: FloatArray
-    covariance: FloatArray
+    coefficients: FloatArray  # (n,)
+    covariance: FloatArray  # (n, n)
     chi2: float
     degrees_of_freedom: int
 

@@ -51,21 +51,11 @@ _PLACES = {
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A derivative of a coordinate.
+    """A derivative of a coordinate."""
 
-    Attributes
-    ----------
-    coordinate : str
-        ``y1``, ``y2``, ``z1``, ``z2``, ``psi`` or ``phi``.
-    order : int
-        Of the derivative.
-    factor : float
-        Its weight in a sum.
-    """
-
-    coordinate: str
-    order: int
-    factor: float = 1.0
+    coordinate: str  # ``y1``, ``y2``, ``z1``, ``z2``, ``psi`` or ``phi``
+    order: int  # of the derivative
+    factor: float = 1.0  # its weight in a sum
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,18 +69,10 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Formation:
-    """How the terms of a row are formed.
+    """How the terms of a row are formed."""
 
-    Attributes
-    ----------
-    raised : int
-        How often the whole row is differentiated.
-    terms : tuple of tuple of Source
-        What each term is the sum of.
-    """
-
-    raised: int
-    terms: tuple[tuple[Source, ...], ...]
+    raised: int  # how often the whole row is differentiated
+    terms: tuple[tuple[Source, ...], ...]  # what each term is the sum of
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -161,83 +143,43 @@ _NO_PHASE = "no phase reference, and no speed to look for in the vibration"
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One term of a row: motions that share a coefficient.
+    """One term of a row: motions that share a coefficient."""
 
-    Attributes
-    ----------
-    motions : tuple of Motion
-        Their weighted sum.
-    spread : float or None
-        Standard deviation expected beforehand of the coefficient; None where nothing is expected.
-    in_units_of : int or None
-        Term whose coefficient `spread` and `about` are multiples of.
-    about : float
-        Value expected beforehand.
-    without : float or None
-        Expected spread of a term that is left out wherever the relation holds without it.
-    times_speed : bool
-        Whether the coefficient is proportional to the speed (gyroscopic terms).
-    """
-
-    motions: tuple[Motion, ...]
+    motions: tuple[Motion, ...]  # their weighted sum
+    # Standard deviation expected beforehand of the coefficient; None where nothing is expected.
     spread: float | None = None
-    in_units_of: int | None = None
-    about: float = 0.0
-    without: float | None = None
-    times_speed: bool = False
+    in_units_of: int | None = None  # term whose coefficient `spread` and `about` are multiples of
+    about: float = 0.0  # value expected beforehand
+    without: float | None = None  # expected spread of a term that is left out wherever the relation holds without it
+    times_speed: bool = False  # whether the coefficient is proportional to the speed (gyroscopic terms)
 
 
 @dataclass(frozen=True, slots=True)
 class Own:
-    """A parameter that a row reads.
+    """A parameter that a row reads."""
 
-    Attributes
-    ----------
-    parameter : str
-        One of ``models.physics.rotor.PARAMETERS``.
-    terms : tuple of int
-        Terms whose coefficients are proportional to it.
-    resists : bool
-        Whether these terms have the sign of the first one, as a stiffness and a damping do; a fit of the other sign
-        has not determined them.
-    one_source : float
-        Factor on the standard error where one source moves everything: all channels are then coherent, what the row
-        leaves out of the machine is driven by the same force as what it holds, and is not averaged away. Measured on
-        finite-element rotors (decision 0012).
-    """
-
-    parameter: str
-    terms: tuple[int, ...] = ()
+    parameter: str  # one of ``models.physics.rotor.PARAMETERS``
+    terms: tuple[int, ...] = ()  # terms whose coefficients are proportional to it
+    # Whether these terms have the sign of the first one, as a stiffness and a damping do; a fit of the other sign has
+    # not determined them.
     resists: bool = True
+    # Factor on the standard error where one source moves everything: all channels are then coherent, what the row
+    # leaves out of the machine is driven by the same force as what it holds, and is not averaged away. Measured on
+    # finite-element rotors (decision 0012).
     one_source: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One row of motion.
+    """One row of motion."""
 
-    Attributes
-    ----------
-    name : str
-        Unique in the table.
-    number : str
-        The paper's equations.
-    title : str
-        What it is about.
-    terms : tuple of Term
-        The first is the target: its coefficient is one.
-    own : tuple of Own
-        What it reads. A change of the first is relative to the scale of the row.
-    rests_on : str
-        Name of the row whose coefficients it uses, for a row that is evaluated on the rotation-synchronous vectors;
-        empty for one that is learned on the stochastic part.
-    """
-
-    name: str
-    number: str
-    title: str
-    terms: tuple[Term, ...]
-    own: tuple[Own, ...]
+    name: str  # unique in the table
+    number: str  # the paper's equations
+    title: str  # what it is about
+    terms: tuple[Term, ...]  # the first is the target: its coefficient is one
+    own: tuple[Own, ...]  # what it reads. A change of the first is relative to the scale of the row
+    # Name of the row whose coefficients it uses, for a row that is evaluated on the rotation-synchronous vectors; empty
+    # for one that is learned on the stochastic part.
     rests_on: str = ""
 
     @property

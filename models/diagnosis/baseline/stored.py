@@ -88,31 +88,17 @@ class _LeftOutRecord(BaseModel):
 
 
 class BaselineRecord(BaseModel):
-    """What was learned on a healthy machine, as plain numbers.
-
-    Attributes
-    ----------
-    relations : tuple
-        One for each learned row, or null.
-    reasons : tuple of str
-        Why there is none.
-    covariance : tuple of tuple of float
-        Of the coefficients of all rows.
-    rotations : tuple
-        Synchronous vectors by speed.
-    consistency : tuple
-        Healthy windows against each other.
-    """
+    """What was learned on a healthy machine, as plain numbers."""
 
     model_config = _STRICT
 
     format: Literal[1] = 1
-    relations: tuple[RelationRecord | None, ...]
-    reasons: tuple[str, ...]
-    covariance: _Matrix
-    rotations: tuple[RotationRecord, ...]
+    relations: tuple[RelationRecord | None, ...]  # one for each learned row, or null
+    reasons: tuple[str, ...]  # why there is none
+    covariance: _Matrix  # of the coefficients of all rows
+    rotations: tuple[RotationRecord, ...]  # synchronous vectors by speed
     duration_s: _Positive
-    consistency: tuple[_LeftOutRecord, ...] = ()
+    consistency: tuple[_LeftOutRecord, ...] = ()  # healthy windows against each other
 
     @model_validator(mode="after")
     def _complete(self) -> Self:

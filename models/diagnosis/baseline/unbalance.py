@@ -35,24 +35,13 @@ _NEIGHBOURS = (2, 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SynchronousVectors:
-    """Synchronous vectors of one window, or of a baseline at one speed.
+    """Synchronous vectors of one window, or of a baseline at one speed."""
 
-    Attributes
-    ----------
-    coordinates : tuple of str
-        Whose they are, for example y1, y2, z1, z2.
-    vectors : ndarray, shape (2 n,)
-        Real parts of the displacements, then their imaginary parts, m.
-    covariance : ndarray, shape (2 n, 2 n)
-        From the stochastic part near the speed.
-    absolute : bool
-        Whether angles are those to the phase reference; otherwise only angles between coordinates hold.
-    """
-
-    coordinates: tuple[str, ...]
-    vectors: FloatArray
-    covariance: FloatArray
+    coordinates: tuple[str, ...]  # whose they are, for example y1, y2, z1, z2
+    vectors: FloatArray  # (2 n,), real parts of the displacements, then their imaginary parts, m
+    covariance: FloatArray  # (2 n, 2 n), from the stochastic part near the speed
     speed_rad_s: float
+    # Whether angles are those to the phase reference; otherwise only angles between coordinates hold.
     absolute: bool = True
 
     def of(self, coordinates: tuple[str, ...]) -> "SynchronousVectors":
@@ -81,39 +70,20 @@ class SynchronousVectors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceRow:
-    """A row that the unbalance is read by, and where its numbers stand among those of all rows.
+    """A row that the unbalance is read by, and where its numbers stand among those of all rows."""
 
-    Attributes
-    ----------
-    row : Row
-        Learned on the stochastic part.
-    coefficients : slice
-        Of its relation among all coefficients.
-    own : slice
-        Of its parameters among all changes.
-    """
-
-    row: Row
-    coefficients: slice
-    own: slice
+    row: Row  # learned on the stochastic part
+    coefficients: slice  # of its relation among all coefficients
+    own: slice  # of its parameters among all changes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SynchronousState:
-    """All that the unbalance depends on.
+    """All that the unbalance depends on."""
 
-    Attributes
-    ----------
-    coefficients : ndarray
-        Of all relations.
-    change : ndarray
-        Of all their own parameters.
-    now, healthy : ndarray, shape (2 n,)
-        Synchronous vectors.
-    """
-
-    coefficients: FloatArray
-    change: FloatArray
+    coefficients: FloatArray  # of all relations
+    change: FloatArray  # of all their own parameters
+    # (2 n,): synchronous vectors
     now: FloatArray
     healthy: FloatArray
 

@@ -42,18 +42,10 @@ as excess."""
 
 @dataclass(frozen=True, slots=True)
 class Glance:
-    """What one step from the window's maximum says of a stretch that holds nothing new.
+    """What one step from the window's maximum says of a stretch that holds nothing new."""
 
-    Attributes
-    ----------
-    point : ModelPoint
-        The window's spectra at the stretch's parameters: what is not diagnosed is the window's.
-    structural : ndarray, shape (n_diagnosed, n_diagnosed)
-        Covariance of the diagnosed parameters.
-    """
-
-    point: ModelPoint
-    structural: FloatArray
+    point: ModelPoint  # the window's spectra at the stretch's parameters: what is not diagnosed is the window's
+    structural: FloatArray  # (n_diagnosed, n_diagnosed), covariance of the diagnosed parameters
 
 
 class Linearised:

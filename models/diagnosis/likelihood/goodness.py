@@ -36,19 +36,11 @@ _LEAST_INFORMATION = 1e-4
 
 @dataclass(frozen=True, slots=True)
 class Alternative:
-    """One thing outside the model, tried on a window.
-
-    Attributes
-    ----------
-    z : float
-        Its score in standard errors.
-    change : float
-        One-step estimate of its relative size.
-    """
+    """One thing outside the model, tried on a window."""
 
     name: str
-    z: float
-    change: float
+    z: float  # its score in standard errors
+    change: float  # one-step estimate of its relative size
 
     @property
     def quantity(self) -> str:
@@ -58,21 +50,11 @@ class Alternative:
 
 @dataclass(frozen=True, slots=True)
 class Goodness:
-    """How well the theory explains a window.
+    """How well the theory explains a window."""
 
-    Attributes
-    ----------
-    excess_z : float
-        Total squared excess of the whitened spectra over its expectation, in standard deviations.
-    alternatives : tuple of Alternative
-        Everything tried.
-    tests : int
-        How many of them, and the total, say something of their own.
-    """
-
-    excess_z: float
-    alternatives: tuple[Alternative, ...]
-    tests: int
+    excess_z: float  # total squared excess of the whitened spectra over its expectation, in standard deviations
+    alternatives: tuple[Alternative, ...]  # everything tried
+    tests: int  # how many of them, and the total, say something of their own
 
     @property
     def misfit_z(self) -> float:

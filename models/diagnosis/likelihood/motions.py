@@ -56,30 +56,16 @@ _PER_BANDWIDTH = 0.5
 
 @dataclass(frozen=True, slots=True)
 class BinGroups:
-    """Neighbouring bins averaged into one.
+    """Neighbouring bins averaged into one."""
 
-    Attributes
-    ----------
-    edges : tuple of (int, int)
-        First bin and the one after the last, of every group.
-    bins : ndarray, shape (n_groups,)
-        Bins per group.
-    centre_hz : ndarray, shape (n_groups,)
-        Mean frequency.
-    nodes_hz : ndarray, shape (n_groups, n_nodes)
-        Frequencies at which the theory is needed; padded with copies of weight zero.
-    weights : ndarray, shape (n_groups, n_nodes)
-        What each of them contributes to the group's expected spectrum.
-    shared : ndarray, shape (n_groups, n_groups)
-        Squared correlations of the groups' scatter, in units of what `AVERAGES_PER_BIN` says of each: a group of few
-        bins scatters less than that, and together with its neighbours.
-    """
-
-    edges: tuple[tuple[int, int], ...]
-    bins: FloatArray
-    centre_hz: FloatArray
+    edges: tuple[tuple[int, int], ...]  # first bin and the one after the last, of every group
+    bins: FloatArray  # (n_groups,), bins per group
+    centre_hz: FloatArray  # (n_groups,), mean frequency
+    # (n_groups, n_nodes): frequencies at which the theory is needed; padded with copies of weight zero
     nodes_hz: FloatArray
-    weights: FloatArray
+    weights: FloatArray  # (n_groups, n_nodes), what each of them contributes to the group's expected spectrum
+    # (n_groups, n_groups): squared correlations of the groups' scatter, in units of what `AVERAGES_PER_BIN` says of
+    # each: a group of few bins scatters less than that, and together with its neighbours
     shared: FloatArray
 
     def average(self, spectrum: ComplexArray) -> ComplexArray:
@@ -174,21 +160,11 @@ _GAIN_FLOOR = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Mismatch:
-    """How far the displacement and the velocity of one degree of freedom disagree.
+    """How far the displacement and the velocity of one degree of freedom disagree."""
 
-    Attributes
-    ----------
-    states : (str, str)
-        Displacement and velocity.
-    change : float
-        Gain of the velocity relative to that of the displacement, minus one.
-    z : float
-        The same in standard errors.
-    """
-
-    states: tuple[str, str]
-    change: float
-    z: float
+    states: tuple[str, str]  # displacement and velocity
+    change: float  # gain of the velocity relative to that of the displacement, minus one
+    z: float  # the same in standard errors
 
 
 class Motions:

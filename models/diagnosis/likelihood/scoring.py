@@ -43,70 +43,36 @@ keeps the order: on coarse groups a filter of order nought would pass for anythi
 
 @dataclass(frozen=True, slots=True)
 class Whitened:
-    """Spectra at a point seen through its own Cholesky factors S = L Lᴴ.
-
-    Attributes
-    ----------
-    L_inverse : ndarray, shape (n_groups, n, n)
-    excess : ndarray, shape (n_groups, n, n)
-        L⁻¹ Ŝ L⁻ᴴ - I: zero where theory and estimate agree.
-    """
+    """Spectra at a point seen through its own Cholesky factors S = L Lᴴ."""
 
     point: ModelPoint
-    L_inverse: ComplexArray
-    excess: ComplexArray
+    L_inverse: ComplexArray  # (n_groups, n, n)
+    excess: ComplexArray  # (n_groups, n, n), L⁻¹ Ŝ L⁻ᴴ - I: zero where theory and estimate agree
 
 
 @dataclass(frozen=True, slots=True)
 class Derivatives:
-    """Derivatives at the end of an earlier search: most of the first step of a search that starts there.
+    """Derivatives at the end of an earlier search: most of the first step of a search that starts there."""
 
-    Attributes
-    ----------
-    slopes : ndarray, shape (size, n_groups, n²)
-    information : ndarray, shape (size, size)
-        Of the data alone, by C.
-    speed_rad_s : float
-        Speed for which they were computed.
-    """
-
-    slopes: FloatArray
-    information: FloatArray
-    speed_rad_s: float
+    slopes: FloatArray  # (size, n_groups, n²)
+    information: FloatArray  # (size, size), of the data alone, by C
+    speed_rad_s: float  # speed for which they were computed
 
 
 @dataclass(frozen=True, slots=True)
 class Maximum:
-    """Where a search ended.
+    """Where a search ended."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (size,)
-        The parameter point.
-    information : ndarray, shape (size, size)
-        Fisher information there, on the elements of C (not of T).
-    slopes : ndarray, shape (size, n_groups, n²)
-        Whitened slopes it is made of.
-    slopes_rad_s : float
-        Speed for which they were computed: that of the window, or of the search whose slopes were taken over.
-    whitened : Whitened
-        Theory and estimate there.
-    steps : int
-        Steps tried.
-    fitted : float
-        Parameters that the window determined; what the weak pulls determine does not count.
-    remaining : ndarray, shape (n_diagnosed,)
-        Step of the diagnosed parameters that the search would still take; a small part of a standard error if it has
-        converged.
-    """
-
-    theta: FloatArray
-    information: FloatArray
-    slopes: FloatArray
+    theta: FloatArray  # (size,), the parameter point
+    information: FloatArray  # (size, size), Fisher information there, on the elements of C (not of T)
+    slopes: FloatArray  # (size, n_groups, n²), whitened slopes it is made of
+    # Speed for which they were computed: that of the window, or of the search whose slopes were taken over.
     slopes_rad_s: float
-    whitened: Whitened
-    steps: int
-    fitted: float
+    whitened: Whitened  # theory and estimate there
+    steps: int  # steps tried
+    fitted: float  # parameters that the window determined; what the weak pulls determine does not count
+    # (n_diagnosed,): step of the diagnosed parameters that the search would still take; a small part of a standard
+    # error if it has converged
     remaining: FloatArray
 
 

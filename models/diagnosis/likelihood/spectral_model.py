@@ -60,33 +60,18 @@ _BEARING_DOFS = (0, 0, 3, 3)
 
 @dataclass(frozen=True, slots=True)
 class ModelPoint:
-    """Expected spectra at one parameter point and what their derivatives are made of, in the motions' units.
+    """Expected spectra at one parameter point and what their derivatives are made of, in the motions' units."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (size,)
-        The parameter point.
-    S : ndarray, shape (n_groups, n, n)
-        Cross-spectral matrices.
-    G : ndarray, shape (n_groups, n_nodes, n, 6)
-        Transfer from forces (in units of C, coloured) to measured motions, times the root of the node's weight.
-    H : ndarray, shape (n_groups, n_nodes, 6, 6)
-        Receptance of all six degrees of freedom for the same forces, without that root.
-    colour : ndarray, shape (n_groups, 6)
-        D.
-    C : ndarray, shape (6, 6)
-        Level matrix.
-    speed_rad_s : float
-        Speed of the gyroscopic terms.
-    """
-
-    theta: FloatArray
-    S: ComplexArray
+    theta: FloatArray  # (size,), the parameter point
+    S: ComplexArray  # (n_groups, n, n), cross-spectral matrices
+    # (n_groups, n_nodes, n, 6): transfer from forces (in units of C, coloured) to measured motions, times the root of
+    # the node's weight
     G: ComplexArray
+    # (n_groups, n_nodes, 6, 6): receptance of all six degrees of freedom for the same forces, without that root
     H: ComplexArray
-    colour: FloatArray
-    C: FloatArray
-    speed_rad_s: float
+    colour: FloatArray  # (n_groups, 6), D
+    C: FloatArray  # (6, 6), level matrix
+    speed_rad_s: float  # speed of the gyroscopic terms
 
 
 class SpectralModel:

@@ -33,41 +33,24 @@ _RATE = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Unbalance:
-    """Relative change of e in one window.
-
-    Attributes
-    ----------
-    covariance : ndarray, shape (5,)
-        With the logarithmic ratios of the structural parameters.
-    """
+    """Relative change of e in one window."""
 
     change: float
     variance: float
-    covariance: FloatArray
+    covariance: FloatArray  # (5,), with the logarithmic ratios of the structural parameters
     vector: UnbalanceVector
 
 
 @dataclass(frozen=True, slots=True)
 class _Ratios:
-    """The unbalance over the nominal one: real with the phase as known, and as real and imaginary part without.
+    """The unbalance over the nominal one: real with the phase as known, and as real and imaginary part without."""
 
-    Attributes
-    ----------
-    values, variances : ndarray, shape (3,)
-        The real number; real and imaginary part.
-    between : float
-        Covariance of the two parts.
-    covariance : ndarray, shape (3, 5)
-        Of the three with the logarithmic ratios of the structural parameters.
-    foreign : str
-        See `UnbalanceVector`.
-    """
-
+    # (3,): the real number; real and imaginary part
     values: FloatArray
     variances: FloatArray
-    between: float
-    covariance: FloatArray
-    foreign: str
+    between: float  # covariance of the two parts
+    covariance: FloatArray  # (3, 5), of the three with the logarithmic ratios of the structural parameters
+    foreign: str  # see `UnbalanceVector`
 
     def decided(self) -> Unbalance:
         """Take that of the descriptions which holds, see this module."""

@@ -39,23 +39,12 @@ _VAGUE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class AmortisedNetwork:
-    """Hidden layers with y = x / (1 + e⁻ˣ), and a linear path beside them to the means.
+    """Hidden layers with y = x / (1 + e⁻ˣ), and a linear path beside them to the means."""
 
-    Attributes
-    ----------
-    equation : str
-        The paper's number.
-    weights : tuple of ndarray, shapes (n_in, n_out)
-        Of the hidden layers and the output.
-    biases : tuple of ndarray, shapes (n_out,)
-    direct : ndarray, shape (n_inputs, n_parameters)
-        From the inputs to the means.
-    """
-
-    equation: str
-    weights: tuple[Float32Array, ...]
+    equation: str  # the paper's number
+    weights: tuple[Float32Array, ...]  # of the hidden layers and the output
     biases: tuple[Float32Array, ...]
-    direct: Float32Array
+    direct: Float32Array  # (n_inputs, n_parameters), from the inputs to the means
 
     def __call__(self, inputs: Float32Array) -> tuple[FloatArray, FloatArray]:
         """Means, shape (n, p), and Cholesky factors of the covariance, shape (n, p, p), of the logarithmic ratios."""
@@ -75,20 +64,11 @@ class AmortisedNetwork:
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What windows simulated in time say about one network's parameter.
+    """What windows simulated in time say about one network's parameter."""
 
-    Attributes
-    ----------
-    bias : float
-        Median error of the logarithmic ratio; it is taken off.
-    log_deviation : tuple of float
-        Logarithms of stated standard errors, ascending: knots.
-    z_scale : tuple of float
-        At each knot, what the standard error has to be multiplied by for its 95 % interval to hold 95 %.
-    """
-
-    bias: float
-    log_deviation: tuple[float, ...]
+    bias: float  # median error of the logarithmic ratio; it is taken off
+    log_deviation: tuple[float, ...]  # logarithms of stated standard errors, ascending: knots
+    # At each knot, what the standard error has to be multiplied by for its 95 % interval to hold 95 %.
     z_scale: tuple[float, ...]
 
     def scale(self, deviation: FloatArray) -> FloatArray:
@@ -98,26 +78,14 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class AmortisedNetworks:
-    """All amortised networks of one machine.
+    """All amortised networks of one machine."""
 
-    Attributes
-    ----------
-    states : tuple of str
-        Measured states they were trained with.
-    calibration : mapping of str to Calibration
-        For every parameter; empty before calibration.
-    novelty_limit : float
-        Largest `FeatureBasis.novelty` that is evaluated.
-    log_range : float
-        Parameters were drawn up to this logarithmic ratio, either sign.
-    """
-
-    states: tuple[str, ...]
+    states: tuple[str, ...]  # measured states they were trained with
     basis: FeatureBasis
     networks: tuple[AmortisedNetwork, ...]
-    calibration: dict[str, Calibration]
-    novelty_limit: float
-    log_range: float
+    calibration: dict[str, Calibration]  # for every parameter; empty before calibration
+    novelty_limit: float  # largest `FeatureBasis.novelty` that is evaluated
+    log_range: float  # parameters were drawn up to this logarithmic ratio, either sign
 
 
 class NetworkDiagnostician:

@@ -118,16 +118,10 @@ class Manifest(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Trained networks of one machine.
-
-    Attributes
-    ----------
-    networks : tuple of EquationNetwork
-        Relation networks in the order of the equation table.
-    """
+    """Trained networks of one machine."""
 
     manifest: Manifest
-    networks: tuple[EquationNetwork, ...]
+    networks: tuple[EquationNetwork, ...]  # relation networks in the order of the equation table
     amortised: AmortisedNetworks | None = None
 
     @property

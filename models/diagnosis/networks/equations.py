@@ -27,40 +27,21 @@ _ANGLES = np.arange(16) * (2 * np.pi / 16)
 
 @dataclass(frozen=True, slots=True)
 class StatisticsView:
-    """The statistics an equation looks at: of a whole window or of one hop in it.
+    """The statistics an equation looks at: of a whole window or of one hop in it."""
 
-    Attributes
-    ----------
-    states : tuple of str
-        Measured states, naming rows and columns of the correlations.
-    correlation : ndarray, shape (n_lags, n, n)
-        Stochastic part at the lags that the networks use.
-    synchronous : ndarray of complex, shape (n,) or None
-        Rotation-synchronous vectors.
-    speed_rad_s : float
-        Speed Ω.
-    """
-
-    states: tuple[str, ...]
-    correlation: FloatArray
-    synchronous: ComplexArray | None
-    speed_rad_s: float
+    states: tuple[str, ...]  # measured states, naming rows and columns of the correlations
+    correlation: FloatArray  # (n_lags, n, n), stochastic part at the lags that the networks use
+    synchronous: ComplexArray | None  # (n,), rotation-synchronous vectors
+    speed_rad_s: float  # speed Ω
 
 
 @dataclass(frozen=True, slots=True)
 class EquationRows:
-    """Training or evaluation rows of one equation: one per lag and reference.
+    """Training or evaluation rows of one equation: one per lag and reference."""
 
-    Attributes
-    ----------
-    inputs : ndarray, shape (n_rows, n_inputs)
-    target : ndarray, shape (n_rows,)
-    signatures : ndarray, shape (n_rows, n_parameters)
-        What a relative change of one of the own parameters adds to the target.
-    """
-
-    inputs: FloatArray
-    target: FloatArray
+    inputs: FloatArray  # (n_rows, n_inputs)
+    target: FloatArray  # (n_rows,)
+    # (n_rows, n_parameters): what a relative change of one of the own parameters adds to the target
     signatures: FloatArray
 
     @property
@@ -71,21 +52,12 @@ class EquationRows:
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """One correlation R_ij(τ), of a reference i with a response j.
+    """One correlation R_ij(τ), of a reference i with a response j."""
 
-    Attributes
-    ----------
-    response : str
-        State j.
-    rate_reference : bool
-        Whether the reference is the rate ẏ instead of the displacement y of the reference channel.
-    times_speed : bool
-        Whether the term stands with Ω (gyroscopic).
-    """
-
-    response: str
+    response: str  # state j
+    # Whether the reference is the rate ẏ instead of the displacement y of the reference channel.
     rate_reference: bool = False
-    times_speed: bool = False
+    times_speed: bool = False  # whether the term stands with Ω (gyroscopic)
 
     @property
     def name(self) -> str:
@@ -97,20 +69,14 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Equation:
-    """An equation between correlations of the stochastic part (28, 30, 31).
+    """An equation between correlations of the stochastic part (28, 30, 31)."""
 
-    Attributes
-    ----------
-    number, title : str
-        The paper's number, and what it is about.
-    signatures : mapping of str to function
-        Own parameter to the coefficients of the inputs that it scales, a function of the rotor.
-    """
-
+    # The paper's number, and what it is about.
     number: str
     title: str
     target: Term
     inputs: tuple[Term, ...]
+    # Own parameter to the coefficients of the inputs that it scales, a function of the rotor.
     signatures: Mapping[str, Callable[[RotorParameters], tuple[float, ...]]]
 
     @property

@@ -217,23 +217,14 @@ class ForceFeatures:
 
 @dataclass(frozen=True, slots=True)
 class FeatureBasis:
-    """How raw features become the inputs of the networks, float32.
+    """How raw features become the inputs of the networks, float32."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape (n_series, 1, n_bins)
-    directions : ndarray, shape (n_series, n_bins, n_kept)
-        Principal components of every function of frequency.
-    centre, scale : ndarray, shape (n_inputs,)
-        Of all inputs over random machines and conditions; those of equation 29 alone stand last.
-    precision_factor : ndarray, shape (n_common, n_common)
-        Factor F of their inverse covariance F Fᵀ, without those of equation 29.
-    """
-
-    mean: Float32Array
-    directions: Float32Array
+    mean: Float32Array  # (n_series, 1, n_bins)
+    directions: Float32Array  # (n_series, n_bins, n_kept), principal components of every function of frequency
+    # (n_inputs,): of all inputs over random machines and conditions; those of equation 29 alone stand last
     centre: Float32Array
     scale: Float32Array
+    # (n_common, n_common): factor F of their inverse covariance F Fᵀ, without those of equation 29
     precision_factor: Float32Array
 
     @property

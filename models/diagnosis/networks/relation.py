@@ -40,22 +40,13 @@ HIDDEN = 15
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A multi-layer perceptron with one hidden layer and one output.
+    """A multi-layer perceptron with one hidden layer and one output."""
 
-    Attributes
-    ----------
-    input_scale : ndarray, shape (n_inputs,)
-        Inputs are divided by it.
-    W1, b1 : ndarray, shapes (n_inputs, 15) and (15,)
-    W2 : ndarray, shape (15,)
-    b2 : ndarray, shape (1,)
-    """
-
-    input_scale: FloatArray
+    input_scale: FloatArray  # (n_inputs,), inputs are divided by it
     W1: FloatArray
     b1: FloatArray
-    W2: FloatArray
-    b2: FloatArray
+    W2: FloatArray  # (15,)
+    b2: FloatArray  # (1,)
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Output for each row of inputs, shape (n_rows,)."""
@@ -65,25 +56,14 @@ class Network:
 
 @dataclass(frozen=True, slots=True)
 class Healthy:
-    """How an equation reads on healthy windows that training did not see.
+    """How an equation reads on healthy windows that training did not see."""
 
-    Attributes
-    ----------
-    windows : int
-        How many.
-    msd : float
-        Mean of the mean squared deviation.
-    z_scale : tuple of float
-        What the standard errors are multiplied by so that 95 % intervals hold 95 %: from quantiles of the readings in
-        their own standard errors, not from their mean square, which a few windows with one source decide.
-    spread : tuple of float
-        Robust standard deviation of each own parameter's reading.
-    """
-
-    windows: int
-    msd: float
+    windows: int  # how many
+    msd: float  # mean of the mean squared deviation
+    # What the standard errors are multiplied by so that 95 % intervals hold 95 %: from quantiles of the readings in
+    # their own standard errors, not from their mean square, which a few windows with one source decide.
     z_scale: tuple[float, ...]
-    spread: tuple[float, ...]
+    spread: tuple[float, ...]  # robust standard deviation of each own parameter's reading
 
 
 @dataclass(frozen=True, slots=True)

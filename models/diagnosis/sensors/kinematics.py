@@ -33,49 +33,28 @@ _FLOOR = 1e-10
 
 @dataclass(frozen=True, slots=True)
 class PairReading:
-    """What two sensors of one motion say of each other.
-
-    Attributes
-    ----------
-    log_gain, log_gain_error : float
-        Logarithm of the second's gain over the first's, and its standard error.
-    polarity : int
-        -1 where one of them is reversed.
-    delay_s, delay_error_s : float
-        By how much the second comes later.
-    shared : float
-        How much of the motion they share after gain and delay, 0 to 1, over the whole band.
-    """
+    """What two sensors of one motion say of each other."""
 
     pair: MotionPair
+    # Logarithm of the second's gain over the first's, and its standard error.
     log_gain: float
     log_gain_error: float
-    polarity: int
+    polarity: int  # -1 where one of them is reversed
+    # By how much the second comes later.
     delay_s: float
     delay_error_s: float
-    shared: float
+    shared: float  # how much of the motion they share after gain and delay, 0 to 1, over the whole band
 
 
 @dataclass(frozen=True, slots=True)
 class Banded:
-    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v.
+    """Cross-spectra of z = (jω)ᵒʳᵈᵉʳ x, of v and of the other places, in bands; index 0 is z, 1 is v."""
 
-    Attributes
-    ----------
-    spectra : ndarray, shape (n_bands, 2 + n_others, 2 + n_others)
-        ``spectra[b, i, j]`` = E{a_i a_j*}, without the rotation.
-    total : ndarray, shape (n_bands, 2, 2)
-        The same of z and v with the rotation.
-    w : ndarray, shape (n_bands,)
-        Angular frequency around which each band's power lies.
-    averages : ndarray, shape (n_bands,)
-        Effectively independent samples.
-    """
-
+    # (n_bands, 2 + n_others, 2 + n_others): ``spectra[b, i, j]`` = E{a_i a_j*}, without the rotation
     spectra: ComplexArray
-    total: ComplexArray
-    w: FloatArray
-    averages: FloatArray
+    total: ComplexArray  # (n_bands, 2, 2), the same of z and v with the rotation
+    w: FloatArray  # (n_bands,), angular frequency around which each band's power lies
+    averages: FloatArray  # (n_bands,), effectively independent samples
 
 
 def banded(window: WindowStatistics, pair: MotionPair) -> Banded:

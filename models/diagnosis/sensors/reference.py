@@ -94,21 +94,12 @@ _SMOOTHED = 3
 
 @dataclass(frozen=True, slots=True)
 class PairNoise:
-    """Noise of two sensors of one motion, in bands.
-
-    Attributes
-    ----------
-    density : ndarray, shape (n_bands,)
-        Power of their difference as the second shows it, two-sided, SI²/Hz.
-    leakage : ndarray, shape (n_bands,)
-        The part of it that two perfect sensors would show in segments of this length.
-    scale : ndarray, shape (n_bands,)
-        Power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI².
-    """
+    """Noise of two sensors of one motion, in bands."""
 
     pair: MotionPair
-    density: FloatArray
-    leakage: FloatArray
+    density: FloatArray  # (n_bands,), power of their difference as the second shows it, two-sided, SI²/Hz
+    leakage: FloatArray  # (n_bands,), the part of it that two perfect sensors would show in segments of this length
+    # (n_bands,): power of the difference, times 1 Hz, if each sensor had white noise of its own rms in 1 Hz, SI²
     scale: FloatArray
 
     @property
@@ -124,24 +115,13 @@ class PairNoise:
 
 @dataclass(frozen=True, slots=True)
 class ChannelNoise:
-    """What one channel does not share with the others.
-
-    Attributes
-    ----------
-    density : ndarray, shape (n_bands,)
-        What is left of it, two-sided, SI²/Hz.
-    share : ndarray, shape (n_bands,)
-        The same over the channel's mean square, 1/Hz.
-    flat : float
-        Part of the bands that lie on the floor, 0 to 1.
-    line_rms, line_hz : float
-        Strongest line that it alone shows, SI, and where; 0 without one.
-    """
+    """What one channel does not share with the others."""
 
     column: int
-    density: FloatArray
-    share: FloatArray
-    flat: float
+    density: FloatArray  # (n_bands,), what is left of it, two-sided, SI²/Hz
+    share: FloatArray  # (n_bands,), the same over the channel's mean square, 1/Hz
+    flat: float  # part of the bands that lie on the floor, 0 to 1
+    # Strongest line that it alone shows, SI, and where; 0 without one.
     line_rms: float
     line_hz: float
 
@@ -311,21 +291,14 @@ class PairReference(_WithNoise):
 
 
 class SensorReference(BaseModel):
-    """What healthy windows say of the sensors; as JSON it comes back bit for bit.
-
-    Attributes
-    ----------
-    n_windows, n_hops : int
-        Healthy windows it was learned from, and the hops in them.
-    speed_rad_s : float or None
-        Mean speed in them.
-    """
+    """What healthy windows say of the sensors; as JSON it comes back bit for bit."""
 
     model_config = _STRICT
 
+    # Healthy windows it was learned from, and the hops in them.
     n_windows: int = Field(ge=1)
     n_hops: int = Field(ge=1)
-    speed_rad_s: float | None = None
+    speed_rad_s: float | None = None  # mean speed in them
     channels: tuple[ChannelReference, ...]
     pairs: tuple[PairReference, ...]
 

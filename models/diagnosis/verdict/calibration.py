@@ -34,21 +34,11 @@ _FURTHER = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Thresholds:
-    """What a test value must exceed, in standard errors.
+    """What a test value must exceed, in standard errors."""
 
-    Attributes
-    ----------
-    first : float
-        For the first changed parameter: this one carries the declared rate.
-    further : float
-        For every one more; larger, because a wrong name beside a right one misleads.
-    outside : float
-        For the over-identification test (one-sided), which has the declared rate to itself.
-    """
-
-    first: float
-    further: float
-    outside: float
+    first: float  # for the first changed parameter: this one carries the declared rate
+    further: float  # for every one more; larger, because a wrong name beside a right one misleads
+    outside: float  # for the over-identification test (one-sided), which has the declared rate to itself
 
 
 def _upper(probability: float) -> float:

@@ -31,32 +31,18 @@ __all__ = ["Isolation", "isolate", "isolate_window", "model_test", "outside_conf
 
 @dataclass(frozen=True, slots=True)
 class Isolation:
-    """Verdict on one stretch of data.
+    """Verdict on one stretch of data."""
 
-    Attributes
-    ----------
-    changed : tuple of str
-        Parameters that changed, in the order of `PARAMETERS`; empty: none.
-    confidence : float
-        Posterior probability of exactly this set among all sets.
-    probability : tuple of float
-        Posterior probability of each of `PARAMETERS` to be among the changed ones.
-    readings : tuple of Parameter
-        The changed parameters with all others held at nominal: sharper than the free estimates, and right if the
-        verdict is.
-    outside : bool
-        The window is further from the model than sampling explains: something changed that no parameter describes, or
-        a sensor is at fault. The verdict on the parameters is then of low confidence.
-    outside_confidence : float or None
-        Of that, see `outside_confidence`; None where there is no such test.
-    """
-
-    changed: tuple[str, ...]
-    confidence: float
-    probability: tuple[float, ...]
+    changed: tuple[str, ...]  # parameters that changed, in the order of `PARAMETERS`; empty: none
+    confidence: float  # posterior probability of exactly this set among all sets
+    probability: tuple[float, ...]  # posterior probability of each of `PARAMETERS` to be among the changed ones
+    # The changed parameters with all others held at nominal: sharper than the free estimates, and right if the verdict
+    # is.
     readings: tuple[Parameter, ...] = ()
+    # The window is further from the model than sampling explains: something changed that no parameter describes, or a
+    # sensor is at fault. The verdict on the parameters is then of low confidence.
     outside: bool = False
-    outside_confidence: float | None = None
+    outside_confidence: float | None = None  # of that, see `outside_confidence`; None where there is no such test
 
     @property
     def low_confidence(self) -> bool:

@@ -47,27 +47,14 @@ _CONTRADICTION_RATE = 1e-7
 
 @dataclass(frozen=True, slots=True)
 class SequentialSettings:
-    """Lengths and declared rate.
+    """Lengths and declared rate."""
 
-    Attributes
-    ----------
-    hop_s : float
-        Data time between looks, s.
-    window_hops : int
-        Hops of a full window.
-    short_hops : tuple of int
-        Hops of the short stretches, shortest first.
-    false_alarms_per_month : float
-        Over all parameters and lengths together.
-    systematic : float
-        Standard error that more windows do not remove, of every parameter: an estimate on nominal values is not true to
-        the last digit however long it is averaged.
-    """
-
-    hop_s: float
-    window_hops: int
-    short_hops: tuple[int, ...] = _SHORT_HOPS
-    false_alarms_per_month: float = 1.0
+    hop_s: float  # data time between looks, s
+    window_hops: int  # hops of a full window
+    short_hops: tuple[int, ...] = _SHORT_HOPS  # hops of the short stretches, shortest first
+    false_alarms_per_month: float = 1.0  # over all parameters and lengths together
+    # Standard error that more windows do not remove, of every parameter: an estimate on nominal values is not true to
+    # the last digit however long it is averaged.
     systematic: float = 0.002
 
     @classmethod
@@ -104,25 +91,15 @@ class SequentialSettings:
 
 @dataclass(slots=True)
 class SequentialState:
-    """All that the test remembers.
+    """All that the test remembers."""
 
-    Attributes
-    ----------
-    sums : dict of int to list of Stretch
-        Latest stretches of one window (key 1) and of the sums of 2, 4, … windows that longer sums may be made of,
-        oldest first.
-    change_ns : int or None
-        Data before this belongs to another condition of the machine.
-    before : tuple of float
-        Values of `PARAMETERS` in that condition, in the scale of their errors.
-    findings : tuple of Finding
-        What has been found and still holds.
-    """
-
+    # Latest stretches of one window (key 1) and of the sums of 2, 4, … windows that longer sums may be made of, oldest
+    # first.
     sums: dict[int, list[Stretch]] = field(default_factory=dict)
-    change_ns: int | None = None
+    change_ns: int | None = None  # data before this belongs to another condition of the machine
+    # Values of `PARAMETERS` in that condition, in the scale of their errors.
     before: tuple[float, ...] = (0.0,) * len(PARAMETERS)
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()  # what has been found and still holds
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything but the sums, which are in `hops`, as named arrays."""

@@ -54,34 +54,19 @@ def slope(name: str, value: float) -> float:
 
 @dataclass(frozen=True, eq=False)  # without slots: what is worked out is kept
 class Stretch:
-    """What a stretch of data says.
+    """What a stretch of data says."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Oldest and newest data.
-    vector : ndarray, shape (6,)
-        J x, in the order of `PARAMETERS`; 0 for a parameter that was not evaluable.
-    information : ndarray, shape (6, 6)
-        J; zero row and column for a parameter that was not evaluable.
-    misfit_z : float or None
-        Over-identification, standard normal where the model holds.
-    common : ndarray, shape (6, 6), or None
-        Covariance shared with every other stretch, not contained in `information`.
-    unexplained : str
-        Why nothing of it should be believed, see `Diagnosis`; of one window at most, sums do not say.
-    unbalance : UnbalanceVector or None
-        Its unbalance with its direction; of one window at most, too.
-    """
-
+    # Oldest and newest data.
     start_ns: int
     end_ns: int
-    vector: FloatArray
-    information: FloatArray
-    misfit_z: float | None = None
+    vector: FloatArray  # (6,), J x, in the order of `PARAMETERS`; 0 for a parameter that was not evaluable
+    information: FloatArray  # (6, 6), J; zero row and column for a parameter that was not evaluable
+    misfit_z: float | None = None  # over-identification, standard normal where the model holds
+    # (6, 6): covariance shared with every other stretch, not contained in `information`
     common: FloatArray | None = None
+    # Why nothing of it should be believed, see `Diagnosis`; of one window at most, sums do not say.
     unexplained: str = ""
-    unbalance: UnbalanceVector | None = None
+    unbalance: UnbalanceVector | None = None  # its unbalance with its direction; of one window at most, too
 
     @cached_property
     def known(self) -> tuple[int, ...]:
