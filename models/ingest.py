@@ -108,13 +108,7 @@ class Course:
 
 
 class Gate:
-    """Judges the blocks of one machine in the order of their arrival.
-
-    Parameters
-    ----------
-    machine : MachineFile
-        What the stream must look like.
-    """
+    """Judges the blocks of one machine in the order of their arrival."""
 
     def __init__(self, machine: MachineFile) -> None:
         self._name = f"{machine.site}/{machine.name}"
@@ -149,10 +143,7 @@ class Gate:
 
         Takes microseconds and changes nothing: any thread may ask.
 
-        Parameters
-        ----------
-        payload, attachment, encoding : bytes, bytes, str
-            See `models.signals.wire`.
+        `payload`, `attachment`, `encoding`: see `models.signals.wire`.
         """
         if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
             return False
@@ -167,12 +158,7 @@ class Gate:
     def judge(self, block: SampleBlock, schema_hash: str = "") -> Admission:
         """Accept or refuse a block.
 
-        Parameters
-        ----------
-        block : SampleBlock
-            As decoded.
-        schema_hash : str
-            Schema hash the sender named, empty if it named none.
+        `schema_hash`: schema hash the sender named, empty if it named none.
         """
         return self.form(block, schema_hash) or self._place(block)
 
@@ -187,14 +173,7 @@ class Gate:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called.
 
-        Parameters
-        ----------
-        arrays : mapping of str to ndarray
-
-        Raises
-        ------
-        CheckpointError
-            If they are not a gate's; nothing is changed then.
+        Raises CheckpointError if they are not a gate's; nothing is changed then.
         """
         courses, candidates, refused = (_courses(arrays, name) for name in ("courses", "candidate", "refused"))
         self._expected = courses[-1] if courses else None

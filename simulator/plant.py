@@ -56,14 +56,8 @@ class Plant:
 
     The first sample is a draw from the stationary distribution, at shaft angle 0.
 
-    Parameters
-    ----------
-    machine : Machine
-        The original machine, its rate, and the angle of the heavy spot from the phase reference.
-    condition : Condition
-        What holds from the first sample on.
-    rng : numpy.random.Generator
-        Used by nothing else, so that the realisation depends on the seed alone.
+    `machine`: the original machine, its rate, and the angle of the heavy spot from the phase reference. `condition`:
+    what holds from the first sample on. `rng`: used by nothing else, so that the realisation depends on the seed alone.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -85,10 +79,7 @@ class Plant:
     def change(self, condition: Condition) -> None:
         """Let another condition hold from the next sample on; displacement, velocity and shaft angle carry over.
 
-        Raises
-        ------
-        ValueError
-            If the number of sources changes: the state would not fit.
+        Raises ValueError if the number of sources changes: the state would not fit.
         """
         if len(condition.sources) != self._n_sources:
             raise ValueError(f"{len(condition.sources)} sources instead of {self._n_sources}: the state would not fit")
@@ -223,15 +214,8 @@ class NonlinearPlant(Plant):
 
     An anomaly that is there from the first sample on has run in for five seconds before it.
 
-    Parameters
-    ----------
-    condition : Condition
-        What holds from the first sample on.
-
-    Raises
-    ------
-    EstimationError
-        Here, in `change` or in `advance`: if a crack or a rub makes the rotor unstable.
+    `condition`: what holds from the first sample on. Raises EstimationError, here, in `change` or in `advance`, if a
+    crack or a rub makes the rotor unstable.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -246,10 +230,7 @@ class NonlinearPlant(Plant):
     def advance(self, n_samples: int) -> PlantSamples:
         """Return the next `n_samples` samples and move on behind them.
 
-        Raises
-        ------
-        EstimationError
-            If friction drives the disc off.
+        Raises EstimationError if friction drives the disc off.
         """
         if self._crack is None and self._contact is None:
             return super().advance(n_samples)

@@ -56,13 +56,8 @@ def pieces_of(pieces: Iterable[Piece]) -> dict[str, np.ndarray]:
 class Recall:
     """Blocks that are taken again, and what can be made of them.
 
-    Parameters
-    ----------
-    plan : Plan
-    level : ndarray, shape (n_states,) or (0,)
-        What was subtracted from all samples.
-    arrays : mapping of str to ndarray
-        From `pieces_of`: the hops, oldest first, and last the unfinished one.
+    `level` (n_states,) or (0,): what was subtracted from all samples. `arrays`: from `pieces_of`: the hops, oldest
+    first, and last the unfinished one. Raises CheckpointError if an array is missing or of another form.
 
     Attributes
     ----------
@@ -72,11 +67,6 @@ class Recall:
         Of the hops.
     last : Piece
         The unfinished hop.
-
-    Raises
-    ------
-    CheckpointError
-        If an array is missing or of another form.
     """
 
     def __init__(self, plan: Plan, level: FloatArray, arrays: Mapping[str, np.ndarray]) -> None:

@@ -49,10 +49,7 @@ def implicated(findings: Iterable[SensorFault]) -> set[str]:
 class Naming:
     """Names of channels and values in their units, for sentences.
 
-    Parameters
-    ----------
-    channels : iterable of Channel
-        Those of the machine; what is not among them is called by its state and given in SI units.
+    `channels`: those of the machine; what is not among them is called by its state and given in SI units.
     """
 
     def __init__(self, channels: Iterable[Channel] = ()) -> None:
@@ -323,10 +320,7 @@ class SensorReference(BaseModel):
 def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReference:
     """Learn from healthy windows that do not overlap.
 
-    Raises
-    ------
-    EstimationError
-        If there is no window, or a channel shows no fluctuation in one.
+    Raises EstimationError if there is no window, or a channel shows no fluctuation in one.
     """
     if not windows:
         raise EstimationError("no healthy window to learn the sensors from")
