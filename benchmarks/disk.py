@@ -26,7 +26,7 @@ from pathlib import Path
 from models.commissioning.commissioned import install
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from service.settings.service import LogSettings, QueueSettings
 from service.stream.inbox import RawBlock

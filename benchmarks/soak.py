@@ -38,7 +38,7 @@ from models.signals.link import LinkSettings
 from rotorwatch.client.alarm_log import follow_alarms
 from rotorwatch.records.alarms import AlarmCloudEvent
 from service.history.machine import MachineStore
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from service.monitor.monitor import MachineMonitor
 from service.stream.transport import Link, LinkError

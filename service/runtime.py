@@ -38,8 +38,8 @@ from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.metrics.requests import RequestCounts, RequestMeter
 from service.delivery.webhooks.webhooks import Webhooks
-from service.history.audit import AuditLog
-from service.history.errors import StoreError
+from service.history.records import StoreError
+from service.history.shared import AuditLog
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.recordings.recent import recent_messages, recorded_files

@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rotorwatch.records.example import example
 from rotorwatch.records.monitor import Problem
-from service.history.errors import StoreError
+from service.history.records import StoreError
 from service.terminal.logs import logger
 
 __all__ = ["add_problems", "problem_answer", "problem_responses", "responses", "share_problems"]

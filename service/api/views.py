@@ -18,8 +18,8 @@ from service.api.routes.recordings import RecordingIndex
 from service.api.routes.replays import ReplayDesk
 from service.api.routes.service import MeasuredView
 from service.delivery.event_feed import EventFeed
-from service.history.audit import AuditLog
 from service.history.machine import MachineStore
+from service.history.shared import AuditLog
 from service.monitor.alarms.operation import OperatorAction
 from service.monitor.reports import Identity
 

@@ -31,7 +31,7 @@ def check(config: HistoryOption = None) -> None:
     [cyan]rotorwatch history check --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.history.backup import faults  # noqa: PLC0415  # keeps --help quick
+        from service.history.file import faults  # noqa: PLC0415  # keeps --help quick
 
         file = _chosen(config).path
         found = faults(file)
@@ -52,7 +52,7 @@ def backup(
     [cyan]rotorwatch history backup /backup/history-monday.sqlite --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.history.backup import back_up  # noqa: PLC0415  # keeps --help quick
+        from service.history.file import back_up  # noqa: PLC0415  # keeps --help quick
 
         file = _chosen(config).path
         back_up(file, copy)
@@ -72,7 +72,7 @@ def restore(
     [cyan]rotorwatch history restore /backup/history-monday.sqlite --config plant.toml[/cyan]
     """
     with exit_codes():
-        from service.history.backup import restore as put_back  # noqa: PLC0415  # keeps --help quick
+        from service.history.file import restore as put_back  # noqa: PLC0415  # keeps --help quick
 
         file = _chosen(config)
         kept = put_back(file, backup_file)

@@ -80,7 +80,7 @@ def record(
             config, machine, out, {k: v for k, v in changes.items() if v is not None}
         )
         from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
-        from service.history.alarm_log import committed_events  # noqa: PLC0415
+        from service.history.shared import committed_events  # noqa: PLC0415
         from service.recordings.recorder import MachineRecorder  # noqa: PLC0415
         from service.settings.service import LogSettings  # noqa: PLC0415
         from service.stream.transport import Link, MachineTap  # noqa: PLC0415

@@ -21,8 +21,7 @@ from starlette.concurrency import run_in_threadpool
 
 from models.errors import RotorwatchError
 from rotorwatch.records.health import Health
-from service.history.errors import StoreError
-from service.history.records import StoredEvent
+from service.history.records import StoredEvent, StoreError
 
 __all__ = ["CURSOR_PATTERN", "AlarmLog", "Cursor", "CursorError", "EventFeed", "cursor_text", "parsed_cursor"]
 

@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 import zstandard
 
-from service.history.errors import StoreError
-from service.history.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport
+from service.history.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport, StoreError
 
 __all__ = ["Bundle", "Claim", "PackedReport", "pack", "unpack"]
 

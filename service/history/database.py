@@ -21,8 +21,8 @@ from sqlalchemy import URL, Connection, Engine, Row, Select, create_engine, even
 from sqlalchemy.exc import ArgumentError, DBAPIError, DisconnectionError, SQLAlchemyError
 from sqlalchemy.pool import StaticPool
 
-from service.history.errors import DamagedError, StoreError
 from service.history.file import HistoryFile, is_damage
+from service.history.records import DamagedError, StoreError
 from service.history.tables import REVISION
 
 if TYPE_CHECKING:
@@ -334,7 +334,7 @@ class Database:
     def _bring_up_to_date(self, connection: Connection) -> None:
         there = inspect(connection).has_table("alembic_version")
         if not there or connection.scalars(text("SELECT version_num FROM alembic_version")).all() != [REVISION]:
-            from service.history.schema import migrate  # noqa: PLC0415  # Alembic takes long to import
+            from service.history.migrations import migrate  # noqa: PLC0415  # Alembic takes long to import
 
             try:
                 migrate(connection)

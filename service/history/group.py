@@ -11,8 +11,7 @@ from sqlalchemy import ColumnElement, Connection, Table, case, delete, insert, o
 
 from service.history.claim import Bundle, Claim
 from service.history.database import Database
-from service.history.errors import StoreError
-from service.history.records import StoredEvent
+from service.history.records import StoredEvent, StoreError
 from service.history.tables import (
     alarm_events,
     buckets,

@@ -9,11 +9,10 @@ from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import ColumnElement
 
 from rotorwatch.records.history import Reading, ReadingBucket
-from service.history.alarm_log import EVENT
 from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
-from service.history.errors import StoreError
-from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport
+from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport, StoreError
+from service.history.shared import EVENT
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evaluations, readings, reports, series
 from service.history.trend import trend
 from service.history.writer import Writer

@@ -1,4 +1,4 @@
-"""What the history keeps, as it goes in and comes out.
+"""What the history keeps, as it goes in and comes out, how long, and what goes wrong with it.
 
 All times are nanoseconds since 1970 UTC. ``recorded_ns``, ``at_ns``, ``created_ns``, ``expires_ns`` and ``revoked_ns``
 are the computer's time, all others data time.
@@ -6,13 +6,20 @@ are the computer's time, all others data time.
 
 from dataclasses import dataclass
 
+from pydantic import BaseModel, ConfigDict, Field
+
+from models.errors import RotorwatchError
+
 __all__ = [
     "AuditEntry",
     "Checkpoint",
     "CheckpointHead",
     "CheckpointStep",
+    "DamagedError",
     "Dropped",
+    "Retention",
     "Step",
+    "StoreError",
     "StoredEvent",
     "StoredReading",
     "StoredReport",
@@ -155,3 +162,34 @@ class Dropped:
     reports: int = 0
     windows: int = 0
     buckets: int = 0
+
+
+class StoreError(RotorwatchError):
+    """The history cannot be opened, read or written; the message names database or machine, never a password."""
+
+
+class DamagedError(StoreError):
+    """The file is there and is no usable database; the message says what SQLite found."""
+
+
+class Retention(BaseModel):
+    """How long the history is kept, by the computer's time of recording; alarm events and audit log are kept for ever.
+
+    Readings are reduced to buckets as they come: count, least, mean and largest value, and mean standard error. Buckets
+    never go before the readings in them.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    reports_days: float = Field(
+        default=14.0, gt=0.0, le=36_500.0, description="how long full reports are kept, in days; about 2 kB each"
+    )
+    readings_days: float = Field(
+        default=90.0, gt=0.0, le=36_500.0, description="how long every single reading is kept, in days"
+    )
+    bucket_s: int = Field(
+        default=600, ge=1, le=86_400, description="length of the stretch that readings are reduced to, in seconds"
+    )
+    buckets_days: float = Field(
+        default=3650.0, gt=0.0, le=36_500.0, description="how long these reduced readings are kept, in days"
+    )

@@ -7,9 +7,7 @@ import structlog
 from sqlalchemy import Connection, Table, delete, func, select, text, update
 
 from service.history.database import Database
-from service.history.errors import StoreError
-from service.history.records import Dropped
-from service.history.retention import Retention
+from service.history.records import Dropped, Retention, StoreError
 from service.history.tables import buckets, evaluations, machines, open_buckets, readings, reports, series
 
 __all__ = ["Reduction"]

@@ -17,16 +17,11 @@ from collections.abc import Callable
 
 from sqlalchemy import text
 
-from service.history.alarm_log import AlarmLog
-from service.history.audit import AuditLog
 from service.history.database import Database
-from service.history.errors import StoreError
 from service.history.machine import MachineStore
-from service.history.records import Dropped
+from service.history.records import Dropped, Retention, StoreError
 from service.history.reduction import Reduction
-from service.history.retention import Retention
-from service.history.tokens import TokenStore
-from service.history.webhooks import WebhookCursors
+from service.history.shared import AlarmLog, AuditLog, TokenStore, WebhookCursors
 from service.history.writer import Writer
 
 __all__ = ["Store"]

@@ -15,10 +15,9 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.history.claim import Claim, PackedReport
 from service.history.database import Database
-from service.history.errors import StoreError
 from service.history.file import lock_file
 from service.history.group import SeriesNumbers, write_group
-from service.history.records import Step
+from service.history.records import Step, StoreError
 from service.history.tables import machines
 
 __all__ = ["Writer"]

@@ -15,7 +15,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 from models.errors import MachineFileError, mistakes, read_toml
 from models.machine import MachineFile, load_machine_file
 from models.signals.link import LinkSettings
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.settings.access import AccessSettings, check_access
 from service.settings.webhooks import WebhookSettings, repeated_name
 

@@ -8,7 +8,6 @@ from models.signals.recording import RecordedMessage
 from rotorwatch import __version__
 from rotorwatch.records.fields import finite
 from rotorwatch.records.health import MEASURES, Report
-from service.history.errors import StoreError
 from service.history.machine import MachineStore
 from service.history.records import (
     Checkpoint,
@@ -18,6 +17,7 @@ from service.history.records import (
     StoredEvent,
     StoredReading,
     StoredReport,
+    StoreError,
 )
 from service.monitor.alarm_conversion import alarm_cloud_event, rfc3339
 from service.monitor.alarms.alarm import Alarm, AlarmEvent

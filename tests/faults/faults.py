@@ -12,7 +12,7 @@ from pathlib import Path
 
 from models.alarm_names import CLOCK, CONFLICT, FAULT, STREAM_LOST
 from rotorwatch.records.health import HealthState
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from tests.faults.rig import Plant, Seen, locked, pause
 from tests.service.hooked import Got, hook, settings_for

@@ -23,8 +23,7 @@ from service.access.problems import add_problems
 from service.access.scopes import Caller, Scope
 from service.access.tls import server_arguments
 from service.access.tokens import new_token
-from service.history.records import AuditEntry, TokenRecord
-from service.history.retention import Retention
+from service.history.records import AuditEntry, Retention, TokenRecord
 from service.history.store import Store
 from service.settings.access import AccessSettings
 

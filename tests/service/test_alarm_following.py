@@ -17,7 +17,7 @@ from rotorwatch.client.errors import ClientError, LogReplaced
 from rotorwatch.client.log_order import LogOrder
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 from rotorwatch.records.example import example
-from service.history.errors import StoreError
+from service.history.records import StoreError
 from service.stream.transport import Link, MachineCallbacks, MachineLink, route
 from tests.service.live import endpoint, until
 

@@ -5,10 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from service.history.alarm_log import committed_events
-from service.history.errors import StoreError
-from service.history.records import Step
-from service.history.retention import Retention
+from service.history.records import Retention, Step, StoreError
+from service.history.shared import committed_events
 from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import alarm_event

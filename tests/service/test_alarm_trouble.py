@@ -19,10 +19,8 @@ from models.signals.wire import encode_block
 from rotorwatch.records.alarms import AlarmState
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Report
-from service.history.errors import StoreError
 from service.history.machine import MachineStore
-from service.history.records import Checkpoint, Step
-from service.history.retention import Retention
+from service.history.records import Checkpoint, Retention, Step, StoreError
 from service.history.store import Store
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.alarms.book import AlarmBook

@@ -19,7 +19,7 @@ from rotorwatch.records.health import Health
 from service.access.scopes import Scope
 from service.delivery import event_feed
 from service.delivery.event_feed import CursorError, cursor_text, parsed_cursor
-from service.history.errors import StoreError
+from service.history.records import StoreError
 from service.monitor.alarms.operation import OperatorAction
 from service.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings

@@ -9,8 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from models.alarm_names import FAULT
-from service.history.records import StoredEvent, TokenRecord
-from service.history.retention import Retention
+from service.history.records import Retention, StoredEvent, TokenRecord
 from service.history.store import Store
 from service.rotorwatch import app
 from service.runtime import running as running_here

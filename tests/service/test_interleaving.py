@@ -15,7 +15,7 @@ from models.commissioning.commissioned import Installed, install
 from models.machine import Machine
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from tests.service.live import ROOT, endpoint, until
 

@@ -12,7 +12,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from service.access.scopes import Scope
 from service.delivery.metrics.requests import RequestCounts
-from service.history.errors import StoreError
+from service.history.records import StoreError
 from service.runtime import Runtime, running
 from service.settings.service import HistorySettings
 from tests.service.hooked import hook, settings_for

@@ -14,8 +14,7 @@ from models.machine import Machine
 from models.signals.wire import ARROW_ENCODING, encode_block, write_arrow
 from rotorwatch.records.alarms import EventKind, Evidence
 from rotorwatch.records.health import HealthState
-from service.history.errors import StoreError
-from service.history.records import Checkpoint, Step
+from service.history.records import Checkpoint, Step, StoreError
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.evaluation import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor

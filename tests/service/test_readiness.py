@@ -10,7 +10,7 @@ import pytest
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.api.readiness import readiness_of
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from service.runtime import Runtime, running
 from service.settings.service import HistorySettings, ServiceSettings

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
-from service.history.errors import StoreError
-from service.history.records import StoredEvent
+from service.history.records import StoredEvent, StoreError
 from service.recordings.catalogue import Catalogue, Recording, kept_reasons, name_of
 from service.recordings.recorder import MachineRecorder
 from service.recordings.retention import AlarmMark, alarm_mark, decide

@@ -12,20 +12,20 @@ import pytest
 from sqlalchemy import create_engine, event, make_url, text
 from sqlalchemy.exc import DBAPIError
 
-from service.history.errors import StoreError
 from service.history.machine import MachineStore
 from service.history.records import (
     AuditEntry,
     Checkpoint,
     CheckpointHead,
     CheckpointStep,
+    Retention,
     Step,
     StoredEvent,
     StoredReading,
     StoredReport,
+    StoreError,
     TokenRecord,
 )
-from service.history.retention import Retention
 from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 

@@ -18,11 +18,9 @@ import pytest
 from sqlalchemy import Select, func, literal, select, text
 
 from service.history.database import Database
-from service.history.errors import StoreError
 from service.history.machine import MachineStore
-from service.history.records import Step
-from service.history.retention import Retention
-from service.history.schema import MIGRATING
+from service.history.migrations import MIGRATING
+from service.history.records import Retention, Step, StoreError
 from service.history.store import Store
 from tests.service.live import until
 from tests.service.postgres import KINDS, USER, PostgresServer, database_url, postgres_server

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from tests.service.live import program
 from tests.service.postgres import KINDS, database_url

@@ -15,10 +15,8 @@ from sqlalchemy.engine import Engine
 
 from service.history import claim
 from service.history.claim import unpack
-from service.history.errors import StoreError
-from service.history.records import Checkpoint, CheckpointHead
-from service.history.retention import Retention
-from service.history.schema import migrate
+from service.history.migrations import migrate
+from service.history.records import Checkpoint, CheckpointHead, Retention, StoreError
 from service.history.store import Store
 from service.history.tables import REVISION, metadata
 from tests.service.postgres import KINDS, database_url
@@ -78,7 +76,7 @@ def test_several_monitors_open_an_empty_database_at_once(url: str) -> None:
 def test_a_database_that_is_up_to_date_is_opened_without_what_only_migrations_need(url: str) -> None:
     opened_and_closed(url)
     code = (
-        "import sys; from service.history.store import Store; from service.history.retention import Retention; "
+        "import sys; from service.history.store import Store; from service.history.records import Retention; "
         "store = Store(sys.argv[1], Retention()); store.open(); store.machine('demo', 'lab'); store.close(); "
         "print({'alembic', 'sqlalchemy.orm', 'sqlalchemy.ext.asyncio'} & set(sys.modules))"
     )

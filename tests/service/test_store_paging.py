@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rotorwatch.records.history import Reading
-from service.history.records import Step, StoredEvent, StoredReading, StoredReport
-from service.history.retention import Retention
+from service.history.records import Retention, Step, StoredEvent, StoredReading, StoredReport
 from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import alarm_event

@@ -13,8 +13,7 @@ from pydantic import ValidationError
 
 from rotorwatch.records.history import ReadingBucket
 from service.history.machine import MachineStore
-from service.history.records import Dropped, Step, StoredReading, StoredReport
-from service.history.retention import Retention
+from service.history.records import Dropped, Retention, Step, StoredReading, StoredReport
 from service.history.store import Store
 from tests.service.postgres import KINDS, database_url
 from tests.service.test_store import AUDIT, T0, alarm_event

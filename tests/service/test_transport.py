@@ -13,7 +13,7 @@ import zenoh.ext
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmLogPage, AlarmStates
 from rotorwatch.records.health import Health
-from service.history.errors import StoreError
+from service.history.records import StoreError
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.transport import Link, LinkError, MachineCallbacks, MachineLink, TopicMessage, follow, route
 from tests.service.live import (

@@ -13,10 +13,8 @@ from standardwebhooks.webhooks import WebhookVerificationError
 from service.delivery.webhooks.dispatcher import Cursors, Dispatcher
 from service.delivery.webhooks.receiver import CONTENT_TYPE, Receiver
 from service.delivery.webhooks.signature import new_secret
-from service.history.errors import StoreError
 from service.history.machine import MachineStore
-from service.history.records import Step, StoredEvent
-from service.history.retention import Retention
+from service.history.records import Retention, Step, StoredEvent, StoreError
 from service.history.store import Store
 from service.settings.webhooks import WebhookSettings
 from tests.service.guarded import Clock

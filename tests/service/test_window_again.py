@@ -16,7 +16,7 @@ from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
-from service.history.retention import Retention
+from service.history.records import Retention
 from service.history.store import Store
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of

@@ -18,7 +18,7 @@ from rotorwatch import __version__
 from rotorwatch.records.monitor import Readiness, WebhookList
 from service.delivery.metrics.machine import Observed, machine_families
 from service.delivery.metrics.requests import RequestCounts
-from service.history.errors import StoreError
+from service.history.records import StoreError
 from service.recordings.recorder import RecorderStatus
 from service.stream.worker import MachineWorker
 

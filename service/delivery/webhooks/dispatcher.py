@@ -25,8 +25,7 @@ from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.monitor import WebhookStatus
 from service.delivery.event_feed import AlarmLog
 from service.delivery.webhooks.answer import Answer, Meaning, pause_s
-from service.history.errors import StoreError
-from service.history.records import StoredEvent
+from service.history.records import StoredEvent, StoreError
 from service.settings.webhooks import WebhookSettings
 from service.terminal.logs import Limiter, logger
 
@@ -53,7 +52,7 @@ class Post(Protocol):
 
 
 class Cursors(Protocol):
-    """Where it is remembered how far each webhook has been served; `service.history.webhooks.WebhookCursors` is one."""
+    """Where it is remembered how far each webhook has been served; `service.history.shared.WebhookCursors` is one."""
 
     def get(self, name: str, machine_key: str) -> int:
         """Return what was set; -1 if nothing was."""

@@ -1,4 +1,4 @@
-"""Where Alembic starts; the connection comes from `service.history.schema`, inside a transaction."""
+"""Where Alembic starts; the connection comes from `service.history.migrations`, inside a transaction."""
 
 from alembic import context
 

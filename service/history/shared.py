@@ -1,0 +1,181 @@
+"""What no single machine has the right to: tokens, audit log, cursors of webhooks, and all logs of alarms to read."""
+
+from typing import Any
+
+from sqlalchemy import insert, select, update
+
+from service.history.database import Database
+from service.history.records import AuditEntry, StoredEvent, StoreError, TokenRecord
+from service.history.tables import alarm_events, audit_log, machines, tokens, webhook_cursors
+
+__all__ = ["EVENT", "AlarmLog", "AuditLog", "TokenStore", "WebhookCursors", "committed_events"]
+
+EVENT = [alarm_events.c[name] for name in StoredEvent.__dataclass_fields__]
+_MOST = 10_000
+_TIMEOUT_S = 5.0
+
+
+class AlarmLog:
+    """What monitors committed to their logs of alarms; for any thread."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def since(self, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
+        """The latest events of a machine, at most 10 000, in the order of their sequence.
+
+        Parameters
+        ----------
+        site, name : str
+            The machine; of one that has no history there are none.
+        recorded_ns : int
+            Only those recorded then or later.
+
+        Raises
+        ------
+        StoreError
+            If the database fails.
+        """
+        log = alarm_events.c
+        query = select(*EVENT).join(machines, machines.c.machine_id == log.machine_id)
+        query = query.where(machines.c.site == site, machines.c.name == name, log.recorded_ns >= recorded_ns)
+        newest_first = self._database.rows(query.order_by(log.sequence.desc()).limit(_MOST))
+        return tuple(StoredEvent(*row) for row in reversed(newest_first))
+
+
+def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[StoredEvent, ...]:
+    """`AlarmLog.since` of a history that another program writes, which is opened for the moment and left as it is.
+
+    Raises
+    ------
+    StoreError
+        If there is no such history, or it cannot be read.
+    """
+    database = Database(url, _TIMEOUT_S)
+    database.start(read_only=True)
+    try:
+        return AlarmLog(database).since(site, name, recorded_ns)
+    finally:
+        database.stop()
+
+
+_ENTRY = [audit_log.c[name] for name in AuditEntry.__dataclass_fields__]
+
+
+class AuditLog:
+    """The log of requests that change something, or were refused; for any thread.
+
+    Both methods raise `StoreError` if the database fails.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def append(self, entry: AuditEntry) -> int:
+        """Write an entry and return its number; the number in the entry is not looked at."""
+        values = {name: _storable(getattr(entry, name)) for name in AuditEntry.__dataclass_fields__ if name != "number"}
+        with self._database.writing() as connection:
+            made = connection.execute(insert(audit_log).values(values).returning(audit_log.c.number))
+            number: int = made.scalar_one()
+        return number
+
+    def entries(
+        self, before: int | None = None, limit: int = 100, *, machine: str | None = None, actor: str | None = None
+    ) -> tuple[AuditEntry, ...]:
+        """Entries, newest first.
+
+        Parameters
+        ----------
+        before : int, optional
+            Only entries with a smaller number: the last number of the page before.
+        limit : int
+            At most this many, 1 or more.
+        machine, actor : str, optional
+            Only entries about this ``site/name``, by this actor.
+        """
+        if limit < 1:
+            raise StoreError(f"audit log: {limit} entries were asked for, expected 1 or more")
+        query = select(*_ENTRY).order_by(audit_log.c.number.desc()).limit(limit)
+        if before is not None:
+            query = query.where(audit_log.c.number < before)
+        if machine is not None:
+            query = query.where(audit_log.c.machine == machine)
+        if actor is not None:
+            query = query.where(audit_log.c.actor == actor)
+        return tuple(AuditEntry(*row) for row in self._database.rows(query))
+
+
+def _storable(value: str | int) -> str | int:
+    """A value without what a stranger can put into a request and no database takes."""
+    return value if isinstance(value, int) else value.replace("\0", "\\0").encode("utf-8", "backslashreplace").decode()
+
+
+_TOKEN = [tokens.c[name] for name in TokenRecord.__dataclass_fields__]
+
+
+class TokenStore:
+    """Every token there is or was; for any thread. All methods raise `StoreError` if the database fails."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, record: TokenRecord) -> None:
+        """Keep a new token.
+
+        Raises
+        ------
+        StoreError
+            If a scope holds a blank, or there is a token with this identifier.
+        """
+        if any(not scope or scope.split() != [scope] for scope in record.scopes):
+            raise StoreError(f"token {record.token_id}: scopes are {record.scopes}, expected words without blanks")
+        values = {name: getattr(record, name) for name in TokenRecord.__dataclass_fields__}
+        values["scopes"] = " ".join(record.scopes)
+        with self._database.writing() as connection:
+            there = select(tokens.c.token_id).where(tokens.c.token_id == record.token_id)
+            if connection.scalar(there) is not None:
+                raise StoreError(f"token {record.token_id}: there is one with this identifier already")
+            connection.execute(insert(tokens).values(values))
+
+    def find(self, token_id: str) -> TokenRecord | None:
+        """One token, revoked and expired ones included."""
+        rows = self._database.rows(select(*_TOKEN).where(tokens.c.token_id == token_id))
+        return _record(*rows[0]) if rows else None
+
+    def all(self) -> tuple[TokenRecord, ...]:
+        """Every token, oldest first."""
+        query = select(*_TOKEN).order_by(tokens.c.created_ns, tokens.c.token_id)
+        return tuple(_record(*row) for row in self._database.rows(query))
+
+    def revoke(self, token_id: str, at_ns: int) -> bool:
+        """Revoke a token; False if there is none, or it is revoked already."""
+        chosen = (tokens.c.token_id == token_id, tokens.c.revoked_ns.is_(None))
+        with self._database.writing() as connection:
+            return connection.execute(update(tokens).where(*chosen).values(revoked_ns=at_ns)).rowcount > 0
+
+
+def _record(token_id: str, name: str, scopes: str, *rest: Any) -> TokenRecord:
+    return TokenRecord(token_id, name, tuple(scopes.split()), *rest)
+
+
+class WebhookCursors:
+    """The alarm event that each webhook is to have next of each machine; for any thread.
+
+    Both methods raise `StoreError` if the database fails.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def get(self, name: str, machine_key: str) -> int:
+        """Sequence of the event that is to be delivered next; -1 if none was ever set."""
+        column = webhook_cursors.c
+        query = select(column.sequence).where(column.name == name, column.machine_key == machine_key)
+        return next((sequence for (sequence,) in self._database.rows(query)), -1)
+
+    def set(self, name: str, machine_key: str, sequence: int) -> None:
+        """Note the sequence of the event that is to be delivered next."""
+        made = self._database.insert(webhook_cursors).values(name=name, machine_key=machine_key, sequence=sequence)
+        made = made.on_conflict_do_update(index_elements=["name", "machine_key"], set_={"sequence": sequence})
+        with self._database.writing() as connection:
+            connection.execute(made)
