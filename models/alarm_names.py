@@ -8,23 +8,6 @@ from typing import Literal
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.sensor_faults import FaultKind
 
-__all__ = [
-    "ALARMS",
-    "CLOCK",
-    "CONFLICT",
-    "DATA",
-    "FAULT",
-    "GAP",
-    "MODEL",
-    "OVERLOADED",
-    "PHASE_REFERENCE",
-    "SHAPE",
-    "STREAM_LOST",
-    "AlarmKind",
-    "alarm_kind",
-    "data_alarm",
-]
-
 MODEL = "model"
 """The alarm that says: outside the model."""
 

@@ -30,8 +30,6 @@ from itertools import combinations
 from models.ingest import EARLIER_COURSES, Course
 from models.signals.block import SampleBlock
 
-__all__ = ["Arrivals", "Arrived", "Senders"]
-
 _ALWAYS_NS = 2**63
 """Later than any time of a block."""
 
@@ -48,10 +46,8 @@ class Arrivals:
     """Puts the blocks of one machine in the order of their sequence, run by run.
 
     A run begins at sequence 0: where its first blocks are overtaken, they are waited for. Where a stream that has run
-    for longer is joined, the first block that arrives is the first.
-
-    `bound`: how many blocks may wait for a missing one; 0 hands on everything as it comes. Raises ValueError if the
-    bound is negative.
+    for longer is joined, the first block that arrives is the first. `bound`: how many blocks may wait for a missing
+    one; 0 hands on everything as it comes. Raises ValueError if the bound is negative.
 
     Examples
     --------

@@ -20,8 +20,6 @@ import zstandard
 
 from models.errors import CheckpointError
 
-__all__ = ["checked", "from_bytes", "prefixed", "texts", "to_bytes", "unprefixed"]
-
 _MAGIC = b"RWCP"
 _VERSION = 2
 _HEADER = struct.Struct("<4sH16s")

@@ -15,23 +15,6 @@ from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-__all__ = [
-    "BundleError",
-    "CheckpointError",
-    "EstimationError",
-    "MachineFileError",
-    "RecordingError",
-    "RotorwatchError",
-    "UnexplainedError",
-    "WireError",
-    "argument_text",
-    "checked",
-    "did_you_mean",
-    "expectation",
-    "mistakes",
-    "read_toml",
-]
-
 
 class RotorwatchError(Exception):
     """Everything this project raises on purpose."""

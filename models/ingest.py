@@ -28,8 +28,6 @@ from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 
-__all__ = ["EARLIER_COURSES", "Admission", "Course", "Gate", "Reason"]
-
 EARLIER_COURSES = 64
 """Courses that are remembered, so that repetitions of their blocks are known as such."""
 
@@ -141,9 +139,8 @@ class Gate:
     def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
         """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
 
-        Takes microseconds and changes nothing: any thread may ask.
-
-        `payload`, `attachment`, `encoding`: see `models.signals.wire`.
+        Takes microseconds and changes nothing: any thread may ask. `payload`, `attachment`, `encoding`: see
+        `models.signals.wire`.
         """
         if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
             return False

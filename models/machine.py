@@ -22,18 +22,6 @@ from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
 
-__all__ = [
-    "AlarmSettings",
-    "ConditionRange",
-    "IngestSettings",
-    "Machine",
-    "MachineFile",
-    "SuppressRule",
-    "WindowSettings",
-    "load_machine",
-    "load_machine_file",
-]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 _SHIPPED = Path(__file__).parent / "machines"
 

@@ -18,8 +18,6 @@ from rich.progress import (
 )
 from typer.core import TyperGroup
 
-__all__ = ["Commands", "VersionOption", "bars", "labelled_bars"]
-
 
 class Commands(TyperGroup):
     """The commands of a program; an argument that is refused is told like a field of a file."""

@@ -39,8 +39,6 @@ from models.physics.rotor import STATE_INDEX, M_matrix, Q_matrix, Q_shaft, Rotor
 from models.signals.block import FloatArray
 from simulator.timeline import Condition
 
-__all__ = ["NONLINEAR", "NonlinearPlant", "Plant", "PlantSamples", "crack_stiffness", "rotor_in", "theoretical_rms"]
-
 
 @dataclass(frozen=True, slots=True)
 class PlantSamples:
@@ -54,10 +52,9 @@ class PlantSamples:
 class Plant:
     """Rotor, coloured excitation and unbalance, advanced sample by sample with an exact discretisation.
 
-    The first sample is a draw from the stationary distribution, at shaft angle 0.
-
-    `machine`: the original machine, its rate, and the angle of the heavy spot from the phase reference. `condition`:
-    what holds from the first sample on. `rng`: used by nothing else, so that the realisation depends on the seed alone.
+    The first sample is a draw from the stationary distribution, at shaft angle 0. `machine`: the original machine, its
+    rate, and the angle of the heavy spot from the phase reference. `condition`: what holds from the first sample on.
+    `rng`: used by nothing else, so that the realisation depends on the seed alone.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -212,10 +209,9 @@ def crack_stiffness(rotor: RotorParameters, theta_rad: FloatArray) -> FloatArray
 class NonlinearPlant(Plant):
     """Rotor with a crack or a rub; same interface, same random numbers as the linear plant.
 
-    An anomaly that is there from the first sample on has run in for five seconds before it.
-
-    `condition`: what holds from the first sample on. Raises EstimationError, here, in `change` or in `advance`, if a
-    crack or a rub makes the rotor unstable.
+    An anomaly that is there from the first sample on has run in for five seconds before it. `condition`: what holds
+    from the first sample on. Raises EstimationError, here, in `change` or in `advance`, if a crack or a rub makes the
+    rotor unstable.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:

@@ -26,8 +26,6 @@ from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
 from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
-__all__ = ["DEFAULT_CONNECT", "PublishError", "PublishSettings", "publish"]
-
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 
 _LOCAL = LinkSettings(connect=(DEFAULT_CONNECT,))
@@ -67,12 +65,11 @@ def publish(
 ) -> RunSummary:
     """Publish descriptor, truth and blocks of one machine until the stream ends or `stop` is set.
 
-    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine.
-
-    `stream`: from `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for. `stop`:
-    when set, publishing ends before the next block and the session closes at once. `on_block`: called with the summary
-    so far after each block. Raises MachineFileError if an endpoint is malformed, or a password, certificate or key
-    cannot be used. Raises PublishError if the session cannot be opened, or nobody subscribed in time.
+    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine. `stream`:
+    from `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for. `stop`: when set,
+    publishing ends before the next block and the session closes at once. `on_block`: called with the summary so far
+    after each block. Raises MachineFileError if an endpoint is malformed, or a password, certificate or key cannot be
+    used. Raises PublishError if the session cannot be opened, or nobody subscribed in time.
     """
     stop = Event() if stop is None else stop
     with _session(settings) as session, _declared(session, machine, settings.pace) as outlets:

@@ -9,8 +9,6 @@ from models.machine import MachineFile
 from models.signals.recording import RecordedMessage, RecordingWriter
 from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
-__all__ = ["record"]
-
 
 def record(
     machine: MachineFile,
@@ -25,12 +23,10 @@ def record(
     """Record descriptor, truth and blocks under the keys a publisher would use.
 
     All times in the file are data time: a block is logged at the time of the sample after its last one, which is when a
-    real machine could first have sent it.
-
-    `stream`: from `simulator.stream.blocks`. `path`: name of the recording; it is ``.part`` until complete.
-    `overwrite`: replace an existing recording. `stop`: when set, the recording ends after the current block and is
-    complete. `on_block`: called with the summary so far after each block. Raises RecordingError if the file cannot be
-    written.
+    real machine could first have sent it. `stream`: from `simulator.stream.blocks`. `path`: name of the recording; it
+    is ``.part`` until complete. `overwrite`: replace an existing recording. `stop`: when set, the recording ends after
+    the current block and is complete. `on_block`: called with the summary so far after each block. Raises
+    RecordingError if the file cannot be written.
     """
     keys, schema_hash = machine.keys, machine.descriptor.schema_hash
     begin = time.monotonic()

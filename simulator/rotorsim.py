@@ -24,8 +24,6 @@ from simulator.scenario import Scenario, load_scenario, parse_fault, shipped_sce
 if TYPE_CHECKING:  # the stream imports scipy, which --help must not wait for
     from simulator.stream import BlockStream, RunSummary
 
-__all__ = ["app"]
-
 _FIRST_LINE_S = 2.0
 _LINE_S = 10.0
 

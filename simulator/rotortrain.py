@@ -11,8 +11,6 @@ import typer
 from models.errors import RotorwatchError
 from simulator.commands import Commands, VersionOption
 
-__all__ = ["app"]
-
 app = typer.Typer(
     name="rotortrain",
     cls=Commands,

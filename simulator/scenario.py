@@ -17,23 +17,6 @@ from models.physics.excitation import Source
 from models.physics.rotor import PARAMETERS
 from models.signals.channels import Channel, Quantity
 
-__all__ = [
-    "ANOMALIES",
-    "LONGEST_DELAY_S",
-    "SENSOR_FAULTS_WITH_VALUE",
-    "ChannelSettings",
-    "Event",
-    "NamedSource",
-    "Rub",
-    "Scenario",
-    "SensorFault",
-    "SensorSettings",
-    "Sensors",
-    "load_scenario",
-    "parse_fault",
-    "shipped_scenarios",
-]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 _SHIPPED = Path(__file__).parent / "scenarios"
 _FAULT = re.compile(r"(?P<parameter>\w+)=(?P<change>[-+.\deE]+)@(?P<at_s>[.\deE]+)")

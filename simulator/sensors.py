@@ -16,8 +16,6 @@ from simulator.plant import PlantSamples
 from simulator.scenario import Sensors, SensorSettings
 from simulator.timeline import SWAPPED_WITH, SensorFaults
 
-__all__ = ["Sensor", "SensorBank"]
-
 _TURN = 2 * np.pi
 _NO_FAULT: SensorFaults = {}
 
@@ -26,7 +24,6 @@ class Sensor:
     """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
 
     A delay shifts the true value by whole samples, the nearest number; before the first sample it was what it is then.
-
     `rms_SI`: what ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
     `rng`: of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
     change without changing the noise. `longest_delay_s`: longest delay it will have.

@@ -22,18 +22,6 @@ from simulator.scenario import NamedSource, Scenario
 from simulator.sensors import SensorBank
 from simulator.timeline import Condition, compile_timeline
 
-__all__ = [
-    "DEFAULT_START_NS",
-    "JSON_ENCODING",
-    "BlockEncoding",
-    "BlockStream",
-    "RunSummary",
-    "TruthRecord",
-    "block_message",
-    "blocks",
-    "descriptor_payload",
-]
-
 
 class TruthRecord(BaseModel):
     """The true condition from one time on; sent at the start, at every change, and every second during a ramp."""

@@ -17,8 +17,6 @@ from models.machine import Machine
 from models.physics.rotor import PARAMETERS
 from simulator.scenario import ANOMALIES, SENSOR_FAULTS_WITH_VALUE, Event, NamedSource, Rub, Scenario, SensorFault
 
-__all__ = ["RAMP_STEP_S", "SWAPPED_WITH", "Condition", "SensorFaults", "Timeline", "compile_timeline"]
-
 RAMP_STEP_S = 0.1
 """Length of the steps a ramp is made of."""
 

@@ -16,20 +16,6 @@ from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.windows import SensorFault
 
-__all__ = [
-    "SAME_SPEED",
-    "Check",
-    "check_agreement",
-    "check_data",
-    "check_determined",
-    "check_halves",
-    "check_lines",
-    "check_recordings",
-    "check_sensors_of",
-    "check_sources",
-    "check_steady",
-]
-
 _FEWEST_HOPS = 8
 _FEW_WINDOWS = 6
 _MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
@@ -175,9 +161,8 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
     """Whether the recordings tell of one machine, each read against what the others teach; None for a single one.
 
     Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
-    limits what can be said between the speeds.
-
-    `differences`: sentences on recordings that differ from the others. `speeds_rad_s`: mean speed of each recording.
+    limits what can be said between the speeds. `differences`: sentences on recordings that differ from the others.
+    `speeds_rad_s`: mean speed of each recording.
     """
     name = "recordings agree"
     if len(speeds_rad_s) < 2:

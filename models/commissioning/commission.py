@@ -31,16 +31,6 @@ from models.errors import EstimationError
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 
-__all__ = [
-    "Commissioning",
-    "CommissioningReport",
-    "EquationRow",
-    "HealthyReading",
-    "ParameterSummary",
-    "commission",
-    "parameter_summaries",
-]
-
 _JSON = ConfigDict(extra="forbid", frozen=True)
 _POWER = 0.95
 

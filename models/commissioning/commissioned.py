@@ -33,24 +33,6 @@ from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = [
-    "FILE",
-    "LEVEL_MARGIN",
-    "SPEED_MARGIN",
-    "Commissioned",
-    "ConditionBaseline",
-    "IdentifiedRecord",
-    "Installed",
-    "Knowledge",
-    "KnowledgeLevel",
-    "OperatingRange",
-    "RecordingEntry",
-    "described",
-    "install",
-    "knowledge_of",
-    "load_commissioned",
-]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")

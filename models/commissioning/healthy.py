@@ -21,8 +21,6 @@ from models.signals.block import SampleBlock
 from models.signals.recording import read_recording, summarize_recording
 from models.signals.wire import decode_block
 
-__all__ = ["HealthyRecording", "Line", "foreign_lines", "healthy_from_blocks", "read_healthy"]
-
 
 @dataclass(frozen=True, slots=True)
 class HealthyRecording:

@@ -20,8 +20,6 @@ from models.machine import ConditionRange, Machine, MachineFile, Operation
 from models.physics.rotor import PARAMETERS, M_matrix, Q_matrix, RotorParameters, changed
 from models.signals.block import FloatArray
 
-__all__ = ["Identified", "identify"]
-
 _ROUNDS = 8
 _SETTLED = 0.02
 """Largest relative move of a parameter in the last round."""

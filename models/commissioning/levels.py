@@ -41,8 +41,6 @@ from models.errors import EstimationError
 from models.machine import Machine, MachineFile
 from models.signals.channels import ACCELERATIONS
 
-__all__ = ["LEVELS", "Learned", "Piece", "Progress", "Read", "learned_baseline", "pieces_of"]
-
 Read = tuple[str, int, Diagnosis]
 """Recording, end of the window, and what was read in it."""
 

@@ -29,22 +29,6 @@ from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS
 
-__all__ = [
-    "STEADY",
-    "ComplexArray",
-    "HopCoefficients",
-    "HopMoments",
-    "Plan",
-    "Rotation",
-    "SpeedSource",
-    "hop_coefficients",
-    "hop_moments",
-    "plan_for",
-    "regression",
-    "relative_vectors",
-    "rotation_of",
-]
-
 ComplexArray = npt.NDArray[np.complex128]
 
 

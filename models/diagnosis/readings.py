@@ -13,18 +13,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation, Parameter
 from rotorwatch.records.windows import UnbalanceVector as VectorRecord
 
-__all__ = [
-    "Z95",
-    "Diagnosis",
-    "Diagnostician",
-    "UnbalanceVector",
-    "beyond",
-    "interval_95",
-    "no_reading",
-    "parameter_reading",
-    "possible_reading",
-]
-
 _DIGITS, _MOST_DIGITS = 3, 15
 
 

@@ -21,8 +21,6 @@ from models.checkpoint import checked
 from models.diagnosis.moments import HopMoments, Plan, hop_moments
 from models.signals.block import FloatArray
 
-__all__ = ["Piece", "Recall", "digest_of", "pieces_of"]
-
 _DIGEST = 16
 
 

@@ -14,8 +14,6 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.signals.block import FloatArray
 
-__all__ = ["RotationLine", "followed_speeds", "rotation_line"]
-
 _ComplexArray = npt.NDArray[np.complex128]
 
 _MARGIN_HZ = 1.0

@@ -31,8 +31,6 @@ from models.errors import EstimationError
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Shape
 
-__all__ = ["FEWEST_WINDOWS", "HealthyShape", "ShapeSpread", "learn_shape"]
-
 FEWEST_WINDOWS = 4
 """Healthy windows without which nothing is learned; six or more are advised, from several recordings."""
 

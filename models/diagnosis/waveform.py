@@ -17,19 +17,6 @@ import numpy.typing as npt
 from models.checkpoint import checked
 from models.signals.block import FloatArray
 
-__all__ = [
-    "N_BANDS",
-    "CountArray",
-    "MotionPair",
-    "Waveform",
-    "combined_waveform",
-    "motion_pairs",
-    "pair_bands",
-    "pair_powers",
-    "stacked_waveform",
-    "waveform_of",
-]
-
 CountArray = npt.NDArray[np.int64]
 
 

@@ -30,8 +30,6 @@ from models.diagnosis.waveform import Waveform, combined_waveform, stacked_wavef
 from models.errors import CheckpointError
 from models.signals.block import FloatArray
 
-__all__ = ["SlidingWindow", "WindowStatistics", "window_statistics"]
-
 
 @dataclass(frozen=True, slots=True)
 class WindowStatistics:

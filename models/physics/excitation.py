@@ -14,20 +14,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from models.physics.rotor import M_matrix, RotorParameters, system_A
 from models.signals.block import FloatArray
 
-__all__ = [
-    "FILTER_DAMPING",
-    "ColouringFilter",
-    "Source",
-    "colouring_filter",
-    "expanded_A",
-    "expanded_B",
-    "filter_R",
-    "low_pass",
-    "low_pass_slopes",
-    "source_spectrum",
-    "unit_spectrum",
-]
-
 FILTER_DAMPING = math.sqrt(0.5)
 """Damping ratio of the colouring filter: Butterworth, flat up to the cutoff."""
 

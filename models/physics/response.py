@@ -15,26 +15,13 @@ from models.physics.excitation import Source, expanded_A, expanded_B
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, RotorParameters
 from models.signals.block import FloatArray
 
-__all__ = [
-    "DiscreteSystem",
-    "advance",
-    "correlation",
-    "discretise",
-    "stationary_covariance",
-    "stochastic_covariance",
-    "synchronous_correlation",
-    "synchronous_response",
-]
-
 
 def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve A R(0) + R(0) Aᵀ = -B Bᵀ for the covariance of a stable system under unit white noise.
 
     The states are balanced first: they differ by many orders of magnitude, and the solver's error is relative to the
-    largest.
-
-    `A` (n, n): system matrix, all eigenvalues in the left half plane. `B` (n, p): input matrix of independent white
-    noise of unit intensity. Raises EstimationError if A is not stable: there is no stationary covariance.
+    largest. `A` (n, n): system matrix, all eigenvalues in the left half plane. `B` (n, p): input matrix of independent
+    white noise of unit intensity. Raises EstimationError if A is not stable: there is no stationary covariance.
     """
     fastest = float(np.linalg.eigvals(A).real.max())
     if fastest >= 0:
@@ -98,10 +85,8 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
 
     Displacement, velocity and filter states differ by many orders of magnitude. They are scaled to unit standard
     deviation before the covariance is factored; without that the displacement-velocity pair comes out inconsistent and
-    damping is off by tens of percent.
-
-    `A` (n, n): stable system matrix. `B` (n, p): input matrix of unit-intensity white noise. `step_s`: sampling
-    interval, s. In the original, unscaled states.
+    damping is off by tens of percent. `A` (n, n): stable system matrix. `B` (n, p): input matrix of unit-intensity
+    white noise. `step_s`: sampling interval, s. In the original, unscaled states.
     """
     n = A.shape[0]
     deviation = np.sqrt(np.diag(stationary_covariance(A, B)))
@@ -125,10 +110,8 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
 
     Equals the recursion ``x = F @ x + G @ w`` row by row. The samples are cut into pieces that advance side by side
     from rest; the pieces' starting states follow and are carried through each piece, which costs √n array operations
-    instead of n.
-
-    `system`: F and G. `state` (n,): state before the first step. `noise` (n_samples, n): standard normal numbers, one
-    row per step. Returns (n_samples, n): states after each step; the last row is where to go on from.
+    instead of n. `system`: F and G. `state` (n,): state before the first step. `noise` (n_samples, n): standard normal
+    numbers, one row per step. Returns (n_samples, n): states after each step; the last row is where to go on from.
     """
     n_samples, n = noise.shape
     length = max(1, int(np.sqrt(n_samples)))

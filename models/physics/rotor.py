@@ -10,26 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from models.signals.block import FloatArray
 
-__all__ = [
-    "COORDINATES",
-    "FAULT_FIELDS",
-    "PARAMETERS",
-    "PARAMETER_TEXT",
-    "QUANTITY",
-    "STATES",
-    "STATE_INDEX",
-    "H_matrix",
-    "KnownRotor",
-    "M_matrix",
-    "P_matrix",
-    "Q_matrix",
-    "Q_shaft",
-    "RotorParameters",
-    "changed",
-    "impossible",
-    "system_A",
-]
-
 
 class KnownRotor(BaseModel):
     """What is known of a rotor's parameters; see `RotorParameters` for the meaning of each."""

@@ -15,8 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy import fft
 
-__all__ = ["FloatArray", "NewestBlocks", "SampleBlock", "integrated", "lowest_valid_hz", "settling_s"]
-
 FloatArray = npt.NDArray[np.float64]
 
 
@@ -86,11 +84,9 @@ def settling_s(high_pass_hz: float) -> float:
 def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_hz: float) -> FloatArray:
     """Integrate samples once or twice.
 
-    The first and last `settling_s` of the result are not valid.
-
-    `acceleration` (n,): Equally spaced, without a gap. `rate_hz`: samples per second. `times`: 1 for velocity, 2 for
-    displacement. `high_pass_hz`: corner of the high-pass; valid from `lowest_valid_hz`. Returns (n,): in the unit of
-    `acceleration` times s or s².
+    The first and last `settling_s` of the result are not valid. `acceleration` (n,): Equally spaced, without a gap.
+    `rate_hz`: samples per second. `times`: 1 for velocity, 2 for displacement. `high_pass_hz`: corner of the high-pass;
+    valid from `lowest_valid_hz`. Returns (n,): in the unit of `acceleration` times s or s².
 
     Examples
     --------

@@ -11,19 +11,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from models.errors import did_you_mean
 
-__all__ = [
-    "ACCELERATIONS",
-    "UNIT_TO_SI",
-    "Channel",
-    "ChannelDescriptor",
-    "Quantity",
-    "same_unit",
-    "state_name",
-    "time_unit_ns",
-    "unit_factor",
-    "with_channel_names",
-]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
 

@@ -12,8 +12,6 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.signals.block import FloatArray
 
-__all__ = ["EdgeDetector", "PulseTrain", "pulse_train", "shaft_angle"]
-
 _NEIGHBOURS = 9
 _MOST_MISSING = 3
 _TOO_SHORT = 0.5
@@ -86,10 +84,9 @@ def pulse_train(times: FloatArray, pulses_per_turn: int = 1) -> PulseTrain:
     """Judge each interval between pulses by the median of the nine around it.
 
     An interval below half of it has a pulse too many. One within a quarter of 2, 3 or 4 times the median has that many
-    pulses missing. What is longer, or in between, is an interruption.
-
-    `times` (n,): times of the pulses, ascending, at least two. Raises ValueError if there are fewer than two pulses or
-    their times do not ascend; the message names the first that does not.
+    pulses missing. What is longer, or in between, is an interruption. `times` (n,): times of the pulses, ascending, at
+    least two. Raises ValueError if there are fewer than two pulses or their times do not ascend; the message names the
+    first that does not.
     """
     if times.size < 2:
         raise ValueError(f"{times.size} pulses, expected at least two to tell the speed")
@@ -117,10 +114,8 @@ def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> 
     """Shaft angle in [0, 2π), 0 at the (first) pulse of each turn.
 
     Before the first pulse, after the last and around an interruption the angle is carried on at the neighbouring
-    interval's speed for one interval at most.
-
-    `at` (n,): in the unit of the train's times. `reverse`: whether the shaft turns from z to y, so that the angle
-    falls. Returns (n,): rad; nan where the angle is unknown.
+    interval's speed for one interval at most. `at` (n,): in the unit of the train's times. `reverse`: whether the shaft
+    turns from z to y, so that the angle falls. Returns (n,): rad; nan where the angle is unknown.
     """
     times, counts = train.times, train.counts
     speed = np.where(train.known, np.diff(counts) / np.diff(times), np.nan)  # pulses per unit of time

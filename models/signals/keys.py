@@ -22,8 +22,6 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validat
 
 from models.errors import MachineFileError
 
-__all__ = ["PREFIX", "Grant", "MachineKeys", "access_control"]
-
 PREFIX = "rotorwatch"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 

@@ -17,21 +17,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from models.errors import MachineFileError, checked, did_you_mean, read_toml
 from models.signals.keys import Grant, access_control
 
-__all__ = [
-    "NAMESPACE_PATTERN",
-    "LinkSettings",
-    "TlsSettings",
-    "check_certificate",
-    "check_key",
-    "endpoint_fault",
-    "is_address",
-    "is_local",
-    "is_loopback",
-    "load_link",
-    "read_password",
-    "read_user_names",
-]
-
 _OF_HOSTS = ("tcp", "udp", "tls", "quic", "ws")
 _WITHIN = ("unixsock-stream", "unixpipe")
 _OTHERS = (*_WITHIN, "serial", "vsock")
@@ -300,9 +285,8 @@ class LinkSettings(BaseModel):
     def zenoh_items(self) -> dict[str, str]:
         """Configuration paths and their JSON5 values, to be inserted one by one into a Zenoh configuration.
 
-        The password is among them: they go to Zenoh and nowhere else, not into a message and not into a log.
-
-        Raises MachineFileError if a password, certificate or key cannot be used, or the settings contradict each other.
+        The password is among them: they go to Zenoh and nowhere else, not into a message and not into a log. Raises
+        MachineFileError if a password, certificate or key cannot be used, or the settings contradict each other.
         """
         for fault in self._faults():  # again: endpoints of a command line are put over settings that were checked
             raise MachineFileError(f"link: {fault}")

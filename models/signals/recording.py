@@ -35,18 +35,6 @@ from mcap.writer import CompressionType, Writer
 
 from models.errors import RecordingError
 
-__all__ = [
-    "DAMAGE",
-    "RecordedMessage",
-    "RecordingSummary",
-    "RecordingWriter",
-    "read_recording",
-    "reading",
-    "summarize_recording",
-    "unpacked",
-    "writing",
-]
-
 _CHUNK_BYTES = 256 * 1024
 _LENGTH = struct.Struct("<I")
 _RECORD_HEAD = 1 + 8
@@ -84,11 +72,9 @@ class RecordingSummary:
 class RecordingWriter:
     """Writes a recording; a context manager.
 
-    Leaving the context without an exception gives the file its name. With an exception the file is completed but
-    stays ``NAME.part``.
-
-    `path`: final name. `overwrite`: replace a recording that is already there, or a ``.part`` that a crash left. Raises
-    RecordingError if one of them exists, or cannot be written; the message names it.
+    Leaving the context without an exception gives the file its name. With an exception the file is completed but stays
+    ``NAME.part``. `path`: final name. `overwrite`: replace a recording that is already there, or a ``.part`` that a
+    crash left. Raises RecordingError if one of them exists, or cannot be written; the message names it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:

@@ -13,8 +13,6 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from models.errors import RecordingError
 from models.signals.recording import DAMAGE, RecordedMessage, RecordingWriter, reading, unpacked, writing
 
-__all__ = ["Salvage", "inspect_recording", "salvage_recording", "salvaged_messages"]
-
 
 @dataclass(slots=True)
 class Salvage:
@@ -45,11 +43,10 @@ class Salvage:
 def salvage_recording(damaged: Path, target: Path) -> Salvage:
     """Copy what can be read of an interrupted or damaged recording into a complete one.
 
-    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost.
-
-    `damaged`: usually the ``.part`` file of a program that was killed; it stays as it is. `target`: must not exist; may
-    be the name that `damaged` was to get. Returns what was recovered and what was not. Raises RecordingError if
-    `damaged` is missing or nothing of it can be read, or `target` exists or cannot be written.
+    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost. `damaged`:
+    usually the ``.part`` file of a program that was killed; it stays as it is. `target`: must not exist; may be the
+    name that `damaged` was to get. Returns what was recovered and what was not. Raises RecordingError if `damaged` is
+    missing or nothing of it can be read, or `target` exists or cannot be written.
     """
     salvage = _nothing_yet(damaged)
     messages = _salvaged(damaged, salvage)

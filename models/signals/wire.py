@@ -19,20 +19,6 @@ from flatbuffers.table import Table
 from models.errors import WireError
 from models.signals.block import SampleBlock
 
-__all__ = [
-    "ARROW_ENCODING",
-    "BLOCK_ENCODING",
-    "HEADER_BYTES",
-    "REPLAY_MARK",
-    "decode_block",
-    "encode_arrow",
-    "encode_block",
-    "may_be_block",
-    "read_arrow",
-    "sender_of",
-    "write_arrow",
-]
-
 _CONTINUES = b"\xff\xff\xff\xff"
 _SCHEMA, _RECORD_BATCH = 1, 3
 _FLOATING_POINT, _FIXED_SIZE_LIST = 3, 16

@@ -29,8 +29,6 @@ from simulator.commission.verdict import (
     smallest_change,
 )
 
-__all__ = ["commission_machine", "print_report"]
-
 _COLOURS = {"commissioned": "bold green", "passed": "green", "limited": "bold yellow", "refused": "bold red"}
 _WIDE = 100
 

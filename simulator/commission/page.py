@@ -33,8 +33,6 @@ from simulator.commission.verdict import (
     smallest_change,
 )
 
-__all__ = ["HTML", "JSON", "Picture", "pictures_of", "write_report"]
-
 _COMPARED = {
     KnowledgeLevel.FULL: "Each healthy window against the parameters in the machine file.",
     KnowledgeLevel.PARTIAL: "Each healthy window against the rotor that was identified from all of them. They scatter "

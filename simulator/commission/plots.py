@@ -17,8 +17,6 @@ from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.stretch import to_scale
 from simulator.commission.verdict import percent
 
-__all__ = ["BAND", "COLOURS", "GREY", "INK", "WIDTH_IN", "draw_budget", "draw_readings", "inline_svg"]
-
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """After Okabe and Ito: told apart with any colour vision."""
 INK, GREY, BAND = "#1c2530", "#66727f", "#edf2f6"

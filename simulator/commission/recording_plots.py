@@ -13,8 +13,6 @@ from models.signals.block import FloatArray
 from simulator.commission.plots import BAND, COLOURS, GREY, INK, WIDTH_IN
 from simulator.commission.verdict import channel_text, channel_unit
 
-__all__ = ["Portrait", "draw_levels", "draw_spectra", "ordered", "portrait"]
-
 _PANEL_IN = 1.6
 _STYLES = ("-", "--", ":")
 _BEYOND_BAND = 0.04

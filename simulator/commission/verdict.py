@@ -5,23 +5,6 @@ from collections.abc import Iterable
 
 from models.commissioning.commission import CommissioningReport, ParameterSummary
 
-__all__ = [
-    "VERDICT_TEXT",
-    "budget_sentences",
-    "change",
-    "channel_text",
-    "channel_unit",
-    "dominant",
-    "duration",
-    "headline",
-    "listed",
-    "next_steps",
-    "parameter_value",
-    "percent",
-    "significant",
-    "smallest_change",
-]
-
 _PLACES = {
     "y1": "bearing, horizontal",
     "y2": "disc, horizontal",

@@ -26,8 +26,6 @@ from simulator.commands import bars
 from simulator.training.draws import Draw, Layout, Purpose, draw_condition, windows, with_tilt
 from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 
-__all__ = ["train_bundle", "train_for"]
-
 _CONDITIONS_PER_BATCH = 480
 _CALIBRATION_SHARE = 3
 """Windows of either layout that calibrate the amortised networks, per training window of a relation network."""

@@ -25,19 +25,6 @@ from simulator.scenario import Event, NamedSource, Rub, Scenario, Sensors
 from simulator.stream import blocks
 from simulator.timeline import Condition
 
-__all__ = [
-    "Anomaly",
-    "Draw",
-    "Excitation",
-    "Layout",
-    "Purpose",
-    "draw_condition",
-    "simulate_scenario",
-    "simulate_window",
-    "windows",
-    "with_tilt",
-]
-
 _BLOCK_S = 5.0
 
 _REALISATION, _EXCITATION, _ANOMALY = 1, 2, 3

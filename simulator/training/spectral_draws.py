@@ -36,8 +36,6 @@ from models.physics.rotor import PARAMETERS, STATE_INDEX, H_matrix, M_matrix, P_
 from models.signals.block import FloatArray
 from simulator.training.draws import Purpose
 
-__all__ = ["LOG_RATIO", "Batch", "DrawnConditions", "FeatureDraws", "SpectralDraws", "batches"]
-
 _Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex128])
 
 LOG_RATIO = 0.55

@@ -30,8 +30,6 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["BaselineDiagnostician", "GainSuspicion", "gain_suspicion"]
-
 _SINGLE = 2.326  # standard errors beyond which no single parameter explains a window (one per cent, one-sided)
 _COMMON = 2.576  # within which the common factor does (one per cent, two-sided)
 _MOST_LOSS = -0.95

@@ -24,24 +24,6 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-__all__ = [
-    "LAG_FROM_S",
-    "LONGEST_LAG_FROM_S",
-    "LONGEST_LAG_STEP_S",
-    "SHORTEST_LAG_FROM_S",
-    "Kernels",
-    "LagMoments",
-    "RowWindow",
-    "Shape",
-    "gain",
-    "inverse",
-    "kernels",
-    "passband_hz",
-    "row_window",
-    "shape_for",
-    "shared_covariance",
-]
-
 LONGEST_LAG_STEP_S = 0.00126
 """Spacing of the lags beyond which a kernel has too few points."""
 
@@ -74,10 +56,8 @@ def shape_for(deepest: int, band_to_hz: float) -> Shape:
 
     One derivative is borne by a narrow kernel. Every further one lifts the sensors' noise by another power of the
     frequency: kernels are then so wide that they pass nothing beyond the band of the spectra, or the spectra would not
-    know what the moments scatter by.
-
-    `deepest`: most derivatives on a kernel (`Formation.deepest`), at most 4. `band_to_hz`: highest frequency of the
-    window's spectra.
+    know what the moments scatter by. `deepest`: most derivatives on a kernel (`Formation.deepest`), at most 4.
+    `band_to_hz`: highest frequency of the window's spectra.
     """
     if deepest <= 1:
         return Shape(4, 0.010, 0.005)

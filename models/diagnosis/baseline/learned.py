@@ -22,21 +22,6 @@ from models.errors import EstimationError
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray
 
-__all__ = [
-    "Baseline",
-    "HeldOutReading",
-    "LeftOut",
-    "allowance_of",
-    "coefficient_slices",
-    "disagreements",
-    "learn_baseline",
-    "learned_rows",
-    "left_out",
-    "positive",
-    "undetermined",
-    "unsuitable",
-]
-
 _FOLDS = 6
 _FEWEST_OTHERS = 2
 _BEYOND = 2.0  # standard deviations of a mean beyond which it is taken for more than scatter
@@ -78,10 +63,9 @@ class LeftOut:
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:
     """Read every healthy window against the relation learned without its condition.
 
-    Where there is one condition, windows are left out one by one, or in up to six runs of neighbours.
-
-    `parts`: one of each healthy window. `conditions`: what each belongs to. Without those for which too few others are
-    left or do not determine the relation.
+    Where there is one condition, windows are left out one by one, or in up to six runs of neighbours. `parts`: one of
+    each healthy window. `conditions`: what each belongs to. Without those for which too few others are left or do not
+    determine the relation.
     """
     groups = list(dict.fromkeys(conditions))
     if len(groups) > 1:
@@ -319,10 +303,9 @@ def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, .
     """Say of every learned row why the healthy windows do not determine it; empty where they do.
 
     One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
-    damping or inertia is not physical, and no interval around it is honest.
-
-    Returns a sentence with what to record instead for each row, in the order of the learned rows; empty if there is no
-    doubt, or if there is no relation (``baseline.reasons`` says why).
+    damping or inertia is not physical, and no interval around it is honest. Returns a sentence with what to record
+    instead for each row, in the order of the learned rows; empty if there is no doubt, or if there is no relation
+    (``baseline.reasons`` says why).
     """
     found = []
     for row, relation in zip(learned_rows(rows), baseline.relations, strict=True):
@@ -353,10 +336,8 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
     """Sentences on conditions in which a parameter reads otherwise than in all others.
 
     Readings of one condition share the error of the relation: their mean is compared with a standard error that does
-    not fall with their number.
-
-    Empty if one relation holds for all conditions. Otherwise keep a baseline for each, or widen (which later windows do
-    by `Relation.allowance` in any case).
+    not fall with their number. Empty if one relation holds for all conditions. Otherwise keep a baseline for each, or
+    widen (which later windows do by `Relation.allowance` in any case).
     """
     found = []
     for condition in dict.fromkeys(one.condition for one in baseline.consistency):

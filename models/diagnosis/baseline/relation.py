@@ -33,21 +33,6 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = [
-    "Contribution",
-    "Relation",
-    "RowChange",
-    "change_of",
-    "fit_row",
-    "lag_beyond_memory",
-    "lags_of",
-    "learn_row",
-    "one_source",
-    "read_row",
-    "relation_criterion",
-    "stretching",
-]
-
 _RISE = 4.0
 """What the criterion gains at two standard errors if the covariance is right."""
 _STEPS = 2.0 * 1.4 ** np.arange(10)
@@ -349,9 +334,7 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     """Read the change of a row's own parameters in one window.
 
     Moments are weighted by all that is uncertain, the relation included: where the healthy recording did not determine
-    the relation, a window is not asked.
-
-    Raises EstimationError if the window does not determine them.
+    the relation, a window is not asked. Raises EstimationError if the window does not determine them.
     """
     first = change_of(row, relation, window.beyond(LAG_FROM_S))
     return change_of(row, relation, window.beyond(lag_beyond_memory(window, first.combination)))

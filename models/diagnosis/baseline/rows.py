@@ -19,23 +19,6 @@ from dataclasses import dataclass
 
 from models.physics.rotor import PARAMETERS
 
-__all__ = [
-    "ORDERS",
-    "ROWS",
-    "Formation",
-    "Motion",
-    "Own",
-    "Row",
-    "Source",
-    "Term",
-    "evaluable_rows",
-    "formation_of",
-    "lowest",
-    "not_measured",
-    "parameters_of",
-    "state_of",
-]
-
 ORDERS = ("", "_dot", "_ddot")
 """Endings of the state variable's name by order of the derivative that is measured."""
 
@@ -116,9 +99,8 @@ def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Fo
     """Choose how to form the terms of a row.
 
     The row is differentiated as rarely as possible. Then every motion is taken from the highest measured derivative
-    that does not exceed it: what needs not be differentiated is not made noisier.
-
-    `terms`: motions of each term; every one's coordinate is measured (see `not_measured`). `states`: what is measured.
+    that does not exceed it: what needs not be differentiated is not made noisier. `terms`: motions of each term; every
+    one's coordinate is measured (see `not_measured`). `states`: what is measured.
     """
     motions = [motion for term in terms for motion in term]
     raised = max(max(0, _measured(motion.coordinate, states)[0] - motion.order) for motion in motions)

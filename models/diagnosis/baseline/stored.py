@@ -15,8 +15,6 @@ from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import SynchronousVectors
 from models.signals.block import FloatArray
 
-__all__ = ["BaselineRecord", "RelationRecord", "RotationRecord"]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -16,17 +16,6 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-__all__ = [
-    "SPEED_TOLERANCE",
-    "ForceRow",
-    "SynchronousState",
-    "SynchronousVectors",
-    "relative_force",
-    "rotation_of",
-    "rotations_by_speed",
-    "slopes",
-]
-
 SPEED_TOLERANCE = 0.03
 """Relative deviation of the speed within which synchronous vectors are compared."""
 

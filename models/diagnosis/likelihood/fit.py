@@ -35,8 +35,6 @@ from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
 
-__all__ = ["LengthFits", "LikelihoodFit"]
-
 _COLD_STEPS, _WARM_STEPS = 100, 15
 _NEAR, _GAIN = 0.15, 3.0
 """Converged: no diagnosed parameter would move by more than this many standard errors."""
@@ -57,10 +55,8 @@ class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
     The state kept between windows is the starting point, how alike the forces' colours were, and the slopes of the last
-    search, with which windows that differ little from it are followed.
-
-    `machine`: nominal rotor and unbalance phase. `follow`: whether windows that follow each other overlap, so that they
-    may be followed.
+    search, with which windows that differ little from it are followed. `machine`: nominal rotor and unbalance phase.
+    `follow`: whether windows that follow each other overlap, so that they may be followed.
     """
 
     def __init__(self, machine: Machine, *, follow: bool = False) -> None:

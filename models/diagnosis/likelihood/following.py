@@ -28,8 +28,6 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
-__all__ = ["Glance", "Linearised"]
-
 _MOST_STEPS = 6
 _FARTHEST = 0.15
 """Relative change of the expected spectra (rms) beyond which the weights are no longer their own."""

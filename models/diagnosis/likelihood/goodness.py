@@ -21,8 +21,6 @@ from models.machine import Machine
 from models.physics.rotor import PARAMETER_TEXT, Q_shaft, impossible
 from models.signals.block import FloatArray
 
-__all__ = ["MOST_MISFIT", "Alternative", "Goodness", "goodness_of_fit", "unexplained_at", "unseen"]
-
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 """Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z."""
 _UNEQUAL = "shaft stiffer in y than in z"

@@ -33,8 +33,6 @@ from models.physics.rotor import COORDINATES, STATE_INDEX, system_A
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS
 
-__all__ = ["AVERAGES_PER_BIN", "BinGroups", "Mismatch", "Motions", "group_bins", "integrated", "natural_frequencies"]
-
 AVERAGES_PER_BIN = 0.4737
 """Independent averages per half-overlapped Hann segment and bin: one over the sum of the squared correlations with all
 neighbouring segments and bins."""
@@ -253,10 +251,9 @@ class Motions:
         """Compare displacement and velocity of every degree of freedom that has both.
 
         With gains 1 and 1 + δ the rest d = (v - jr x)/√(1 + r²) of a pair holds jr δ z/(1 + r²) of its motion z; δ is
-        the least-squares regression of d on that, with standard error from what of d remains.
-
-        `states` (n_groups, n_states, n_states): cross-spectra of the states, SI. `w` (n_groups,). `averages`
-        (n_groups,): independent averages they are made of.
+        the least-squares regression of d on that, with standard error from what of d remains. `states` (n_groups,
+        n_states, n_states): cross-spectra of the states, SI. `w` (n_groups,). `averages` (n_groups,): independent
+        averages they are made of.
         """
         found = []
         r = self._r(w)

@@ -10,19 +10,6 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
-__all__ = [
-    "LOG_NOISE",
-    "Derivatives",
-    "FisherScoring",
-    "Maximum",
-    "Weights",
-    "Whitened",
-    "Workspace",
-    "information_of",
-    "inverse_factor",
-    "whitened_at",
-]
-
 LOG_NOISE = float(np.log(1e-3))
 """Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
 
@@ -134,13 +121,11 @@ class FisherScoring:
 
     The levels move as T of C = T Tᵀ. Where the data want less of a direction than there is, T's own curvature is added
     to the information; without it the small columns of an excitation of low rank overshoot, and every other parameter
-    waits for them.
-
-    `observed` (n_groups, n, n): estimated cross-spectra in units of the model's scale. `n_segments`: segments they are
-    averaged over. `usual_cutoff_hz`: where the cutoff is pulled, weakly, if the band does not show it. `strength`: how
-    strongly the forces' own colours are pulled towards none until the window itself has said so; the weakest pull
-    without it. `workspace`: shared by searches that follow each other; the slopes of a `Maximum` are valid until the
-    next one.
+    waits for them. `observed` (n_groups, n, n): estimated cross-spectra in units of the model's scale. `n_segments`:
+    segments they are averaged over. `usual_cutoff_hz`: where the cutoff is pulled, weakly, if the band does not show
+    it. `strength`: how strongly the forces' own colours are pulled towards none until the window itself has said so;
+    the weakest pull without it. `workspace`: shared by searches that follow each other; the slopes of a `Maximum` are
+    valid until the next one.
     """
 
     def __init__(

@@ -33,19 +33,6 @@ from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
 
-__all__ = [
-    "COLUMNS",
-    "ROWS",
-    "SHAPES",
-    "STRUCTURAL",
-    "ModelPoint",
-    "SpectralModel",
-    "factor_of",
-    "packed",
-    "starting_point",
-    "twice_packed",
-]
-
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
 
@@ -78,12 +65,11 @@ class SpectralModel:
     """Expected cross-spectra and their derivatives for one machine, set of measured states, and groups of bins.
 
     The parameter vector holds the logarithmic ratios of `STRUCTURAL` to nominal, the logarithms of the low-pass's
-    cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per
-    Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
-
-    `motions`: what is measured, in units that make all spectra of the order of one. `groups`: frequencies of the
-    spectra. `force_scale`: unit of forces, N/√Hz, so that the elements of C are of the order of one. `shapes`:
-    polynomials of the forces' colour; 0 leaves one low-pass for all.
+    cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per Hz),
+    their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T. `motions`: what
+    is measured, in units that make all spectra of the order of one. `groups`: frequencies of the spectra.
+    `force_scale`: unit of forces, N/√Hz, so that the elements of C are of the order of one. `shapes`: polynomials of
+    the forces' colour; 0 leaves one low-pass for all.
     """
 
     def __init__(
@@ -185,11 +171,10 @@ class SpectralModel:
     def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
         """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed; the last 21 are by the elements of C, not of T.
 
-        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of
-        G C Hᴴ plus its conjugate transpose.
-
-        `L_inverse` (n_groups, n, n): inverse Cholesky factors of the spectra. `out` (size, n_groups, n²): where to put
-        them: megabytes, better not allocated at every step. Returns (size, n_groups, n²).
+        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of G C
+        Hᴴ plus its conjugate transpose. `L_inverse` (n_groups, n, n): inverse Cholesky factors of the spectra. `out`
+        (size, n_groups, n²): where to put them: megabytes, better not allocated at every step. Returns (size, n_groups,
+        n²).
         """
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G
@@ -295,10 +280,8 @@ def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatAr
     """Guess the excitation with the nominal rotor.
 
     Forces follow from the response through the regularised inverse of G, bin group by bin group; their mean, divided by
-    the low-pass that fits its trace best, is the level matrix.
-
-    `observed` (n_groups, n, n): estimated cross-spectra in units of the model's scale. `centre` (size,): usual values
-    of everything else.
+    the low-pass that fits its trace best, is the level matrix. `observed` (n_groups, n, n): estimated cross-spectra in
+    units of the model's scale. `centre` (size,): usual values of everything else.
     """
     groups = model.groups
     w = 2 * np.pi * groups.centre_hz

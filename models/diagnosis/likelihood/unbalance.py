@@ -20,8 +20,6 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
-__all__ = ["Unbalance", "estimate_unbalance", "estimate_unbalance_by_hop"]
-
 _TURNED, _LEAST_TURN = 6.0, 0.05
 """Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
 and probes are not mounted better than to a few degrees."""
@@ -85,7 +83,6 @@ def estimate_unbalance(
 
     The vector's covariance is the stochastic part's spectrum over the window length, averaged around Ω as a window of
     that length sees it, plus what the uncertainty of the structural parameters makes of the predicted response.
-
     `point`: the model's spectra at the estimate. `covariance` (5, 5): of the logarithmic ratios of the structural
     parameters. `synchronous` (n_states,): q, SI. Raises EstimationError if the vector says nothing about e.
     """
@@ -172,10 +169,9 @@ def estimate_unbalance_by_hop(
 ) -> Unbalance:
     """Estimate e where the speed varies: every hop at its own speed, with its own vector.
 
-    The hops' own errors are independent; that of the structural parameters is one for all.
-
-    `machine`, `model`, `point`, `covariance`: as for `estimate_unbalance`. `hop_synchronous` (n_hops, n_states).
-    `hop_speed_rad_s` (n_hops,). `hop_s`: length of a hop, s. Raises EstimationError if a vector says nothing about e.
+    The hops' own errors are independent; that of the structural parameters is one for all. `machine`, `model`, `point`,
+    `covariance`: as for `estimate_unbalance`. `hop_synchronous` (n_hops, n_states). `hop_speed_rad_s` (n_hops,).
+    `hop_s`: length of a hop, s. Raises EstimationError if a vector says nothing about e.
     """
     hops = [
         _ratios(machine, model, point, covariance, vectors, float(speed), hop_s)

@@ -18,8 +18,6 @@ from models.machine import Machine
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
-__all__ = ["LAYERS", "LIMIT", "OWN", "AmortisedNetwork", "AmortisedNetworks", "Calibration", "NetworkDiagnostician"]
-
 OWN = {"28": ("k_by", "c_by"), "29": ("e",), "30": ("EI",), "31": ("k_bz", "c_bz")}
 """Own parameters of each equation."""
 

@@ -28,8 +28,6 @@ from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy,
 from models.errors import BundleError, did_you_mean, mistakes
 from models.machine import Machine
 
-__all__ = ["Bundle", "Manifest", "Training", "load_bundle", "save_bundle"]
-
 _SHIPPED = Path(__file__).parents[2] / "bundles"
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 _Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]

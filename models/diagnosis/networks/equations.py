@@ -19,8 +19,6 @@ from models.machine import Machine
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix, RotorParameters
 from models.signals.block import FloatArray
 
-__all__ = ["EQUATIONS", "Equation", "EquationRows", "StatisticsView", "SynchronousEquation", "Term", "missing"]
-
 _REFERENCES = ("y1", "y2", "z1", "z2")
 _ANGLES = np.arange(16) * (2 * np.pi / 16)
 

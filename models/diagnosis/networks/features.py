@@ -24,8 +24,6 @@ from models.physics.response import stochastic_covariance
 from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray
 
-__all__ = ["FeatureBasis", "Float32Array", "ForceFeatures", "fit_basis", "principal_directions"]
-
 Float32Array = npt.NDArray[np.float32]
 
 _BANDS = 8
@@ -160,7 +158,6 @@ class ForceFeatures:
         """Relative disagreement in amplitude of displacement and rate, each of shape (n_windows,), by displacement.
 
         Of the band in which they agree best: sensor noise sets them apart in some bands, a wrong gain in all of them.
-
         `consistency` (n_windows, n): from `consistency`.
         """
         n = len(self._twice)
@@ -177,9 +174,8 @@ class ForceFeatures:
         """What equation 29 looks at besides, shape (n_windows, 3 n_dofs).
 
         The rotation-synchronous vectors as forces, in units of the nominal unbalance force (real parts, imaginary
-        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them.
-
-        `spectrum` (n_windows, n_bins, n, n). `synchronous` (n_windows, n). `speed_rad_s` (n_windows,).
+        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them. `spectrum`
+        (n_windows, n_bins, n, n). `synchronous` (n_windows, n). `speed_rad_s` (n_windows,).
         """
         machine = self._machine
         unbalance = machine.rotor.m2_kg * machine.rotor.e_m * speed_rad_s**2

@@ -22,18 +22,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation as EquationReading
 from rotorwatch.records.windows import Parameter
 
-__all__ = [
-    "HIDDEN",
-    "EquationNetwork",
-    "Healthy",
-    "Network",
-    "RelationDiagnostician",
-    "equation_by_number",
-    "hop_views",
-    "read_equation",
-    "window_view",
-]
-
 HIDDEN = 15
 """Neurons of the hidden layer, as in the paper."""
 

@@ -35,8 +35,6 @@ from models.machine import Machine
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = ["calibrate", "calibrate_networks", "train_network", "train_networks"]
-
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25
 

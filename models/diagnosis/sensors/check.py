@@ -14,8 +14,6 @@ from models.signals.channels import Channel
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-__all__ = ["sensor_findings"]
-
 
 def sensor_findings(
     window: WindowStatistics, reference: SensorReference | None = None, channels: Iterable[Channel] = ()

@@ -14,8 +14,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-__all__ = ["BROKEN", "gain_and_delay", "suspect_pairs", "swapped"]
-
 MOST_ERRORS = 5.0
 """Standard errors beyond which two sensors disagree."""
 LEAST_GAIN, LEAST_GAIN_CHANGE = 0.06, 0.015

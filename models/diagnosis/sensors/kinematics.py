@@ -14,8 +14,6 @@ from models.diagnosis.waveform import MotionPair, motion_pairs, pair_bands
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-__all__ = ["LONGEST_DELAY_S", "Banded", "PairReading", "banded", "gain_course", "read_pair", "same", "shared"]
-
 LONGEST_DELAY_S = 0.02
 """Longest delay that is looked for."""
 

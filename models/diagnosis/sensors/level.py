@@ -15,8 +15,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-__all__ = ["clipped", "gain_jump", "offset", "stuck"]
-
 STILL_S = 0.25
 """Longest time for which equal samples are put down to quantisation."""
 FLAT_PART = 0.005

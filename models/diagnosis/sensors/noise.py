@@ -29,8 +29,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-__all__ = ["noisy"]
-
 PAIR_RISE = 10.0
 """Power of the difference of two sensors of one motion over the healthy one, beyond what the others' rose by.
 

@@ -17,8 +17,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-__all__ = ["phase_faults"]
-
 MOST_ERRORS = 8.0
 """Standard errors beyond which the angle jumped or slips; the most probable of all moments is tested."""
 LEAST_JUMP_RAD = 0.35

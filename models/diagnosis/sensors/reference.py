@@ -22,24 +22,6 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.windows import SensorFault
 
-__all__ = [
-    "ChannelNoise",
-    "ChannelReference",
-    "Naming",
-    "NoiseReference",
-    "PairNoise",
-    "PairReference",
-    "SensorReference",
-    "channel_noise",
-    "channel_rms",
-    "floor",
-    "implicated",
-    "learn_sensor_reference",
-    "matched",
-    "pair_noise",
-    "single",
-]
-
 
 def implicated(findings: Iterable[SensorFault]) -> set[str]:
     """Channels whose data must not be used, by what they measure (``theta`` is the shaft angle)."""

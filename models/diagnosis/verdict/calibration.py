@@ -13,18 +13,6 @@ from models.diagnosis.verdict.stretch import Stretch, from_scale, to_scale
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Agreement, Detectable, Parameter
 
-__all__ = [
-    "MONTH_S",
-    "Thresholds",
-    "agreements",
-    "crossing_rate",
-    "detectable_changes",
-    "length_to_find",
-    "month_thresholds",
-    "overshoot_correction",
-    "window_thresholds",
-]
-
 MONTH_S = 30 * 86400.0
 """The month of "false alarms per month", s."""
 
@@ -85,7 +73,6 @@ def crossing_rate(threshold: float, overlap: int) -> float:
 
     The test value of a window of `overlap` hops is a moving average of independent hops: its autocorrelation falls
     linearly to zero over the window. For such a process the rate is b φ(b) μ ν(b √(2μ)) with μ = 1/overlap.
-
     `threshold`: b, in standard errors. `overlap`: hops in a window; 1 for windows that do not overlap. Returns
     crossings per hop; of -b the same number again.
     """
@@ -169,10 +156,9 @@ def detectable_changes(
 
     In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
     error is the one with all other parameters free: the change shall not only be noticed, it shall be told from a
-    change of any other parameter, so where estimates hang together the power is higher than stated.
-
-    `stretch`: what the data says; the errors of a parameter hardly depend on its value. `thresholds`: from the declared
-    rate. `length_s`: length of the data in it, s. `power`: probability of finding the change.
+    change of any other parameter, so where estimates hang together the power is higher than stated. `stretch`: what the
+    data says; the errors of a parameter hardly depend on its value. `thresholds`: from the declared rate. `length_s`:
+    length of the data in it, s. `power`: probability of finding the change.
     """
     distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
     return tuple(

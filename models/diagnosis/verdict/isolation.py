@@ -26,8 +26,6 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
-__all__ = ["Isolation", "isolate", "isolate_window", "model_test", "outside_confidence", "reading_of", "restricted"]
-
 
 @dataclass(frozen=True, slots=True)
 class Isolation:

@@ -31,8 +31,6 @@ from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Finding, Parameter, Verdict
 
-__all__ = ["SequentialSettings", "SequentialState", "SequentialTest", "finding", "hop_arrays"]
-
 _SHORT_HOPS = (2, 4, 7)
 """Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
 on 150 healthy stretches of each length and either layout of sources (rotor kit, seed 301) z of no parameter scatters

@@ -28,8 +28,6 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
-__all__ = ["Stretch", "added", "determined", "from_scale", "slope", "stretch_of", "to_scale", "with_shared_error"]
-
 _LINEAR = frozenset({"e"})
 _MOST_LOSS = -0.95
 """A parameter that reads as lost altogether has no logarithm."""
