@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -95,6 +94,8 @@ def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_h
     >>> bool(np.allclose(v[1000:3000], np.sin(2 * np.pi * 25 * t[1000:3000]) / (2 * np.pi * 25), atol=1e-7))
     True
     """
+    from scipy import fft  # noqa: PLC0415  # which nobody else who has blocks needs
+
     count = acceleration.size
     size = fft.next_fast_len(count, real=True)
     frequency = fft.rfftfreq(size, 1 / rate_hz)
