@@ -46,8 +46,17 @@ class Arrivals:
     """Puts the blocks of one machine in the order of their sequence, run by run.
 
     A run begins at sequence 0: where its first blocks are overtaken, they are waited for. Where a stream that has run
-    for longer is joined, the first block that arrives is the first. `bound`: how many blocks may wait for a missing
-    one; 0 hands on everything as it comes. Raises ValueError if the bound is negative.
+    for longer is joined, the first block that arrives is the first.
+
+    Parameters
+    ----------
+    bound : int
+        How many blocks may wait for a missing one; 0 hands on everything as it comes.
+
+    Raises
+    ------
+    ValueError
+        If the bound is negative.
 
     Examples
     --------
@@ -76,9 +85,18 @@ class Arrivals:
     def take(self, block: SampleBlock, schema_hash: str = "") -> tuple[Arrived, ...]:
         """Take a block as it arrives.
 
-        `block`: as decoded, of whatever form. `schema_hash`: schema hash the sender named, empty if it named none.
-        Returns what may go to the gate now, in order. Repetitions of blocks that have gone on go at once and change
-        nothing here; those of waiting blocks follow their originals.
+        Parameters
+        ----------
+        block : SampleBlock
+            As decoded, of whatever form.
+        schema_hash : str
+            Schema hash the sender named, empty if it named none.
+
+        Returns
+        -------
+        tuple of Arrived
+            What may go to the gate now, in order. Repetitions of blocks that have gone on go at once and change nothing
+            here; those of waiting blocks follow their originals.
         """
         arrived = Arrived(block, schema_hash)
         if self._bound == 0 or self._is_repetition(block):
@@ -95,7 +113,10 @@ class Arrivals:
     def withdraw(self, run: int, sequence: int) -> bool:
         """Take back a block that waits; its place stays open.
 
-        Returns whether it waited.
+        Returns
+        -------
+        bool
+            Whether it waited.
         """
         return run == self._run and self._waiting.pop(sequence, None) is not None
 
@@ -110,14 +131,21 @@ class Arrivals:
     def expect(self, run: int, sequence: int) -> None:
         """Go on in a stream of which everything before a block is there already.
 
-        `sequence`: of the next block.
+        Parameters
+        ----------
+        run : int
+        sequence : int
+            Of the next block.
         """
         self.resume((Course(run, 0, -_ALWAYS_NS, sequence, _ALWAYS_NS),))
 
     def resume(self, courses: Iterable[Course]) -> None:
         """Go on where a restored gate stands.
 
-        `courses`: `Gate.courses`.
+        Parameters
+        ----------
+        courses : iterable of Course
+            `Gate.courses`.
         """
         self._waiting.clear()
         self._earlier.clear()
@@ -234,7 +262,10 @@ class Senders:
     def take(self, block: SampleBlock) -> bool:
         """Take note of a block that has arrived.
 
-        Returns whether it, or an earlier one of its number and time, is another version of the same block.
+        Returns
+        -------
+        bool
+            Whether it, or an earlier one of its number and time, is another version of the same block.
         """
         self._heard_s += block.samples.shape[0] / block.rate_hz
         self._follow(block)

@@ -31,8 +31,15 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Put named arrays of numbers, truth values and text into bytes; the same arrays give the same bytes.
 
-    `arrays`: of any shape; the order of elements in memory (rows or columns first) is kept. Raises CheckpointError if
-    an array holds Python objects.
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+        Of any shape; the order of elements in memory (rows or columns first) is kept.
+
+    Raises
+    ------
+    CheckpointError
+        If an array holds Python objects.
 
     Examples
     --------
@@ -54,8 +61,14 @@ def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
 def from_bytes(data: bytes) -> dict[str, np.ndarray]:
     """Named arrays from what `to_bytes` gave.
 
-    Raises CheckpointError if the bytes are damaged, cut short, or something else, or were written by another version of
-    the format.
+    Parameters
+    ----------
+    data : bytes
+
+    Raises
+    ------
+    CheckpointError
+        If the bytes are damaged, cut short, or something else, or were written by another version of the format.
     """
     if len(data) < _HEADER.size or not data.startswith(_MAGIC):
         raise CheckpointError(f"{len(data)} bytes that begin with {data[:4]!r}, expected a checkpoint ({_MAGIC!r})")
@@ -103,8 +116,19 @@ def checked(
 ) -> npt.NDArray[_Scalar]:
     """Return one array if it is what it should be.
 
-    `kind`: element type. `shape`: expected shape; None where any size will do. Raises CheckpointError if there is no
-    such array, or it has another type or shape: the state is that of another machine or program.
+    Parameters
+    ----------
+    arrays : mapping of str to ndarray
+    name : str
+    kind : type
+        Element type.
+    shape : tuple of int or None
+        Expected shape; None where any size will do.
+
+    Raises
+    ------
+    CheckpointError
+        If there is no such array, or it has another type or shape: the state is that of another machine or program.
     """
     array = arrays.get(name)
     if array is None:
@@ -123,7 +147,10 @@ def checked(
 def texts(arrays: Mapping[str, np.ndarray], name: str) -> tuple[str, ...]:
     """Return the texts in one array of any length.
 
-    Raises CheckpointError as `checked`.
+    Raises
+    ------
+    CheckpointError
+        As `checked`.
     """
     found: list[str] = checked(arrays, name, np.str_, (None,)).tolist()
     return tuple(found)

@@ -76,7 +76,10 @@ _UNREADABLE = (
 def read_toml(path: Path) -> dict[str, object]:
     """Read a TOML file.
 
-    Raises MachineFileError if it cannot be read or is not TOML; the message names the file and, where known, the line.
+    Raises
+    ------
+    MachineFileError
+        If it cannot be read or is not TOML; the message names the file and, where known, the line.
     """
     try:
         data = path.read_bytes()
@@ -99,8 +102,17 @@ def read_toml(path: Path) -> dict[str, object]:
 def checked(model: type[_Model], fields: object, place: object) -> _Model:
     """The fields of a file as the record they describe.
 
-    `place`: what the messages begin with: the file, or the argument. Raises MachineFileError with one line for each
-    mistake.
+    Parameters
+    ----------
+    fields : object
+        What the file holds.
+    place : object
+        What the messages begin with: the file, or the argument.
+
+    Raises
+    ------
+    MachineFileError
+        With one line for each mistake.
     """
     try:
         return model.model_validate(fields)
@@ -111,8 +123,17 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
 def mistakes(error: ValidationError, model: type[BaseModel], fields: object = None) -> tuple[tuple[_Place, str], ...]:
     """What is wrong, mistake by mistake.
 
-    `model`: what was expected. `fields`: what was checked; lets a message name the entry of a list. Returns the place
-    as a path of names and numbers; the text begins with it.
+    Parameters
+    ----------
+    model : type of BaseModel
+        What was expected.
+    fields : object, optional
+        What was checked; lets a message name the entry of a list.
+
+    Returns
+    -------
+    tuple of (place, text)
+        The place as a path of names and numbers; the text begins with it.
     """
     found = error.errors(include_url=False)
     texts: dict[_Place, list[str]] = {}
@@ -145,7 +166,12 @@ def mistakes(error: ValidationError, model: type[BaseModel], fields: object = No
 def expectation(fault: ErrorDetails, info: FieldInfo | None = None) -> str:
     """What was expected and what was found, of a single fault.
 
-    `fault`: one of `ValidationError.errors`. `info`: the field, whose range is told from both ends.
+    Parameters
+    ----------
+    fault : ErrorDetails
+        One of `ValidationError.errors`.
+    info : FieldInfo, optional
+        The field, whose range is told from both ends.
     """
     kind, context, value = fault["type"], fault.get("ctx", {}), fault["input"]
     between = "" if info is None else _range(info)
@@ -195,7 +221,10 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def argument_text(error: Exception) -> str | None:
     """What an argument of a command should have been, where that was found out by the same checks as those of files.
 
-    `error`: what refuses the argument; its cause says why.
+    Parameters
+    ----------
+    error : Exception
+        What refuses the argument; its cause says why.
     """
     cause = error.__cause__
     return expectation(cause.errors(include_url=False)[0]) if isinstance(cause, ValidationError) else None

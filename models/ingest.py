@@ -106,7 +106,13 @@ class Course:
 
 
 class Gate:
-    """Judges the blocks of one machine in the order of their arrival."""
+    """Judges the blocks of one machine in the order of their arrival.
+
+    Parameters
+    ----------
+    machine : MachineFile
+        What the stream must look like.
+    """
 
     def __init__(self, machine: MachineFile) -> None:
         self._name = f"{machine.site}/{machine.name}"
@@ -139,8 +145,12 @@ class Gate:
     def could_use(self, payload: bytes, attachment: bytes, encoding: str) -> bool:
         """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
 
-        Takes microseconds and changes nothing: any thread may ask. `payload`, `attachment`, `encoding`: see
-        `models.signals.wire`.
+        Takes microseconds and changes nothing: any thread may ask.
+
+        Parameters
+        ----------
+        payload, attachment, encoding : bytes, bytes, str
+            See `models.signals.wire`.
         """
         if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
             return False
@@ -155,7 +165,12 @@ class Gate:
     def judge(self, block: SampleBlock, schema_hash: str = "") -> Admission:
         """Accept or refuse a block.
 
-        `schema_hash`: schema hash the sender named, empty if it named none.
+        Parameters
+        ----------
+        block : SampleBlock
+            As decoded.
+        schema_hash : str
+            Schema hash the sender named, empty if it named none.
         """
         return self.form(block, schema_hash) or self._place(block)
 
@@ -170,7 +185,14 @@ class Gate:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called.
 
-        Raises CheckpointError if they are not a gate's; nothing is changed then.
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+
+        Raises
+        ------
+        CheckpointError
+            If they are not a gate's; nothing is changed then.
         """
         courses, candidates, refused = (_courses(arrays, name) for name in ("courses", "candidate", "refused"))
         self._expected = courses[-1] if courses else None

@@ -335,8 +335,15 @@ class Machine(MachineFile):
 def load_machine(name_or_path: str | Path) -> Machine:
     """Load the file of a machine whose parameters are known, by path, or a shipped one by its name.
 
-    `name_or_path`: name of a shipped machine ("lab", "heavy", "light"), or the path of a TOML file. Raises
-    MachineFileError, naming the file, the field, the value found and what was expected.
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of a shipped machine ("lab", "heavy", "light"), or the path of a TOML file.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
     """
     path = _path(name_or_path)
     return checked(Machine, read_toml(path), path)
@@ -345,8 +352,15 @@ def load_machine(name_or_path: str | Path) -> Machine:
 def load_machine_file(name_or_path: str | Path) -> MachineFile:
     """Load a machine file, whatever is known of the machine; a `Machine` if all its parameters are.
 
-    `name_or_path`: as for `load_machine`. Raises MachineFileError, naming the file, the field, the value found and what
-    was expected.
+    Parameters
+    ----------
+    name_or_path : str or Path
+        As for `load_machine`.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
     """
     path = _path(name_or_path)
     found = checked(MachineFile, read_toml(path), path)

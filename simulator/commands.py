@@ -63,8 +63,15 @@ def bars(*, remaining: bool = False) -> Progress:
 def labelled_bars(*, remaining: bool = False) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar for every label that progress is told of.
 
-    `remaining`: also show the time that remains. Yields a function that takes what is being done, how much of
-    it is done, and how much there is.
+    Parameters
+    ----------
+    remaining : bool
+        Also show the time that remains.
+
+    Yields
+    ------
+    callable
+        Takes what is being done, how much of it is done, and how much there is.
     """
     with bars(remaining=remaining) as shown:
         tasks: dict[str, TaskID] = {}

@@ -52,9 +52,16 @@ class PlantSamples:
 class Plant:
     """Rotor, coloured excitation and unbalance, advanced sample by sample with an exact discretisation.
 
-    The first sample is a draw from the stationary distribution, at shaft angle 0. `machine`: the original machine, its
-    rate, and the angle of the heavy spot from the phase reference. `condition`: what holds from the first sample on.
-    `rng`: used by nothing else, so that the realisation depends on the seed alone.
+    The first sample is a draw from the stationary distribution, at shaft angle 0.
+
+    Parameters
+    ----------
+    machine : Machine
+        The original machine, its rate, and the angle of the heavy spot from the phase reference.
+    condition : Condition
+        What holds from the first sample on.
+    rng : numpy.random.Generator
+        Used by nothing else, so that the realisation depends on the seed alone.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -76,7 +83,10 @@ class Plant:
     def change(self, condition: Condition) -> None:
         """Let another condition hold from the next sample on; displacement, velocity and shaft angle carry over.
 
-        Raises ValueError if the number of sources changes: the state would not fit.
+        Raises
+        ------
+        ValueError
+            If the number of sources changes: the state would not fit.
         """
         if len(condition.sources) != self._n_sources:
             raise ValueError(f"{len(condition.sources)} sources instead of {self._n_sources}: the state would not fit")
@@ -209,9 +219,17 @@ def crack_stiffness(rotor: RotorParameters, theta_rad: FloatArray) -> FloatArray
 class NonlinearPlant(Plant):
     """Rotor with a crack or a rub; same interface, same random numbers as the linear plant.
 
-    An anomaly that is there from the first sample on has run in for five seconds before it. `condition`: what holds
-    from the first sample on. Raises EstimationError, here, in `change` or in `advance`, if a crack or a rub makes the
-    rotor unstable.
+    An anomaly that is there from the first sample on has run in for five seconds before it.
+
+    Parameters
+    ----------
+    condition : Condition
+        What holds from the first sample on.
+
+    Raises
+    ------
+    EstimationError
+        Here, in `change` or in `advance`: if a crack or a rub makes the rotor unstable.
     """
 
     def __init__(self, machine: Machine, condition: Condition, rng: np.random.Generator) -> None:
@@ -226,7 +244,10 @@ class NonlinearPlant(Plant):
     def advance(self, n_samples: int) -> PlantSamples:
         """Return the next `n_samples` samples and move on behind them.
 
-        Raises EstimationError if friction drives the disc off.
+        Raises
+        ------
+        EstimationError
+            If friction drives the disc off.
         """
         if self._crack is None and self._contact is None:
             return super().advance(n_samples)

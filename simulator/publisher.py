@@ -65,11 +65,27 @@ def publish(
 ) -> RunSummary:
     """Publish descriptor, truth and blocks of one machine until the stream ends or `stop` is set.
 
-    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine. `stream`:
-    from `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for. `stop`: when set,
-    publishing ends before the next block and the session closes at once. `on_block`: called with the summary so far
-    after each block. Raises MachineFileError if an endpoint is malformed, or a password, certificate or key cannot be
-    used. Raises PublishError if the session cannot be opened, or nobody subscribed in time.
+    Blocks go out when their last sample would have been taken, so that pace 1 behaves like a real machine.
+
+    Parameters
+    ----------
+    stream : iterator of (SampleBlock, tuple of TruthRecord)
+        From `simulator.stream.blocks`; not advanced before a subscriber is there, if one is waited for.
+    stop : threading.Event, optional
+        When set, publishing ends before the next block and the session closes at once.
+    on_block : callable, optional
+        Called with the summary so far after each block.
+
+    Returns
+    -------
+    RunSummary
+
+    Raises
+    ------
+    MachineFileError
+        If an endpoint is malformed, or a password, certificate or key cannot be used.
+    PublishError
+        If the session cannot be opened, or nobody subscribed in time.
     """
     stop = Event() if stop is None else stop
     with _session(settings) as session, _declared(session, machine, settings.pace) as outlets:

@@ -23,10 +23,26 @@ def record(
     """Record descriptor, truth and blocks under the keys a publisher would use.
 
     All times in the file are data time: a block is logged at the time of the sample after its last one, which is when a
-    real machine could first have sent it. `stream`: from `simulator.stream.blocks`. `path`: name of the recording; it
-    is ``.part`` until complete. `overwrite`: replace an existing recording. `stop`: when set, the recording ends after
-    the current block and is complete. `on_block`: called with the summary so far after each block. Raises
-    RecordingError if the file cannot be written.
+    real machine could first have sent it.
+
+    Parameters
+    ----------
+    stream : iterator of (SampleBlock, tuple of TruthRecord)
+        From `simulator.stream.blocks`.
+    path : Path
+        Name of the recording; it is ``.part`` until complete.
+    encoding : {"raw", "arrow"}
+    overwrite : bool
+        Replace an existing recording.
+    stop : threading.Event, optional
+        When set, the recording ends after the current block and is complete.
+    on_block : callable, optional
+        Called with the summary so far after each block.
+
+    Raises
+    ------
+    RecordingError
+        If the file cannot be written.
     """
     keys, schema_hash = machine.keys, machine.descriptor.schema_hash
     begin = time.monotonic()

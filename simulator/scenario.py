@@ -241,8 +241,11 @@ class Scenario(BaseModel):
     def check_channels(self, machine: Machine) -> None:
         """Check that every channel the scenario names is one of the machine's, and that swaps are possible.
 
-        Raises MachineFileError, naming the scenario, the field, the unknown channel, and the channels the machine has;
-        or two channels that cannot be swapped because they measure different quantities or in different units.
+        Raises
+        ------
+        MachineFileError
+            Naming the scenario, the field, the unknown channel, and the channels the machine has; or two channels that
+            cannot be swapped because they measure different quantities or in different units.
         """
         known = [channel.name for channel in machine.sensors]
         named = [(f"sensors.channels.{name}", name) for name in self.sensors.channels]
@@ -275,7 +278,10 @@ class Scenario(BaseModel):
     ) -> "Scenario":
         """Return the scenario with another seed or duration and with events added, checked again.
 
-        Raises MachineFileError if the result is not a valid scenario (an event after the new end, say).
+        Raises
+        ------
+        MachineFileError
+            If the result is not a valid scenario (an event after the new end, say).
         """
         fields = self.model_dump(exclude={"events"})
         fields["events"] = [event.model_dump() for event in (*self.events, *faults)]
@@ -294,9 +300,21 @@ def shipped_scenarios() -> tuple[str, ...]:
 def load_scenario(name_or_path: str | Path) -> tuple[Scenario, Machine]:
     """Load a scenario by path, or a shipped one by name, together with its machine.
 
-    `name_or_path`: "healthy", "k_by", ... (shipped), or the path of a TOML file. Returns `scenario`; `machine`: the one
-    the scenario names; a path is relative to the scenario file. Raises MachineFileError, naming the file, the field,
-    the value found and what was expected.
+    Parameters
+    ----------
+    name_or_path : str or Path
+        "healthy", "k_by", ... (shipped), or the path of a TOML file.
+
+    Returns
+    -------
+    scenario : Scenario
+    machine : Machine
+        The one the scenario names; a path is relative to the scenario file.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field, the value found and what was expected.
     """
     path = _locate(name_or_path, Path())
     fields = _merged(path, ())
@@ -314,7 +332,10 @@ def load_scenario(name_or_path: str | Path) -> tuple[Scenario, Machine]:
 def parse_fault(text: str) -> Event:
     """Turn ``PARAMETER=RELATIVE_CHANGE@AT_SECONDS`` into an event.
 
-    Raises MachineFileError if the text does not have this form or names no parameter.
+    Raises
+    ------
+    MachineFileError
+        If the text does not have this form or names no parameter.
 
     Examples
     --------

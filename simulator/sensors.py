@@ -24,9 +24,16 @@ class Sensor:
     """One channel: (value + noise) · gain + offset, clipped, rounded to a step, in the channel's unit.
 
     A delay shifts the true value by whole samples, the nearest number; before the first sample it was what it is then.
-    `rms_SI`: what ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
-    `rng`: of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
-    change without changing the noise. `longest_delay_s`: longest delay it will have.
+
+    Parameters
+    ----------
+    rms_SI : float
+        What ``noise_relative`` refers to: the channel's own theoretical rms, one revolution for a shaft angle.
+    rng : numpy.random.Generator
+        Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
+        change without changing the noise.
+    longest_delay_s : float
+        Longest delay it will have.
     """
 
     def __init__(
@@ -64,7 +71,14 @@ class Sensor:
     def measure(self, value_SI: FloatArray, noise: FloatArray, faults: SensorFaults) -> FloatArray:
         """Return samples in the channel's unit while the same faults are active; NaN after a dropout.
 
-        `value_SI` (n,): true values, n ≥ 1. `noise` (n,): from `noise`. `faults`: active faults, kind to value.
+        Parameters
+        ----------
+        value_SI : ndarray, shape (n,)
+            True values, n ≥ 1.
+        noise : ndarray, shape (n,)
+            From `noise`.
+        faults : mapping
+            Active faults, kind to value.
         """
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
@@ -95,8 +109,15 @@ class Sensor:
 class SensorBank:
     """All channels of a machine, in the order of its file.
 
-    `sensors`: settings from the scenario. `rms` (12,): theoretical rms of the states at the start, SI. `rngs`: one per
-    channel.
+    Parameters
+    ----------
+    sensors : Sensors
+        Settings from the scenario.
+    rms : ndarray, shape (12,)
+        Theoretical rms of the states at the start, SI.
+    faults : mapping of channel name to (sample number, active faults), ascending
+    rngs : sequence of numpy.random.Generator
+        One per channel.
     """
 
     def __init__(
@@ -124,7 +145,10 @@ class SensorBank:
     def measure(self, plant: PlantSamples, first: int) -> npt.NDArray[np.float32] | FloatArray:
         """Return all channels of consecutive plant samples; shape (n_samples, n_channels), the machine's dtype.
 
-        `first`: sample number of the first one.
+        Parameters
+        ----------
+        first : int
+            Sample number of the first one.
         """
         n_samples = plant.theta_rad.size
         samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)

@@ -111,11 +111,29 @@ def blocks(
 ) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
     """Simulate a scenario, block by block.
 
-    `machine`: the original machine; its channels, rate and number format shape the blocks. `block_s`: length of a
-    block, s; the last one may be shorter. `start_ns`: acquisition time of the first sample, ns since 1970-01-01 UTC.
-    `run`: run number in every block, 0 to 65535. Yields `block`; `truth`: records that begin within the block,
-    ascending. Raises MachineFileError if the scenario names a channel the machine does not have. Raises ValueError if a
-    block would hold no sample.
+    Parameters
+    ----------
+    machine : Machine
+        The original machine; its channels, rate and number format shape the blocks.
+    block_s : float
+        Length of a block, s; the last one may be shorter.
+    start_ns : int
+        Acquisition time of the first sample, ns since 1970-01-01 UTC.
+    run : int
+        Run number in every block, 0 to 65535.
+
+    Yields
+    ------
+    block : SampleBlock
+    truth : tuple of TruthRecord
+        Records that begin within the block, ascending.
+
+    Raises
+    ------
+    MachineFileError
+        If the scenario names a channel the machine does not have.
+    ValueError
+        If a block would hold no sample.
     """
     scenario.check_channels(machine)
     n_block = round(block_s * machine.rate_hz)

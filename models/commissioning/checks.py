@@ -76,7 +76,13 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
 
 
 def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
-    """Whether a sensor was at fault while the recordings were made."""
+    """Whether a sensor was at fault while the recordings were made.
+
+    Parameters
+    ----------
+    findings : mapping of str to sequence of SensorFault
+        By recording.
+    """
     name = "sensors"
     faults: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
     for recording, found in findings.items():
@@ -161,8 +167,14 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
     """Whether the recordings tell of one machine, each read against what the others teach; None for a single one.
 
     Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
-    limits what can be said between the speeds. `differences`: sentences on recordings that differ from the others.
-    `speeds_rad_s`: mean speed of each recording.
+    limits what can be said between the speeds.
+
+    Parameters
+    ----------
+    differences : sequence of str
+        Sentences on recordings that differ from the others.
+    speeds_rad_s : mapping of str to float
+        Mean speed of each recording.
     """
     name = "recordings agree"
     if len(speeds_rad_s) < 2:
@@ -192,6 +204,11 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
 
     With one source every channel is a filtered copy of every other, and relations that differ by far fit the same
     recording.
+
+    Parameters
+    ----------
+    windows : mapping of str to sequence of WindowStatistics
+        By recording.
     """
     name = "ways of excitation"
     alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]
@@ -213,8 +230,12 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
 def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Check:
     """Whether the recordings determine every relation that the sensors allow.
 
-    `reasons`: why there is none, with what to record instead. `only_shapes`: there is none at all, and each channel is
-    only compared with its own healthy form.
+    Parameters
+    ----------
+    reasons : sequence of str
+        Why there is none, with what to record instead.
+    only_shapes : bool
+        There is none at all, and each channel is only compared with its own healthy form.
     """
     name = "relations determined"
     if not reasons:
@@ -230,7 +251,10 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
 def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:
     """Whether either half of the data, taken for healthy, finds the other half healthy.
 
-    `first_on_second`: windows read against what was learned on the other half.
+    Parameters
+    ----------
+    first_on_second : sequence of Diagnosis
+        Windows read against what was learned on the other half.
     """
     return _compared("halves agree", first_on_second, "between the halves of the healthy data")
 
@@ -238,7 +262,10 @@ def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:
 def check_agreement(diagnoses: Sequence[Diagnosis], what: str) -> Check:
     """Whether healthy windows agree with what they are compared with.
 
-    `what`: in words: "the parameters in the machine file".
+    Parameters
+    ----------
+    what : str
+        In words: "the parameters in the machine file".
     """
     return _compared(f"agrees with {what}", diagnoses, f"between the healthy data and {what}", theory=True)
 

@@ -117,10 +117,20 @@ def parameter_summaries(
 ) -> tuple[ParameterSummary, ...]:
     """Sum up what healthy windows say of each parameter.
 
-    `diagnoses`: healthy windows read as later ones will be, with the shared error in each. `compared`: the same windows
-    read against what was learned without them. `healthy_s` and `window_s`: data learned from; length of each window in
-    `diagnoses`. `wished`: relative change that is wished to be found. `short`: whether stretches shorter than a window
-    are looked at, too: they share the declared rate. `identified`: identified values, SI.
+    Parameters
+    ----------
+    diagnoses : sequence of (recording, end_ns, Diagnosis)
+        Healthy windows read as later ones will be, with the shared error in each.
+    compared : sequence of (recording, end_ns, Diagnosis)
+        The same windows read against what was learned without them.
+    healthy_s, window_s : float
+        Data learned from; length of each window in `diagnoses`.
+    wished : float
+        Relative change that is wished to be found.
+    short : bool
+        Whether stretches shorter than a window are looked at, too: they share the declared rate.
+    identified : mapping of str to float
+        Identified values, SI.
     """
     settings = SequentialSettings.for_machine(machine, short=short)
     threshold = settings.thresholds(settings.window_hops).first + float(ndtri(_POWER))
@@ -224,9 +234,20 @@ def commission(
 ) -> Commissioning:
     """Commission a machine.
 
-    `recordings`: one for each file; of one steady condition each. `entries`: what is kept of each file. `wished`:
-    relative change that shall be found; the alarm limit without it. `replaces`: the version before. `why`: why it is
-    commissioned again. `progress`: told what is being done, how much of it is done, and how much there is.
+    Parameters
+    ----------
+    recordings : sequence of HealthyRecording
+        One for each file; of one steady condition each.
+    entries : sequence of RecordingEntry
+        What is kept of each file.
+    wished : float, optional
+        Relative change that shall be found; the alarm limit without it.
+    replaces : Commissioned, optional
+        The version before.
+    why : str
+        Why it is commissioned again.
+    progress : callable, optional
+        Told what is being done, how much of it is done, and how much there is.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]

@@ -259,8 +259,17 @@ def described(machine: MachineFile) -> dict[str, Any]:
 def load_commissioned(directory: Path, machine: MachineFile, *, same_description: bool = True) -> Commissioned:
     """Load what was commissioned and check that it belongs to a machine.
 
-    `same_description`: whether channels, window and physics must be as they were. Raises BundleError, naming what is
-    missing, damaged or different.
+    Parameters
+    ----------
+    directory : Path
+        The bundle.
+    same_description : bool
+        Whether channels, window and physics must be as they were.
+
+    Raises
+    ------
+    BundleError
+        Naming what is missing, damaged or different.
     """
     path = directory / FILE
     try:
@@ -314,8 +323,16 @@ class Installed:
 def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
     """Load what a machine is monitored with.
 
-    `bundle`: shipped bundle by name, or directory of a trained or commissioned one. Raises BundleError if it is damaged
-    or of another machine, or if the machine's parameters are not known and it was not commissioned.
+    Parameters
+    ----------
+    bundle : str or Path, optional
+        Shipped bundle by name, or directory of a trained or commissioned one.
+
+    Raises
+    ------
+    BundleError
+        If it is damaged or of another machine, or if the machine's parameters are not known and it was not
+        commissioned.
     """
     place = f"{machine.site}/{machine.name}"
     directory = None if bundle is None else Path(bundle)

@@ -47,7 +47,10 @@ class HealthyRecording:
     def windows(self, hops: int | None = None) -> tuple[WindowStatistics, ...]:
         """Windows that do not overlap, gaps left out.
 
-        `hops`: length of each; a full window without it.
+        Parameters
+        ----------
+        hops : int, optional
+            Length of each; a full window without it.
         """
         length = self.plan.hops if hops is None else hops
         return tuple(
@@ -62,8 +65,14 @@ def healthy_from_blocks(
 ) -> HealthyRecording:
     """Cut a stream into hops.
 
-    `blocks`: blocks in their order, each with the hash of the channel descriptor that its sender named, or "".
-    `until_s`: use only data from before this time after the first sample.
+    Parameters
+    ----------
+    name : str
+        What the recording is called.
+    blocks : iterable of (SampleBlock, str)
+        Blocks in their order, each with the hash of the channel descriptor that its sender named, or "".
+    until_s : float, optional
+        Use only data from before this time after the first sample.
     """
     plan = plan_for(machine)
     gate, window = Gate(machine), SlidingWindow(replace(plan, hops=1))
@@ -102,9 +111,17 @@ def healthy_from_blocks(
 def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None) -> HealthyRecording:
     """Read a recording of the machine.
 
-    `path`: recording (MCAP); of several machines in it, the one with the machine file's site and name is taken.
-    `until_s`: use only data from before this time after the first sample. Raises RecordingError if it cannot be read,
-    or holds no stream of this machine; the message names what it holds.
+    Parameters
+    ----------
+    path : Path
+        Recording (MCAP); of several machines in it, the one with the machine file's site and name is taken.
+    until_s : float, optional
+        Use only data from before this time after the first sample.
+
+    Raises
+    ------
+    RecordingError
+        If it cannot be read, or holds no stream of this machine; the message names what it holds.
     """
     found = healthy_from_blocks(path.name, machine, _blocks(path, machine), until_s)
     if not found.hops and not found.refused:

@@ -48,9 +48,21 @@ def identify(
 ) -> Identified:
     """Identify stiffness, damping and unbalance.
 
-    `machine`: with masses and shaft in its ``[rotor]``. `windows`: healthy ones that do not overlap. `progress`: told
-    how many rounds are done, and how many there may be. Raises EstimationError if no start leads to a rotor that
-    explains the windows. Raises MachineFileError if masses or shaft are missing.
+    Parameters
+    ----------
+    machine : MachineFile
+        With masses and shaft in its ``[rotor]``.
+    windows : sequence of WindowStatistics
+        Healthy ones that do not overlap.
+    progress : callable, optional
+        Told how many rounds are done, and how many there may be.
+
+    Raises
+    ------
+    EstimationError
+        If no start leads to a rotor that explains the windows.
+    MachineFileError
+        If masses or shaft are missing.
     """
     whole = _first_guess(machine, windows)
     for number in range(_ROUNDS):

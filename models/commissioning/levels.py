@@ -163,7 +163,10 @@ def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
 def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
     """Learn the relations, in one baseline or in one for each speed.
 
-    Raises EstimationError if there is none that the pieces determine.
+    Raises
+    ------
+    EstimationError
+        If there is none that the pieces determine.
     """
     groups = [list(pieces)]
     baselines = [_baseline(groups[0])]
@@ -204,8 +207,17 @@ def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Pro
 def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[str]) -> Baseline:
     """What healthy windows teach, without the rows that they do not determine well enough.
 
-    `windows`: they do not overlap. `conditions`: what each belongs to, for example its recording. Raises
-    EstimationError if they determine none.
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        They do not overlap.
+    conditions : sequence of str
+        What each belongs to, for example its recording.
+
+    Raises
+    ------
+    EstimationError
+        If they determine none.
     """
     baseline = learn_baseline(windows, conditions)
     weak = undetermined(baseline)

@@ -83,7 +83,11 @@ class Plan:
 def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
     """Derive the plan of a machine.
 
-    `lagged`: whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
+    Parameters
+    ----------
+    machine : MachineFile
+    lagged : bool
+        Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
     """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
@@ -150,7 +154,10 @@ class HopMoments:
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopMoments":
         """Moments from what `checkpoint` gave.
 
-        Raises CheckpointError if an array is missing or of another form.
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
         """
         start_ns, end_ns = checked(arrays, "times_ns", np.int64, (2,)).tolist()
         line = checked(arrays, "line", np.float64, (None,)).tolist()
@@ -169,10 +176,17 @@ class HopMoments:
 def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: int) -> HopMoments:
     """Compute the moments of one hop.
 
-    `samples` (preamble + hop, n_states [+ 1]): SI samples as `Plan.to_si` gives them, without a gap; the first
-    `preamble` rows are history. `level` (n_states,): fixed level subtracted before anything is summed. A proximity
-    probe's gap voltage may be a million times its fluctuation; squared, it would swallow every digit. `start_ns`: time
-    of the first sample of the hop itself.
+    Parameters
+    ----------
+    plan : Plan
+        Sizes.
+    samples : ndarray, shape (preamble + hop, n_states [+ 1])
+        SI samples as `Plan.to_si` gives them, without a gap; the first `preamble` rows are history.
+    level : ndarray, shape (n_states,)
+        Fixed level subtracted before anything is summed. A proximity probe's gap voltage may be a million times its
+        fluctuation; squared, it would swallow every digit.
+    start_ns : int
+        Time of the first sample of the hop itself.
     """
     n_states = len(plan.states)
     x = samples[:, :n_states] - level
@@ -294,7 +308,12 @@ def regression(zero_lag: FloatArray, n: int) -> FloatArray:
 def hop_coefficients(plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotation, mean: FloatArray) -> HopCoefficients:
     """Coefficients of every hop and segment, with one mean for the whole window.
 
-    `rotation`: where its speed is nan, nothing but the mean is taken out. `mean` (n,): coefficient of the constant.
+    Parameters
+    ----------
+    rotation : Rotation
+        Where its speed is nan, nothing but the mean is taken out.
+    mean : ndarray, shape (n,)
+        Coefficient of the constant.
     """
     n = len(plan.states)
     beta = np.zeros((len(hops), n, 3))
@@ -329,8 +348,11 @@ def _adjoin(earlier: HopMoments, later: HopMoments) -> bool:
 def relative_vectors(vectors: ComplexArray) -> tuple[ComplexArray, int]:
     """Turn each hop's vectors so that the channel with the clearest line is at angle zero.
 
-    Returns `vectors` (n_hops, n); `channel`: the one at angle zero: its amplitude varies least from hop to hop,
-    relative.
+    Returns
+    -------
+    vectors : ndarray, shape (n_hops, n)
+    channel : int
+        The one at angle zero: its amplitude varies least from hop to hop, relative.
     """
     size = np.abs(vectors)
     mean = size.mean(axis=0)

@@ -135,11 +135,22 @@ def parameter_reading(
 ) -> Parameter:
     """One parameter as one diagnostician reads it.
 
-    `name`: one of ``models.physics.rotor.PARAMETERS``. `by`: who says so: ``likelihood``, ``network`` (amortised),
-    ``relation`` or ``baseline``. `change` and `standard_error`: relative change from nominal and its standard error.
-    `vector`: of e, where there is a phase reference. `change` is then that of its size as long as the heavy spot stays
-    where it is, and the size of the vector of change once it has turned. Raises EstimationError if the change is not
-    finite.
+    Parameters
+    ----------
+    name : str
+        One of ``models.physics.rotor.PARAMETERS``.
+    by : str
+        Who says so: ``likelihood``, ``network`` (amortised), ``relation`` or ``baseline``.
+    change, standard_error : float
+        Relative change from nominal and its standard error.
+    vector : UnbalanceVector, optional
+        Of e, where there is a phase reference. `change` is then that of its size as long as the heavy spot stays where
+        it is, and the size of the vector of change once it has turned.
+
+    Raises
+    ------
+    EstimationError
+        If the change is not finite.
     """
     if not math.isfinite(change):
         raise EstimationError(f"{by}: change of {name} reads as {change}, expected a finite number")
@@ -233,5 +244,8 @@ class Diagnostician(Protocol):
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window.
 
-        Raises models.errors.EstimationError if the window as a whole cannot be judged.
+        Raises
+        ------
+        models.errors.EstimationError
+            If the window as a whole cannot be judged.
         """

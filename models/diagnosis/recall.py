@@ -54,8 +54,13 @@ def pieces_of(pieces: Iterable[Piece]) -> dict[str, np.ndarray]:
 class Recall:
     """Blocks that are taken again, and what can be made of them.
 
-    `level` (n_states,) or (0,): what was subtracted from all samples. `arrays`: from `pieces_of`: the hops, oldest
-    first, and last the unfinished one. Raises CheckpointError if an array is missing or of another form.
+    Parameters
+    ----------
+    plan : Plan
+    level : ndarray, shape (n_states,) or (0,)
+        What was subtracted from all samples.
+    arrays : mapping of str to ndarray
+        From `pieces_of`: the hops, oldest first, and last the unfinished one.
 
     Attributes
     ----------
@@ -65,6 +70,11 @@ class Recall:
         Of the hops.
     last : Piece
         The unfinished hop.
+
+    Raises
+    ------
+    CheckpointError
+        If an array is missing or of another form.
     """
 
     def __init__(self, plan: Plan, level: FloatArray, arrays: Mapping[str, np.ndarray]) -> None:

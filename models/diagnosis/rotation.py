@@ -52,8 +52,17 @@ class RotationLine:
 def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: float) -> RotationLine | None:
     """Find the line in one hop.
 
-    `x` (n_samples, n): all samples of the hop and what it needs before it. `speed_rad_s` and `tolerance`: expected
-    speed and how far it may be off, relative. None if no channel fluctuates or the range holds no frequency.
+    Parameters
+    ----------
+    x : ndarray, shape (n_samples, n)
+        All samples of the hop and what it needs before it.
+    speed_rad_s, tolerance : float
+        Expected speed and how far it may be off, relative.
+
+    Returns
+    -------
+    RotationLine or None
+        None if no channel fluctuates or the range holds no frequency.
     """
     n_samples = x.shape[0]
     duration_s, expected_hz = n_samples / rate_hz, speed_rad_s / (2 * np.pi)
@@ -125,7 +134,15 @@ def _top(values: list[float]) -> float:
 def followed_speeds(lines: tuple[RotationLine | None, ...], hop_s: float) -> FloatArray | None:
     """Speed of each hop if the lines are those of one shaft; nan where a hop's largest peak was another one.
 
-    `lines`: of hops that follow each other, apart from gaps. Returns (n_hops,): None if no line can be followed.
+    Parameters
+    ----------
+    lines : tuple of RotationLine or None
+        Of hops that follow each other, apart from gaps.
+
+    Returns
+    -------
+    ndarray, shape (n_hops,), or None
+        None if no line can be followed.
     """
     speed = np.array([np.nan if line is None else line.speed_rad_s for line in lines])
     sweep = np.array([np.nan if line is None else line.sweep_rad_s2 for line in lines])

@@ -88,8 +88,15 @@ class HealthyShape(BaseModel):
     def judge(self, window: WindowStatistics, rate: float = 0.01) -> tuple[Shape, ...]:
         """Compare every channel of a window with its healthy shape; what cannot be compared says why.
 
-        `rate`: declared probability that any channel of an unchanged machine is called changed in one window. Raises
-        ValueError if the rate is not between 0 and 1.
+        Parameters
+        ----------
+        rate : float
+            Declared probability that any channel of an unchanged machine is called changed in one window.
+
+        Raises
+        ------
+        ValueError
+            If the rate is not between 0 and 1.
         """
         if not 0 < rate < 1:
             raise ValueError(f"rate is {rate}, expected between 0 and 1")
@@ -148,9 +155,16 @@ class HealthyShape(BaseModel):
 def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:
     """Learn the healthy shape of every channel.
 
-    `windows`: healthy windows that do not overlap, of all conditions that are to count as healthy: a colour of
-    excitation that is in none of them will be called a change. Raises EstimationError if they are too few, differ in
-    their lags, or no channel moves in all of them.
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        Healthy windows that do not overlap, of all conditions that are to count as healthy: a colour of excitation that
+        is in none of them will be called a change.
+
+    Raises
+    ------
+    EstimationError
+        If they are too few, differ in their lags, or no channel moves in all of them.
     """
     count = len(windows)
     if count < FEWEST_WINDOWS:

@@ -51,7 +51,10 @@ class Waveform:
     def restored(cls, arrays: Mapping[str, np.ndarray]) -> "Waveform":
         """Waveform of one hop from what `checkpoint` gave.
 
-        Raises CheckpointError if an array is missing or of another form.
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
         """
         mean, rms, minimum, maximum, step = checked(arrays, "levels", np.float64, (5, None))
         at_minimum, at_maximum, longest_run = checked(arrays, "counts", np.int64, (3, mean.size))
@@ -71,7 +74,10 @@ class Waveform:
 def waveform_of(samples: FloatArray) -> Waveform:
     """Look at the samples of one hop.
 
-    `samples` (n_samples, n_channels): finite, at least one sample.
+    Parameters
+    ----------
+    samples : ndarray, shape (n_samples, n_channels)
+        Finite, at least one sample.
     """
     x = np.array(samples.T, order="C")  # a copy: the mean is taken out of it below
     n, n_samples = x.shape
@@ -191,8 +197,16 @@ def pair_bands(n_bins: int) -> npt.NDArray[np.intp]:
 def pair_powers(segments: _ComplexArray, frequencies_hz: FloatArray, pairs: tuple[MotionPair, ...]) -> _ComplexArray:
     """Sum powers over segments and the bins of each band.
 
-    `segments` (n_segments, n_bins, n): Fourier coefficients. `frequencies_hz` (n_bins,). Returns (n_pairs, n_bands, 3):
-    with z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|².
+    Parameters
+    ----------
+    segments : ndarray, shape (n_segments, n_bins, n)
+        Fourier coefficients.
+    frequencies_hz : ndarray, shape (n_bins,)
+
+    Returns
+    -------
+    ndarray, shape (n_pairs, n_bands, 3)
+        With z = (jω)ᵒʳᵈᵉʳ x: Σ|z|², Σ z* v, Σ|v|².
     """
     edges = pair_bands(frequencies_hz.size)
     powers = np.zeros((len(pairs), edges.size, 3), dtype=np.complex128)

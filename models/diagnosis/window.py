@@ -186,6 +186,11 @@ class SlidingWindow:
 
     The same samples give the same hops, whatever blocks they come in. A gap costs the hop it falls into; earlier hops
     stay until the window's allowed span has passed.
+
+    Parameters
+    ----------
+    plan : Plan
+        Sizes.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -218,9 +223,18 @@ class SlidingWindow:
     def feed(self, samples: FloatArray, start_ns: int) -> Iterator[int]:
         """Add samples that continue the previous ones, stopping at every completed hop.
 
-        `samples` (n_samples, n_states [+ 1]): finite SI samples as `Plan.to_si` gives them. `start_ns`: time of the
-        first sample. Yields end time of a hop that became complete and is in the window now. A long block may complete
-        several: ask for the statistics between them, and take all, or the rest of the block is lost.
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_states [+ 1])
+            Finite SI samples as `Plan.to_si` gives them.
+        start_ns : int
+            Time of the first sample.
+
+        Yields
+        ------
+        int
+            End time of a hop that became complete and is in the window now. A long block may complete several: ask for
+            the statistics between them, and take all, or the rest of the block is lost.
         """
         self.give_up()
         # Anchored anew by every block: the device's clock is the time, however its rate deviates from nominal.
@@ -276,8 +290,14 @@ class SlidingWindow:
     def recall(self, samples: npt.NDArray[np.float32] | FloatArray, start_ns: int, *, newest: bool) -> None:
         """Take a block again that was in the window when `checkpoint` was called.
 
-        `samples` (n_samples, n_channels): as received, not yet in SI units. `start_ns`: time of the first sample.
-        `newest`: whether no later one has been there: everything may be complete now.
+        Parameters
+        ----------
+        samples : ndarray, shape (n_samples, n_channels)
+            As received, not yet in SI units.
+        start_ns : int
+            Time of the first sample.
+        newest : bool
+            Whether no later one has been there: everything may be complete now.
         """
         if self._recall is None:
             return
@@ -304,7 +324,10 @@ class SlidingWindow:
     def checkpoint(self, *, whole: bool = False) -> dict[str, np.ndarray]:
         """What a window goes on from, as named arrays, between two blocks.
 
-        `whole`: with moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
+        Parameters
+        ----------
+        whole : bool
+            With moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
         """
         if self._recall is not None:
             return dict(self._recall.arrays)
@@ -325,8 +348,16 @@ class SlidingWindow:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called; without moments the window `lacks` its samples until they are recalled.
 
-        Raises CheckpointError if an array is missing or of another form, a hop is missing, or it does not fit the plan;
-        nothing is changed then.
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+            What `checkpoint` gave.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form, a hop is missing, or it does not fit the plan; nothing is
+            changed then.
         """
         level = checked(arrays, "level", np.float64, (None,))
         if level.size not in (0, len(self.plan.states)):
@@ -370,7 +401,10 @@ class SlidingWindow:
     def statistics(self, hops: int | None = None) -> WindowStatistics | None:
         """Statistics of the window, or of its latest hops, or None while there are not so many.
 
-        `hops`: how many of the latest hops, with correlations at lag zero alone; all hops of a full window without it.
+        Parameters
+        ----------
+        hops : int, optional
+            How many of the latest hops, with correlations at lag zero alone; all hops of a full window without it.
         """
         count = self.plan.hops if hops is None else hops
         if not 0 < count <= len(self._hops):

@@ -20,8 +20,19 @@ def stationary_covariance(A: FloatArray, B: FloatArray) -> FloatArray:
     """Solve A R(0) + R(0) Aᵀ = -B Bᵀ for the covariance of a stable system under unit white noise.
 
     The states are balanced first: they differ by many orders of magnitude, and the solver's error is relative to the
-    largest. `A` (n, n): system matrix, all eigenvalues in the left half plane. `B` (n, p): input matrix of independent
-    white noise of unit intensity. Raises EstimationError if A is not stable: there is no stationary covariance.
+    largest.
+
+    Parameters
+    ----------
+    A : ndarray, shape (n, n)
+        System matrix, all eigenvalues in the left half plane.
+    B : ndarray, shape (n, p)
+        Input matrix of independent white noise of unit intensity.
+
+    Raises
+    ------
+    EstimationError
+        If A is not stable: there is no stationary covariance.
     """
     fastest = float(np.linalg.eigvals(A).real.max())
     if fastest >= 0:
@@ -85,8 +96,21 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
 
     Displacement, velocity and filter states differ by many orders of magnitude. They are scaled to unit standard
     deviation before the covariance is factored; without that the displacement-velocity pair comes out inconsistent and
-    damping is off by tens of percent. `A` (n, n): stable system matrix. `B` (n, p): input matrix of unit-intensity
-    white noise. `step_s`: sampling interval, s. In the original, unscaled states.
+    damping is off by tens of percent.
+
+    Parameters
+    ----------
+    A : ndarray, shape (n, n)
+        Stable system matrix.
+    B : ndarray, shape (n, p)
+        Input matrix of unit-intensity white noise.
+    step_s : float
+        Sampling interval, s.
+
+    Returns
+    -------
+    DiscreteSystem
+        In the original, unscaled states.
     """
     n = A.shape[0]
     deviation = np.sqrt(np.diag(stationary_covariance(A, B)))
@@ -110,8 +134,21 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
 
     Equals the recursion ``x = F @ x + G @ w`` row by row. The samples are cut into pieces that advance side by side
     from rest; the pieces' starting states follow and are carried through each piece, which costs √n array operations
-    instead of n. `system`: F and G. `state` (n,): state before the first step. `noise` (n_samples, n): standard normal
-    numbers, one row per step. Returns (n_samples, n): states after each step; the last row is where to go on from.
+    instead of n.
+
+    Parameters
+    ----------
+    system : DiscreteSystem
+        F and G.
+    state : ndarray, shape (n,)
+        State before the first step.
+    noise : ndarray, shape (n_samples, n)
+        Standard normal numbers, one row per step.
+
+    Returns
+    -------
+    ndarray, shape (n_samples, n)
+        States after each step; the last row is where to go on from.
     """
     n_samples, n = noise.shape
     length = max(1, int(np.sqrt(n_samples)))

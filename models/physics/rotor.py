@@ -92,8 +92,17 @@ QUANTITY: Mapping[str, str] = MappingProxyType({name: row.quantity for name, row
 def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> RotorParameters:
     """Return the rotor with some parameters changed by a relative amount.
 
-    `rotor`: parameters before the change. `relative_changes`: parameter (one of `PARAMETERS`) to relative change, above
-    -1; -0.2 is a loss of 20 %. Raises ValueError for an unknown parameter or a change of -100 % and more.
+    Parameters
+    ----------
+    rotor : RotorParameters
+        Parameters before the change.
+    relative_changes : mapping of str to float
+        Parameter (one of `PARAMETERS`) to relative change, above -1; -0.2 is a loss of 20 %.
+
+    Raises
+    ------
+    ValueError
+        For an unknown parameter or a change of -100 % and more.
 
     Examples
     --------
@@ -190,8 +199,12 @@ _LEAST = -1.0
 def impossible(change: float, quantity: str) -> str:
     """Why a relative change cannot be; empty if it can.
 
-    `change`: relative change of something that is positive by nature: a mass, a stiffness, a damping, a gain, a length.
-    `quantity`: what it is, in a word or two.
+    Parameters
+    ----------
+    change : float
+        Relative change of something that is positive by nature: a mass, a stiffness, a damping, a gain, a length.
+    quantity : str
+        What it is, in a word or two.
 
     Examples
     --------

@@ -38,7 +38,10 @@ class SampleBlock:
 class NewestBlocks:
     """The newest blocks without a gap, for whoever wants to see samples.
 
-    `n_samples`: as many blocks as hold at least so many samples.
+    Parameters
+    ----------
+    n_samples : int
+        As many blocks as hold at least so many samples.
     """
 
     def __init__(self, n_samples: int) -> None:
@@ -83,9 +86,23 @@ def settling_s(high_pass_hz: float) -> float:
 def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_hz: float) -> FloatArray:
     """Integrate samples once or twice.
 
-    The first and last `settling_s` of the result are not valid. `acceleration` (n,): Equally spaced, without a gap.
-    `rate_hz`: samples per second. `times`: 1 for velocity, 2 for displacement. `high_pass_hz`: corner of the high-pass;
-    valid from `lowest_valid_hz`. Returns (n,): in the unit of `acceleration` times s or s².
+    The first and last `settling_s` of the result are not valid.
+
+    Parameters
+    ----------
+    acceleration : ndarray, shape (n,)
+        Equally spaced, without a gap.
+    rate_hz : float
+        Samples per second.
+    times : int
+        1 for velocity, 2 for displacement.
+    high_pass_hz : float
+        Corner of the high-pass; valid from `lowest_valid_hz`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        In the unit of `acceleration` times s or s².
 
     Examples
     --------

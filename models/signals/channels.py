@@ -215,9 +215,18 @@ _DETECTED = re.compile(r"(?:[ _(-]|\b)(pp|p-p|pk-pk|pkpk|peak-peak|0-p|0-pk|pk|p
 def unit_factor(quantity: str, unit: str) -> float:
     """Factor that turns samples in `unit` into SI units of `quantity`.
 
-    `quantity`: a `Quantity`. `unit`: as a person or a measuring program writes it; both micro signs are understood.
-    Raises ValueError if it is not a unit of this quantity; the message says of which it is one, or that it describes a
-    detected value (peak to peak, rms) and not the samples of a waveform.
+    Parameters
+    ----------
+    quantity : str
+        A `Quantity`.
+    unit : str
+        As a person or a measuring program writes it; both micro signs are understood.
+
+    Raises
+    ------
+    ValueError
+        If it is not a unit of this quantity; the message says of which it is one, or that it describes a detected
+        value (peak to peak, rms) and not the samples of a waveform.
 
     Examples
     --------
@@ -253,7 +262,10 @@ def same_unit(quantity: str, one: str, other: str) -> bool:
 def time_unit_ns(unit: str) -> float:
     """Nanoseconds in a unit of time.
 
-    Raises ValueError if the unit is not known; the message names those that are.
+    Raises
+    ------
+    ValueError
+        If the unit is not known; the message names those that are.
     """
     spelled = _spelled(unit)
     if spelled not in _TIME_NS:

@@ -21,9 +21,15 @@ _WHOLE = 0.25
 class EdgeDetector:
     """Finds the pulses in a sampled tachometer signal, piece by piece.
 
-    `threshold`: level at which a pulse begins, in the signal's unit. `hysteresis`: how far the signal must fall below
-    the threshold (rise above it for falling edges) before the next pulse counts; 0 counts every crossing. `rising`:
-    whether pulses begin with a rising edge.
+    Parameters
+    ----------
+    threshold : float
+        Level at which a pulse begins, in the signal's unit.
+    hysteresis : float
+        How far the signal must fall below the threshold (rise above it for falling edges) before the next pulse
+        counts; 0 counts every crossing.
+    rising : bool
+        Whether pulses begin with a rising edge.
     """
 
     def __init__(self, threshold: float, hysteresis: float, *, rising: bool) -> None:
@@ -40,7 +46,15 @@ class EdgeDetector:
     def feed(self, time: FloatArray, signal: FloatArray) -> FloatArray:
         """Times of the pulses in the next piece, interpolated between samples.
 
-        `time` and `signal` (n,): ascending times, and the signal at them. Returns (n_pulses,): in the unit of `time`.
+        Parameters
+        ----------
+        time, signal : ndarray, shape (n,)
+            Ascending times, and the signal at them.
+
+        Returns
+        -------
+        ndarray, shape (n_pulses,)
+            In the unit of `time`.
         """
         if time.size == 0:
             return np.empty(0)
@@ -84,9 +98,17 @@ def pulse_train(times: FloatArray, pulses_per_turn: int = 1) -> PulseTrain:
     """Judge each interval between pulses by the median of the nine around it.
 
     An interval below half of it has a pulse too many. One within a quarter of 2, 3 or 4 times the median has that many
-    pulses missing. What is longer, or in between, is an interruption. `times` (n,): times of the pulses, ascending, at
-    least two. Raises ValueError if there are fewer than two pulses or their times do not ascend; the message names the
-    first that does not.
+    pulses missing. What is longer, or in between, is an interruption.
+
+    Parameters
+    ----------
+    times : ndarray, shape (n,)
+        Times of the pulses, ascending, at least two.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two pulses or their times do not ascend; the message names the first that does not.
     """
     if times.size < 2:
         raise ValueError(f"{times.size} pulses, expected at least two to tell the speed")
@@ -114,8 +136,19 @@ def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> 
     """Shaft angle in [0, 2π), 0 at the (first) pulse of each turn.
 
     Before the first pulse, after the last and around an interruption the angle is carried on at the neighbouring
-    interval's speed for one interval at most. `at` (n,): in the unit of the train's times. `reverse`: whether the shaft
-    turns from z to y, so that the angle falls. Returns (n,): rad; nan where the angle is unknown.
+    interval's speed for one interval at most.
+
+    Parameters
+    ----------
+    at : ndarray, shape (n,)
+        In the unit of the train's times.
+    reverse : bool
+        Whether the shaft turns from z to y, so that the angle falls.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        rad; nan where the angle is unknown.
     """
     times, counts = train.times, train.counts
     speed = np.where(train.known, np.diff(counts) / np.diff(times), np.nan)  # pulses per unit of time

@@ -167,7 +167,10 @@ class Grant(BaseModel):
 def access_control(grants: Sequence[Grant], known_by: Literal["usernames", "cert_common_names"]) -> dict[str, object]:
     """Zenoh's ``access_control`` for these grants: what none of them allows is dropped.
 
-    `known_by`: what the names in `Grant.who` are.
+    Parameters
+    ----------
+    known_by : {"usernames", "cert_common_names"}
+        What the names in `Grant.who` are.
     """
     rules: list[dict[str, object]] = []
     allowed: dict[str, list[str]] = {}

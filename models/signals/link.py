@@ -83,7 +83,10 @@ def endpoint_fault(text: str) -> str | None:
 def read_password(field: str, path: Path) -> str:
     """The password that is alone in a file.
 
-    Raises MachineFileError if the file cannot be read, others may read it, or it is not one line.
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be read, others may read it, or it is not one line.
     """
     lines = _secret(field, path).splitlines()
     if len(lines) != 1 or not lines[0].strip():
@@ -94,7 +97,10 @@ def read_password(field: str, path: Path) -> str:
 def read_user_names(field: str, path: Path) -> frozenset[str]:
     """Names of the users in a file with a line ``name:password`` for each.
 
-    Raises MachineFileError if the file cannot be read, others may read it, or a line is none of these.
+    Raises
+    ------
+    MachineFileError
+        If the file cannot be read, others may read it, or a line is none of these.
     """
     names: list[str] = []
     for number, line in enumerate(_secret(field, path).splitlines(), start=1):
@@ -116,7 +122,10 @@ def read_user_names(field: str, path: Path) -> frozenset[str]:
 def check_certificate(field: str, path: Path) -> None:
     """Check that a file has a certificate.
 
-    Raises MachineFileError if it cannot be read, or is not PEM.
+    Raises
+    ------
+    MachineFileError
+        If it cannot be read, or is not PEM.
     """
     if "-----BEGIN CERTIFICATE-----" not in _text(field, path):
         raise MachineFileError(f"link.{field}: {path}: expected a certificate in PEM (-----BEGIN CERTIFICATE-----)")
@@ -125,7 +134,10 @@ def check_certificate(field: str, path: Path) -> None:
 def check_key(field: str, path: Path) -> None:
     """Check that a file has a private key that others may not read.
 
-    Raises MachineFileError if it cannot be read, others may read it, it is not PEM, or needs a passphrase.
+    Raises
+    ------
+    MachineFileError
+        If it cannot be read, others may read it, it is not PEM, or needs a passphrase.
     """
     text = _secret(field, path)
     if "ENCRYPTED" in text:
@@ -261,8 +273,15 @@ class LinkSettings(BaseModel):
     def check_reach(self, place: str) -> None:
         """Check that others than programs on this computer have grants, or may do everything in so many words.
 
-        `place`: settings file or command line, for the message. Raises MachineFileError, naming the endpoints that they
-        reach.
+        Parameters
+        ----------
+        place : str
+            Settings file or command line, for the message.
+
+        Raises
+        ------
+        MachineFileError
+            Naming the endpoints that they reach.
         """
         far = [end for end in self.listen if endpoint_fault(end) is None and not is_local(end)]
         if far and not self.grants and not self.without_grants:
@@ -285,8 +304,12 @@ class LinkSettings(BaseModel):
     def zenoh_items(self) -> dict[str, str]:
         """Configuration paths and their JSON5 values, to be inserted one by one into a Zenoh configuration.
 
-        The password is among them: they go to Zenoh and nowhere else, not into a message and not into a log. Raises
-        MachineFileError if a password, certificate or key cannot be used, or the settings contradict each other.
+        The password is among them: they go to Zenoh and nowhere else, not into a message and not into a log.
+
+        Raises
+        ------
+        MachineFileError
+            If a password, certificate or key cannot be used, or the settings contradict each other.
         """
         for fault in self._faults():  # again: endpoints of a command line are put over settings that were checked
             raise MachineFileError(f"link: {fault}")
@@ -309,6 +332,11 @@ class LinkSettings(BaseModel):
         """Why a session could not be opened, in plain words.
 
         Zenoh does not tell a program why it was turned away; what may be the reason with these settings is listed.
+
+        Parameters
+        ----------
+        error : str
+            Zenoh's own text.
         """
         if "Address already in use" in error:
             return "address already in use: does another program listen there?"
@@ -435,8 +463,11 @@ class _LinkFile(BaseModel):
 def load_link(path: Path) -> LinkSettings:
     """Load a link file; files named in it are taken from its folder.
 
-    Raises MachineFileError, naming the file, the field and what was expected. Passwords, certificates and keys are read
-    and checked when a session is opened.
+    Raises
+    ------
+    MachineFileError
+        Naming the file, the field and what was expected. Passwords, certificates and keys are read and checked when a
+        session is opened.
     """
     link = checked(_LinkFile, read_toml(path), path).link
     if not link.listen and not link.connect:

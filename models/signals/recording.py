@@ -72,9 +72,20 @@ class RecordingSummary:
 class RecordingWriter:
     """Writes a recording; a context manager.
 
-    Leaving the context without an exception gives the file its name. With an exception the file is completed but stays
-    ``NAME.part``. `path`: final name. `overwrite`: replace a recording that is already there, or a ``.part`` that a
-    crash left. Raises RecordingError if one of them exists, or cannot be written; the message names it.
+    Leaving the context without an exception gives the file its name. With an exception the file is completed but
+    stays ``NAME.part``.
+
+    Parameters
+    ----------
+    path : Path
+        Final name.
+    overwrite : bool
+        Replace a recording that is already there, or a ``.part`` that a crash left.
+
+    Raises
+    ------
+    RecordingError
+        If one of them exists, or cannot be written; the message names it.
     """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
@@ -122,7 +133,10 @@ class RecordingWriter:
     def write(self, message: RecordedMessage) -> None:
         """Append a message.
 
-        Raises RecordingError if the file cannot be written.
+        Raises
+        ------
+        RecordingError
+            If the file cannot be written.
         """
         framing = _PREFIXED if message.attachment else _PLAIN
         data = message.payload
@@ -140,7 +154,10 @@ class RecordingWriter:
     def flush(self) -> None:
         """Complete the chunk in progress and hand it to the operating system.
 
-        Raises RecordingError if the file cannot be written.
+        Raises
+        ------
+        RecordingError
+            If the file cannot be written.
         """
         with writing(self.part):
             self._writer.flush()  # type: ignore[no-untyped-call]  # the library's stub
@@ -149,7 +166,10 @@ class RecordingWriter:
     def sync(self) -> None:
         """`flush`, and wait until the file is on the disk.
 
-        Raises RecordingError if the file cannot be written.
+        Raises
+        ------
+        RecordingError
+            If the file cannot be written.
         """
         self.flush()
         with writing(self.part):
@@ -158,7 +178,10 @@ class RecordingWriter:
     def close(self) -> None:
         """Complete the file, wait until it is on the disk, and give it its name.
 
-        Raises RecordingError if the file cannot be completed or renamed, or something has taken its name meanwhile.
+        Raises
+        ------
+        RecordingError
+            If the file cannot be completed or renamed, or something has taken its name meanwhile.
         """
         if self._file.closed:
             return
@@ -219,8 +242,17 @@ def read_recording(
 ) -> Iterator[RecordedMessage]:
     """Read messages in the order in which they were written.
 
-    `keys`: only these keys. `from_ns` and `to_ns`: only log times from `from_ns` up to, and without, `to_ns`. Raises
-    RecordingError if the file is missing, not a recording, incomplete or damaged; raised where the damage is met.
+    Parameters
+    ----------
+    keys : collection of str, optional
+        Only these keys.
+    from_ns, to_ns : int, optional
+        Only log times from `from_ns` up to, and without, `to_ns`.
+
+    Raises
+    ------
+    RecordingError
+        If the file is missing, not a recording, incomplete or damaged; raised where the damage is met.
     """
     # Chunk by chunk, in the order of the file: the library's own iteration collects every message of the file before it
     # gives the first when it is not asked for the order of time.
@@ -246,7 +278,10 @@ def read_recording(
 def summarize_recording(path: Path) -> RecordingSummary:
     """Read from its index what a recording holds.
 
-    Raises RecordingError if the file is missing, not a recording, incomplete or damaged.
+    Raises
+    ------
+    RecordingError
+        If the file is missing, not a recording, incomplete or damaged.
     """
     with reading(path), path.open("rb") as file:
         summary = make_reader(file, validate_crcs=True).get_summary()
@@ -262,7 +297,10 @@ def summarize_recording(path: Path) -> RecordingSummary:
 def unpacked(channel: Channel, message: Message) -> RecordedMessage:
     """Take a message out of the form in which the file keeps it.
 
-    Raises ValueError if it is not in that form.
+    Raises
+    ------
+    ValueError
+        If it is not in that form.
     """
     framing = channel.metadata.get("framing", _PLAIN)
     encoding = channel.metadata.get("encoding", "")

@@ -43,10 +43,24 @@ class Salvage:
 def salvage_recording(damaged: Path, target: Path) -> Salvage:
     """Copy what can be read of an interrupted or damaged recording into a complete one.
 
-    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost. `damaged`:
-    usually the ``.part`` file of a program that was killed; it stays as it is. `target`: must not exist; may be the
-    name that `damaged` was to get. Returns what was recovered and what was not. Raises RecordingError if `damaged` is
-    missing or nothing of it can be read, or `target` exists or cannot be written.
+    A chunk that cannot be read is passed over; what comes after the place where the file is cut off is lost.
+
+    Parameters
+    ----------
+    damaged : Path
+        Usually the ``.part`` file of a program that was killed; it stays as it is.
+    target : Path
+        Must not exist; may be the name that `damaged` was to get.
+
+    Returns
+    -------
+    Salvage
+        What was recovered and what was not.
+
+    Raises
+    ------
+    RecordingError
+        If `damaged` is missing or nothing of it can be read, or `target` exists or cannot be written.
     """
     salvage = _nothing_yet(damaged)
     messages = _salvaged(damaged, salvage)
@@ -74,7 +88,10 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
 def inspect_recording(path: Path) -> Salvage:
     """Read a recording from end to end and say what can be read of it.
 
-    Raises RecordingError if it cannot be opened.
+    Raises
+    ------
+    RecordingError
+        If it cannot be opened.
     """
     salvage = _nothing_yet(path)
     for _ in _salvaged(path, salvage):
@@ -85,7 +102,10 @@ def inspect_recording(path: Path) -> Salvage:
 def salvaged_messages(path: Path) -> Iterator[RecordedMessage]:
     """Messages that can be read of a recording, cut off or not, in the order in which they were written.
 
-    Raises RecordingError if it cannot be opened.
+    Raises
+    ------
+    RecordingError
+        If it cannot be opened.
     """
     return _salvaged(path, _nothing_yet(path))
 

@@ -31,7 +31,11 @@ _COLUMN = "expected a single column 'samples' of fixed-size lists of float32 or 
 def write_arrow(samples: npt.NDArray[Any], metadata: dict[str, str]) -> bytes:
     """Write samples as one fixed-size-list column.
 
-    `samples` (n_samples, n_channels).
+    Parameters
+    ----------
+    samples : ndarray, shape (n_samples, n_channels)
+    metadata : dict of str to str
+        Metadata of the schema.
     """
     import pyarrow as pa  # noqa: PLC0415  # 50 ms that only users of Arrow should pay
 
@@ -48,8 +52,17 @@ def write_arrow(samples: npt.NDArray[Any], metadata: dict[str, str]) -> bytes:
 def read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
     """Read what `write_arrow` writes, from any Arrow library.
 
-    Returns `samples` (n_samples, n_channels): a read-only view of `stream`; `metadata`. Raises WireError if it is
-    anything else; nothing larger than the stream is allocated to find out.
+    Returns
+    -------
+    samples : ndarray, shape (n_samples, n_channels)
+        A read-only view of `stream`.
+    metadata : dict of str to bytes
+        Metadata of the schema.
+
+    Raises
+    ------
+    WireError
+        If it is anything else; nothing larger than the stream is allocated to find out.
     """
     try:
         kind, schema, _, after = _message(stream, 0)
@@ -175,8 +188,14 @@ _ARROW_FIELDS = ("start_ns", "sequence", "rate_hz", "run")
 def encode_block(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, str]:
     """Encode a block as raw little-endian samples.
 
-    Returns `payload`: samples, C order, shape (n_samples, n_channels); `attachment`: 32-byte header; `encoding`:
-    ``application/x-rotorwatch-block;<schema hash>``.
+    Returns
+    -------
+    payload : bytes
+        Samples, C order, shape (n_samples, n_channels).
+    attachment : bytes
+        32-byte header.
+    encoding : str
+        ``application/x-rotorwatch-block;<schema hash>``.
     """
     n_samples, n_channels = block.samples.shape
     code = _DTYPE_CODES[block.samples.dtype.str[1:]]
@@ -188,7 +207,10 @@ def encode_block(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, st
 def encode_arrow(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, str]:
     """Encode a block as a self-contained Arrow IPC stream: one fixed-size-list column, header fields as metadata.
 
-    As `encode_block`; the attachment is empty.
+    Returns
+    -------
+    payload, attachment, encoding
+        As `encode_block`; the attachment is empty.
     """
     metadata = {name: repr(getattr(block, name)) for name in _ARROW_FIELDS}
     return write_arrow(block.samples, metadata), b"", f"{ARROW_ENCODING};{schema_hash}"
@@ -197,9 +219,17 @@ def encode_arrow(block: SampleBlock, schema_hash: str) -> tuple[bytes, bytes, st
 def decode_block(payload: bytes, attachment: bytes, encoding: str) -> tuple[SampleBlock, str]:
     """Decode a block in either encoding.
 
-    Returns `block`: its samples are a read-only view of `payload` in the raw encoding; `schema_hash`: schema hash named
-    by the encoding, empty if none was named. Raises WireError if the bytes do not make a block; the message names the
-    field.
+    Returns
+    -------
+    block : SampleBlock
+        Its samples are a read-only view of `payload` in the raw encoding.
+    schema_hash : str
+        Schema hash named by the encoding, empty if none was named.
+
+    Raises
+    ------
+    WireError
+        If the bytes do not make a block; the message names the field.
     """
     kind, _, schema_hash = encoding.partition(";")
     schema_hash = schema_hash[:_LONGEST_TEXT]
@@ -219,7 +249,11 @@ def sender_of(attachment: bytes, encoding: str) -> tuple[str, int | None]:
 def may_be_block(payload: bytes, attachment: bytes, encoding: str, n_channels: int, most_samples: int) -> bool:
     """Whether a message may be a block of a machine, as far as its size and header say; costs a microsecond.
 
-    `n_channels` and `most_samples`: of the machine's blocks.
+    Parameters
+    ----------
+    payload, attachment, encoding : bytes, bytes, str
+    n_channels, most_samples : int
+        Of the machine's blocks.
     """
     most = n_channels * most_samples * 8
     kind = encoding.partition(";")[0]

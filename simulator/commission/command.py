@@ -36,7 +36,10 @@ _WIDE = 100
 def print_report(report: CommissioningReport, console: Console | None = None) -> None:
     """Print verdict, checks and parameters.
 
-    `console`: the terminal without it. 80 columns suffice.
+    Parameters
+    ----------
+    console : rich.console.Console, optional
+        The terminal without it. 80 columns suffice.
     """
     console = Console(highlight=False) if console is None else console
     verdict = Text(headline(report))
@@ -112,11 +115,34 @@ def commission_machine(
 ) -> bool:
     """Commission a machine and write its bundle.
 
-    `healthy`: recordings. `out`: directory of the bundle. `first_s`: use only the first seconds of every recording.
-    `wished`: relative change that shall be found. `why`: why the machine is commissioned again; needed where `out`
-    holds a commissioning already. `networks`: whether to train networks, too, where the parameters are known.
-    `n_windows`, `n_draws`, `seed`, `processes`: for training. Returns whether the machine was commissioned; if not, the
-    report says why. Raises RotorwatchError if machine file, recordings or directory cannot be used.
+    Parameters
+    ----------
+    name : str
+        Machine file.
+    healthy : sequence of Path
+        Recordings.
+    out : Path
+        Directory of the bundle.
+    first_s : float, optional
+        Use only the first seconds of every recording.
+    wished : float, optional
+        Relative change that shall be found.
+    why : str
+        Why the machine is commissioned again; needed where `out` holds a commissioning already.
+    networks : bool
+        Whether to train networks, too, where the parameters are known.
+    n_windows, n_draws, seed, processes
+        For training.
+
+    Returns
+    -------
+    bool
+        Whether the machine was commissioned; if not, the report says why.
+
+    Raises
+    ------
+    RotorwatchError
+        If machine file, recordings or directory cannot be used.
     """
     machine = load_machine_file(name)
     _check_names(healthy)

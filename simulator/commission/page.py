@@ -56,7 +56,12 @@ def pictures_of(
 ) -> tuple[Picture, ...]:
     """Draw all that there is something to draw of.
 
-    `names`: of the recordings, in the order in which they are numbered. `portraits`: of those that hold usable data.
+    Parameters
+    ----------
+    names : sequence of str
+        Of the recordings, in the order in which they are numbered.
+    portraits : sequence of Portrait
+        Of those that hold usable data.
     """
     drawn: list[tuple[str, str, Callable[[], Figure | None], str]] = [
         (
@@ -154,10 +159,26 @@ def write_report(
 ) -> Path:
     """Write ``report.html`` and ``report.json``.
 
-    `directory`: made if it is not there. `recordings`: what it was made from: for the pictures and the table of
-    recordings. `machine`: for its description. `commissioned`: what was stored: for what it replaces and why, and the
-    hash of each file. Returns the page. The same arguments give the same page, to the last byte. Raises RecordingError
-    if they cannot be written.
+    Parameters
+    ----------
+    directory : Path
+        Made if it is not there.
+    recordings : sequence of HealthyRecording
+        What it was made from: for the pictures and the table of recordings.
+    machine : MachineFile, optional
+        For its description.
+    commissioned : Commissioned, optional
+        What was stored: for what it replaces and why, and the hash of each file.
+
+    Returns
+    -------
+    Path
+        The page. The same arguments give the same page, to the last byte.
+
+    Raises
+    ------
+    RecordingError
+        If they cannot be written.
     """
     text = _render(report, recordings, "" if machine is None else machine.description, commissioned)
     page = directory / HTML

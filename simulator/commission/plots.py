@@ -61,8 +61,18 @@ _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 def inline_svg(name: str, label: str, paint: Callable[[], Figure | None]) -> Markup | None:
     """Draw a picture in the house style, as an element of an HTML page.
 
-    `name`: unique on the page: every identifier in the picture begins with it. `label`: what it shows, for those who
-    cannot see it. `paint`: makes the figure, of width `WIDTH_IN`, or None if there is nothing to draw.
+    Parameters
+    ----------
+    name : str
+        Unique on the page: every identifier in the picture begins with it.
+    label : str
+        What it shows, for those who cannot see it.
+    paint : callable
+        Makes the figure, of width `WIDTH_IN`, or None if there is nothing to draw.
+
+    Returns
+    -------
+    Markup or None
     """
     written = StringIO()
     with style.context(["default", _STYLE]):
@@ -94,7 +104,10 @@ _MOST_LABELS = 24
 def draw_readings(report: CommissioningReport, recordings: Sequence[str]) -> Figure | None:
     """Each parameter's healthy readings with 95 % intervals against zero, by recording; None without readings.
 
-    `recordings`: names, in the order in which they are numbered.
+    Parameters
+    ----------
+    recordings : sequence of str
+        Names, in the order in which they are numbered.
     """
     read = [one for one in report.parameters if one.readings]
     if not read:

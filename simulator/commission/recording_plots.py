@@ -49,7 +49,10 @@ class Portrait:
 def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
     """Statistics of a whole recording; None if it holds no usable data.
 
-    `number`: its number on the page.
+    Parameters
+    ----------
+    number : int
+        Its number on the page.
     """
     hops = recording.hops
     if not hops:
@@ -85,7 +88,10 @@ def _rank(state: str) -> tuple[int, int, int]:
 def draw_spectra(portraits: Sequence[Portrait]) -> Figure:
     """Spectra of every channel, all recordings in each.
 
-    `portraits`: at least one.
+    Parameters
+    ----------
+    portraits : sequence of Portrait
+        At least one.
     """
     states = ordered(portraits[0].statistics.states)
     columns = min(2, len(states))
@@ -162,7 +168,10 @@ def _mark_rotation(axes: Axes, portraits: Sequence[Portrait], highest_hz: float)
 def draw_levels(portraits: Sequence[Portrait]) -> Figure:
     """Speed and level of random vibration hop by hop, the recordings one after the other.
 
-    `portraits`: at least one.
+    Parameters
+    ----------
+    portraits : sequence of Portrait
+        At least one.
     """
     speeds_known = any(np.isfinite(one.statistics.hop_speed_rad_s).any() for one in portraits)
     heights = [1.0, 1.8] if speeds_known else [1.8]

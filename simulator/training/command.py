@@ -35,7 +35,10 @@ _CALIBRATION_STREAM = 20
 def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
     """Train the networks of a machine file or a shipped machine, see `train_for`.
 
-    Raises RotorwatchError if the machine file or the bundle directory is not usable.
+    Raises
+    ------
+    RotorwatchError
+        If the machine file or the bundle directory is not usable.
     """
     train_for(load_machine(name), out, n_windows, n_draws, seed, processes)
 
@@ -43,9 +46,19 @@ def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, 
 def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
     """Train every equation's relation network and amortised network for the machine and write the bundle.
 
-    `out`: directory of the bundle. `n_windows`: simulated training windows per relation network; half as many for
-    calibration. `n_draws`: random machines and conditions for the amortised networks. Raises RotorwatchError if the
-    bundle directory is not usable.
+    Parameters
+    ----------
+    out : Path
+        Directory of the bundle.
+    n_windows : int
+        Simulated training windows per relation network; half as many for calibration.
+    n_draws : int
+        Random machines and conditions for the amortised networks.
+
+    Raises
+    ------
+    RotorwatchError
+        If the bundle directory is not usable.
     """
     networks: list[EquationNetwork] = []
     with bars(remaining=True) as bar:

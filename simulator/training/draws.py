@@ -291,8 +291,14 @@ def windows(
 ) -> Iterator[WindowStatistics]:
     """Simulate windows over worker processes, in order.
 
-    `numbers`: which windows of the series. `processes`: 1 stays in this process. `progress`: called with 1 for each
-    finished window.
+    Parameters
+    ----------
+    numbers : sequence of int
+        Which windows of the series.
+    processes : int
+        1 stays in this process.
+    progress : callable
+        Called with 1 for each finished window.
     """
     make = partial(simulate_window, draw)
     if processes == 1:

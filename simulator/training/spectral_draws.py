@@ -98,8 +98,13 @@ class SpectralDraws:
     ) -> Iterator[npt.NDArray[np.complex64]]:
         """Realisations of the averaged cross-spectra, each of the shape of `expected`.
 
-        `expected` (n_windows, n_bins, n, n): expected cross-spectra of any linear combinations of the measured states.
-        `speed_rad_s` (n_windows,). `count`: how many.
+        Parameters
+        ----------
+        expected : ndarray of complex, shape (n_windows, n_bins, n, n)
+            Expected cross-spectra of any linear combinations of the measured states.
+        speed_rad_s : ndarray, shape (n_windows,)
+        count : int
+            How many.
         """
         n_windows, n_bins, n, _ = expected.shape
         # What the regression on the shaft angle takes out of the bins around the rotation: one coefficient's worth.

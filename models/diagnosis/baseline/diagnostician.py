@@ -50,8 +50,19 @@ def gain_suspicion(
 ) -> GainSuspicion | None:
     """Find the row whose changes look most like a gain error of a place with a single sensor.
 
-    `diagnosis`: readings with their covariance. `relations`: what was learned of each. None where single parameters
-    explain the window, or a common factor does not.
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        Readings with their covariance.
+    rows : sequence of Row
+        Learned rows.
+    relations : sequence of Relation or None
+        What was learned of each.
+
+    Returns
+    -------
+    GainSuspicion or None
+        None where single parameters explain the window, or a common factor does not.
     """
     tested = [
         (row, single)
@@ -129,6 +140,11 @@ class BaselineDiagnostician:
 
     Changes of stiffness are relative to the stiffness to ground that holds the bearing, changes of damping and
     unbalance relative to the healthy ones.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        The table it was learned by.
     """
 
     def __init__(self, baseline: Baseline, rows: Sequence[Row] = ROWS) -> None:
@@ -241,7 +257,10 @@ class BaselineDiagnostician:
     def _unbalance(self, changes: list[RowChange | None], bearing: _Bearing, window: WindowStatistics) -> _Unbalance:
         """Read the unbalance.
 
-        Raises EstimationError with the reason why it cannot be read.
+        Raises
+        ------
+        EstimationError
+            With the reason why it cannot be read.
         """
         rows = [
             self._forces[row.name]

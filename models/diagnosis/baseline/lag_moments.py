@@ -56,8 +56,14 @@ def shape_for(deepest: int, band_to_hz: float) -> Shape:
 
     One derivative is borne by a narrow kernel. Every further one lifts the sensors' noise by another power of the
     frequency: kernels are then so wide that they pass nothing beyond the band of the spectra, or the spectra would not
-    know what the moments scatter by. `deepest`: most derivatives on a kernel (`Formation.deepest`), at most 4.
-    `band_to_hz`: highest frequency of the window's spectra.
+    know what the moments scatter by.
+
+    Parameters
+    ----------
+    deepest : int
+        Most derivatives on a kernel (`Formation.deepest`), at most 4.
+    band_to_hz : float
+        Highest frequency of the window's spectra.
     """
     if deepest <= 1:
         return Shape(4, 0.010, 0.005)
@@ -82,8 +88,14 @@ class Kernels:
 def kernels(lags_s: FloatArray, lag_from_s: float, shape: Shape, deepest: int) -> Kernels:
     """Kernels beyond a shortest lag.
 
-    `lags_s` (n_lags,): Equally spaced. `lag_from_s`: where the first kernel begins. `deepest`: most derivatives that
-    are asked for, at most 4.
+    Parameters
+    ----------
+    lags_s : ndarray, shape (n_lags,)
+        Equally spaced.
+    lag_from_s : float
+        Where the first kernel begins.
+    deepest : int
+        Most derivatives that are asked for, at most 4.
     """
     return _kernels(lags_s.tobytes(), lag_from_s, shape, deepest)
 
@@ -119,8 +131,12 @@ def gain(frequencies_hz: FloatArray, shape: Shape) -> FloatArray:
 def passband_hz(deepest: int, band_to_hz: float) -> float:
     """Frequency, Hz, up to which the kernels let through at least a tenth: the end of the differentiator's valid band.
 
-    `deepest`: most derivatives on a kernel (`Formation.deepest`). `band_to_hz`: highest frequency of the window's
-    spectra.
+    Parameters
+    ----------
+    deepest : int
+        Most derivatives on a kernel (`Formation.deepest`).
+    band_to_hz : float
+        Highest frequency of the window's spectra.
     """
     f = np.linspace(0.0, 2000.0, 8001)
     through = gain(f, shape_for(deepest, band_to_hz))
@@ -231,8 +247,14 @@ class RowWindow:
 def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], references: tuple[str, ...]) -> RowWindow:
     """Prepare a row in a window.
 
-    `window`: with correlations at lags up to 0.1 s or more. `states`: measured states that the row may be formed from.
-    `references`: measured states that may serve as references.
+    Parameters
+    ----------
+    window : WindowStatistics
+        With correlations at lags up to 0.1 s or more.
+    states : tuple of str
+        Measured states that the row may be formed from.
+    references : tuple of str
+        Measured states that may serve as references.
     """
     formation = formation_of([term.motions for term in row.terms], states)
     index = {name: position for position, name in enumerate(window.states)}

@@ -63,9 +63,19 @@ class LeftOut:
 def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashable]) -> tuple[LeftOut, ...]:
     """Read every healthy window against the relation learned without its condition.
 
-    Where there is one condition, windows are left out one by one, or in up to six runs of neighbours. `parts`: one of
-    each healthy window. `conditions`: what each belongs to. Without those for which too few others are left or do not
-    determine the relation.
+    Where there is one condition, windows are left out one by one, or in up to six runs of neighbours.
+
+    Parameters
+    ----------
+    parts : sequence of LagMoments
+        One of each healthy window.
+    conditions : sequence
+        What each belongs to.
+
+    Returns
+    -------
+    tuple of LeftOut
+        Without those for which too few others are left or do not determine the relation.
     """
     groups = list(dict.fromkeys(conditions))
     if len(groups) > 1:
@@ -165,10 +175,20 @@ def learn_baseline(
 ) -> Baseline:
     """Learn a baseline from healthy windows.
 
-    `windows`: they must not overlap; a long recording is best cut into windows of about a minute. Each window weighs by
-    its own spectra, so that they may differ in speed, load, and level, colour and layout of the excitation.
-    `conditions`: what each window belongs to, for example the recording it was cut from; one condition without it.
-    Raises EstimationError if there is nothing to learn from, or if no row has a relation.
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        They must not overlap; a long recording is best cut into windows of about a minute. Each window weighs by its
+        own spectra, so that they may differ in speed, load, and level, colour and layout of the excitation.
+    conditions : sequence, optional
+        What each window belongs to, for example the recording it was cut from; one condition without it.
+    rows : sequence of Row
+        Table of rows.
+
+    Raises
+    ------
+    EstimationError
+        If there is nothing to learn from, or if no row has a relation.
     """
     if not windows:
         raise EstimationError("no healthy window to learn from")
@@ -303,9 +323,18 @@ def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, .
     """Say of every learned row why the healthy windows do not determine it; empty where they do.
 
     One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
-    damping or inertia is not physical, and no interval around it is honest. Returns a sentence with what to record
-    instead for each row, in the order of the learned rows; empty if there is no doubt, or if there is no relation
-    (``baseline.reasons`` says why).
+    damping or inertia is not physical, and no interval around it is honest.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+        The table it was learned by.
+
+    Returns
+    -------
+    tuple of str
+        A sentence with what to record instead for each row, in the order of the learned rows; empty if there is no
+        doubt, or if there is no relation (``baseline.reasons`` says why).
     """
     found = []
     for row, relation in zip(learned_rows(rows), baseline.relations, strict=True):
@@ -336,8 +365,13 @@ def disagreements(baseline: Baseline) -> tuple[str, ...]:
     """Sentences on conditions in which a parameter reads otherwise than in all others.
 
     Readings of one condition share the error of the relation: their mean is compared with a standard error that does
-    not fall with their number. Empty if one relation holds for all conditions. Otherwise keep a baseline for each, or
-    widen (which later windows do by `Relation.allowance` in any case).
+    not fall with their number.
+
+    Returns
+    -------
+    tuple of str
+        Empty if one relation holds for all conditions. Otherwise keep a baseline for each, or widen (which later
+        windows do by `Relation.allowance` in any case).
     """
     found = []
     for condition in dict.fromkeys(one.condition for one in baseline.consistency):

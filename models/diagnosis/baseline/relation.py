@@ -42,7 +42,14 @@ _STEPS = 2.0 * 1.4 ** np.arange(10)
 def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covariance: FloatArray) -> FloatArray:
     """Matrix A that stretches errors e with the given covariance to A e, whose covariance is what the criterion says.
 
-    `criterion`: χ² at an estimate. `b` (n,): estimate. `covariance` (n, n): its own.
+    Parameters
+    ----------
+    criterion : callable
+        χ² at an estimate.
+    b : ndarray, shape (n,)
+        Estimate.
+    covariance : ndarray, shape (n, n)
+        Its own.
     """
     spread = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(spread, spread))
@@ -61,8 +68,14 @@ def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covarian
 def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatArray) -> float:
     """Left-over moments of healthy windows, weighted as at these coefficients, less what scatter explains.
 
-    `parts`: one of each healthy window. `prior` (n, n): precision of what was expected of the coefficients. `b` (n,):
-    coefficients.
+    Parameters
+    ----------
+    parts : sequence of LagMoments
+        One of each healthy window.
+    prior : ndarray, shape (n, n)
+        Precision of what was expected of the coefficients.
+    b : ndarray, shape (n,)
+        Coefficients.
     """
     combination = np.concatenate([[1.0], -b])
     total = float(b @ prior @ b)
@@ -245,7 +258,10 @@ def lags_of(row: Row, windows: Sequence[RowWindow]) -> list[float]:
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
     """Fit a row without its optional terms and with them.
 
-    `parts`: one of each healthy window.
+    Parameters
+    ----------
+    parts : sequence of LagMoments
+        One of each healthy window.
     """
     start = _start(row, parts)
     full = _fit(parts, start, _prior(row, start, minimal=False))
@@ -255,9 +271,17 @@ def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
 def learn_row(row: Row, parts: Sequence[LagMoments], *, widened: bool = True) -> tuple[Relation, list[Contribution]]:
     """Learn the relation of a row.
 
-    `parts`: one of each healthy window; windows do not overlap, each is in one condition, they may differ from each
-    other. `widened`: whether the covariance is widened to what the windows object to (`flatness`), which takes most of
-    the time. Raises EstimationError if the windows do not determine the row's own parameters.
+    Parameters
+    ----------
+    parts : sequence of LagMoments
+        One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
+    widened : bool
+        Whether the covariance is widened to what the windows object to (`flatness`), which takes most of the time.
+
+    Raises
+    ------
+    EstimationError
+        If the windows do not determine the row's own parameters.
     """
     # Without the optional terms where that fits; their uncertainty counts in either case. With one source, y2 - y1 and
     # the disc's acceleration can take each other's place, and the estimate wanders along that direction further than
@@ -334,7 +358,12 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
     """Read the change of a row's own parameters in one window.
 
     Moments are weighted by all that is uncertain, the relation included: where the healthy recording did not determine
-    the relation, a window is not asked. Raises EstimationError if the window does not determine them.
+    the relation, a window is not asked.
+
+    Raises
+    ------
+    EstimationError
+        If the window does not determine them.
     """
     first = change_of(row, relation, window.beyond(LAG_FROM_S))
     return change_of(row, relation, window.beyond(lag_beyond_memory(window, first.combination)))
@@ -343,7 +372,10 @@ def read_row(row: Row, relation: Relation, window: RowWindow) -> RowChange:
 def change_of(row: Row, relation: Relation, moments: LagMoments) -> RowChange:
     """Read the change from given moments.
 
-    Raises EstimationError if they do not determine it.
+    Raises
+    ------
+    EstimationError
+        If they do not determine it.
     """
     combination = relation.combination
     X = moments.values[:, 1:]

@@ -99,8 +99,14 @@ def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Fo
     """Choose how to form the terms of a row.
 
     The row is differentiated as rarely as possible. Then every motion is taken from the highest measured derivative
-    that does not exceed it: what needs not be differentiated is not made noisier. `terms`: motions of each term; every
-    one's coordinate is measured (see `not_measured`). `states`: what is measured.
+    that does not exceed it: what needs not be differentiated is not made noisier.
+
+    Parameters
+    ----------
+    terms : sequence of sequences of Motion
+        Motions of each term; every one's coordinate is measured (see `not_measured`).
+    states : sequence of str
+        What is measured.
     """
     motions = [motion for term in terms for motion in term]
     raised = max(max(0, _measured(motion.coordinate, states)[0] - motion.order) for motion in motions)
@@ -233,8 +239,17 @@ def evaluable_rows(
 ) -> list[tuple[Row, str]]:
     """Say of every row whether it can be evaluated with these sensors.
 
-    `states`: measured state variables and accelerations. `has_phase_reference`: or a speed that the vibration's own
-    line is looked for at. Returns each row with the reason why it cannot be evaluated; empty if it can.
+    Parameters
+    ----------
+    states : sequence of str
+        Measured state variables and accelerations.
+    has_phase_reference : bool
+        Or a speed that the vibration's own line is looked for at.
+
+    Returns
+    -------
+    list of (Row, str)
+        Each row with the reason why it cannot be evaluated; empty if it can.
     """
     found = []
     for row in rows:

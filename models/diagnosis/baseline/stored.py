@@ -112,7 +112,10 @@ class BaselineRecord(BaseModel):
     def of(cls, baseline: Baseline) -> Self:
         """Record of a baseline.
 
-        Raises pydantic.ValidationError if a number in it is not finite.
+        Raises
+        ------
+        pydantic.ValidationError
+            If a number in it is not finite.
         """
         return cls(
             relations=tuple(None if one is None else _relation(one) for one in baseline.relations),

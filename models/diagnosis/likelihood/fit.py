@@ -55,8 +55,14 @@ class LikelihoodFit:
     """Fits window after window, each from where the last one ended.
 
     The state kept between windows is the starting point, how alike the forces' colours were, and the slopes of the last
-    search, with which windows that differ little from it are followed. `machine`: nominal rotor and unbalance phase.
-    `follow`: whether windows that follow each other overlap, so that they may be followed.
+    search, with which windows that differ little from it are followed.
+
+    Parameters
+    ----------
+    machine : Machine
+        Nominal rotor and unbalance phase.
+    follow : bool
+        Whether windows that follow each other overlap, so that they may be followed.
     """
 
     def __init__(self, machine: Machine, *, follow: bool = False) -> None:
@@ -109,7 +115,14 @@ class LikelihoodFit:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called: the next readings are the same to the last bit.
 
-        Raises CheckpointError if they are not those of a fit of this machine; nothing is changed then.
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+
+        Raises
+        ------
+        CheckpointError
+            If they are not those of a fit of this machine; nothing is changed then.
         """
         last, strength = (checked(arrays, name, np.float64, (None,)) for name in ("last", "strength"))
         segments, followed = checked(arrays, "followed", np.int64, (2,)).tolist()
@@ -150,8 +163,12 @@ class LikelihoodFit:
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of one window.
 
-        Raises EstimationError if a channel has no power in the band (a dead sensor), or two carry the same signal.
-        Raises UnexplainedError if the search finds no maximum, or nothing within the model comes near the window.
+        Raises
+        ------
+        EstimationError
+            If a channel has no power in the band (a dead sensor), or two carry the same signal.
+        UnexplainedError
+            If the search finds no maximum, or nothing within the model comes near the window.
         """
         window = integrated(window)
         speed = self._speed(window)
@@ -189,9 +206,16 @@ class LikelihoodFit:
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
         """Read a short stretch of the latest window by one step from the window's maximum.
 
-        `stretch`: latest hops of the window that was diagnosed last. None if there is no such window, or the stretch
-        says anything that the window does not: diagnose it then. Whether the stretch is outside the model is not tested
-        closely, so there is no misfit.
+        Parameters
+        ----------
+        stretch : WindowStatistics
+            Latest hops of the window that was diagnosed last.
+
+        Returns
+        -------
+        Diagnosis or None
+            None if there is no such window, or the stretch says anything that the window does not: diagnose it then.
+            Whether the stretch is outside the model is not tested closely, so there is no misfit.
         """
         stretch = integrated(stretch)
         line, speed = self._line, self._speed(stretch)
@@ -419,7 +443,14 @@ class LengthFits:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called: the next readings are the same to the last bit.
 
-        Raises CheckpointError if they are not those of this machine; nothing is changed then.
+        Parameters
+        ----------
+        arrays : mapping of str to ndarray
+
+        Raises
+        ------
+        CheckpointError
+            If they are not those of this machine; nothing is changed then.
         """
         hop = int(checked(arrays, "hop", np.int64, ()))
         searched = dict(checked(arrays, "searched", np.int64, (None, 2)).tolist())
@@ -433,7 +464,10 @@ class LengthFits:
     def window(self, window: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of the window at the next hop.
 
-        Raises EstimationError as `LikelihoodFit.diagnose`.
+        Raises
+        ------
+        EstimationError
+            As `LikelihoodFit.diagnose`.
         """
         self._hop += 1
         return self._window.diagnose(window)
@@ -441,7 +475,10 @@ class LengthFits:
     def short(self, hops: int, stretch: WindowStatistics) -> Diagnosis:
         """Estimate the parameters of the window's latest hops: at a glance if they say what the window says.
 
-        Raises EstimationError as `LikelihoodFit.diagnose`.
+        Raises
+        ------
+        EstimationError
+            As `LikelihoodFit.diagnose`.
         """
         seen = self._window.glance(stretch)
         if seen is not None:

@@ -49,8 +49,20 @@ class Glance:
 class Linearised:
     """The spectra around the maximum of the last search, and where the maximum has moved since.
 
-    `weights`: those of the search that ended there. `searched`: where it ended. `point`: where the maximum is now.
-    `derivatives`: at the search's end. `left` (n_levels,): what the search left of the data's gradient by the levels.
+    Parameters
+    ----------
+    weights : Weights
+        Those of the search that ended there.
+    searched : ModelPoint
+        Where it ended.
+    point : ModelPoint
+        Where the maximum is now.
+    derivatives : Derivatives
+        At the search's end.
+    left : ndarray, shape (n_levels,)
+        What the search left of the data's gradient by the levels.
+    fitted : float
+        Parameters that its window determined.
     """
 
     def __init__(
@@ -103,8 +115,12 @@ class Linearised:
     def restored(cls, model: SpectralModel, weights: Weights, arrays: Mapping[str, np.ndarray]) -> "Linearised":
         """The same from what `checkpoint` gave.
 
-        Raises CheckpointError if an array is missing or of another form. Raises numpy.linalg.LinAlgError if the point
-        makes no valid spectra.
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        numpy.linalg.LinAlgError
+            If the point makes no valid spectra.
         """
         size = (model.size,)
         theta = checked(arrays, "searched", np.float64, size)
@@ -130,7 +146,12 @@ class Linearised:
     def follow(self, observed: ComplexArray, speed_rad_s: float, near: float, gain: float) -> Maximum | None:
         """Solve for the next window's estimated spectra; None where a new search is due.
 
-        `observed` (n_groups, n, n): in the units of the model. `near` and `gain`: as `FisherScoring.maximise` has them.
+        Parameters
+        ----------
+        observed : ndarray, shape (n_groups, n, n)
+            In the units of the model.
+        near, gain : float
+            As `FisherScoring.maximise` has them.
         """
         model, point = self.model, self._point
         covariance = self._inverse(1.0)
@@ -164,7 +185,12 @@ class Linearised:
     def glance(self, observed: ComplexArray, share: float) -> Glance | None:
         """Take one step from the latest maximum; None if the stretch says anything new.
 
-        `observed` (n_groups, n, n): of the stretch. `share`: its segments over those of the window.
+        Parameters
+        ----------
+        observed : ndarray, shape (n_groups, n, n)
+            Of the stretch.
+        share : float
+            Its segments over those of the window.
         """
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)

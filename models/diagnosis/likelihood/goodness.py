@@ -88,8 +88,10 @@ def goodness_of_fit(
 ) -> Goodness:
     """Try the alternatives at the maximum of one window.
 
-    `states` (n_groups, n_states, n_states): estimated cross-spectra of the states, SI: displacement and velocity are
-    compared with each other, too.
+    Parameters
+    ----------
+    states : ndarray, shape (n_groups, n_states, n_states)
+        Estimated cross-spectra of the states, SI: displacement and velocity are compared with each other, too.
     """
     names, slopes = _alternatives(machine, model, found)
     excess = packed(found.whitened.excess)
@@ -185,8 +187,14 @@ def unexplained_at(
 ) -> tuple[str, bool]:
     """Why nothing at this point means anything, if so, and whether nothing within the model comes near the window.
 
-    `reached`: the point. `states` (n_groups, n_states, n_states): estimated cross-spectra of the states, SI. `times`:
-    so many times what is evaluated counts as too much.
+    Parameters
+    ----------
+    reached : Whitened
+        The point.
+    states : ndarray, shape (n_groups, n_states, n_states)
+        Estimated cross-spectra of the states, SI.
+    times : float
+        So many times what is evaluated counts as too much.
     """
     excess, point, bins = reached.excess, reached.point, model.groups.bins
     squared = np.einsum("fij,fij->f", excess, excess.conj()).real / model.n**2

@@ -90,8 +90,14 @@ def group_bins(
 ) -> BinGroups:
     """Group bins: narrow near the modes, at most `widest_hz` elsewhere.
 
-    `frequencies_hz` (n_bins,): evenly spaced. `machine`: its nominal modes say where spectra are narrow. `excluded`
-    (n_bins,): bins that belong to no group.
+    Parameters
+    ----------
+    frequencies_hz : ndarray, shape (n_bins,)
+        Evenly spaced.
+    machine : Machine
+        Its nominal modes say where spectra are narrow.
+    excluded : ndarray of bool, shape (n_bins,)
+        Bins that belong to no group.
     """
     spacing = frequencies_hz[1] - frequencies_hz[0]
     modes_hz, damping = natural_frequencies(machine)
@@ -162,8 +168,12 @@ class Mismatch:
 class Motions:
     """Measured degrees of freedom, and how the measured states make them.
 
-    `states`: measured states. `scale` (n_states,): unit of each, in the ratio of the sensors' noise: the mean amplitude
-    in the band, for want of better.
+    Parameters
+    ----------
+    states : tuple of str
+        Measured states.
+    scale : ndarray, shape (n_states,)
+        Unit of each, in the ratio of the sensors' noise: the mean amplitude in the band, for want of better.
     """
 
     def __init__(self, states: tuple[str, ...], scale: FloatArray) -> None:
@@ -195,8 +205,16 @@ class Motions:
     def factor(self, w: FloatArray, centre: FloatArray) -> ComplexArray:
         """What a displacement of one, at frequency w, makes of each motion.
 
-        `w`: angular frequencies, rad/s. `centre`: frequency the states are combined for: that of the group w is seen
-        in. Returns (*w.shape, n).
+        Parameters
+        ----------
+        w : ndarray
+            Angular frequencies, rad/s.
+        centre : ndarray, broadcast to the shape of w
+            Frequency the states are combined for: that of the group w is seen in.
+
+        Returns
+        -------
+        ndarray, shape (*w.shape, n)
         """
         at_centre = self._r(centre)
         pair = (1 + at_centre * self._r(w)) / np.sqrt(1 + at_centre**2)
@@ -235,7 +253,11 @@ class Motions:
     def rest(self, states: ComplexArray, w: FloatArray) -> FloatArray:
         """Power of what the two sensors of a motion do not share, shape (n_groups, n); infinite where there is one.
 
-        `states` (n_groups, n_states, n_states): cross-spectra of the states, SI. `w` (n_groups,).
+        Parameters
+        ----------
+        states : ndarray, shape (n_groups, n_states, n_states)
+            Cross-spectra of the states, SI.
+        w : ndarray, shape (n_groups,)
         """
         r = self._r(w)
         left = np.full(r.shape, np.inf)
@@ -251,9 +273,15 @@ class Motions:
         """Compare displacement and velocity of every degree of freedom that has both.
 
         With gains 1 and 1 + δ the rest d = (v - jr x)/√(1 + r²) of a pair holds jr δ z/(1 + r²) of its motion z; δ is
-        the least-squares regression of d on that, with standard error from what of d remains. `states` (n_groups,
-        n_states, n_states): cross-spectra of the states, SI. `w` (n_groups,). `averages` (n_groups,): independent
-        averages they are made of.
+        the least-squares regression of d on that, with standard error from what of d remains.
+
+        Parameters
+        ----------
+        states : ndarray, shape (n_groups, n_states, n_states)
+            Cross-spectra of the states, SI.
+        w : ndarray, shape (n_groups,)
+        averages : ndarray, shape (n_groups,)
+            Independent averages they are made of.
         """
         found = []
         r = self._r(w)

@@ -81,9 +81,14 @@ class Workspace:
 class Weights:
     """How much a window's data count, and how strongly usual values pull at what they leave undetermined.
 
-    `n_segments`: segments the estimated spectra are averaged over. `usual_cutoff_hz`: where the cutoff is pulled,
-    weakly, if the band does not show it. `strength`: how strongly the forces' own colours are pulled towards none; the
-    weakest pull without it.
+    Parameters
+    ----------
+    n_segments : int
+        Segments the estimated spectra are averaged over.
+    usual_cutoff_hz : float
+        Where the cutoff is pulled, weakly, if the band does not show it.
+    strength : float, optional
+        How strongly the forces' own colours are pulled towards none; the weakest pull without it.
     """
 
     def __init__(
@@ -121,11 +126,21 @@ class FisherScoring:
 
     The levels move as T of C = T Tᵀ. Where the data want less of a direction than there is, T's own curvature is added
     to the information; without it the small columns of an excitation of low rank overshoot, and every other parameter
-    waits for them. `observed` (n_groups, n, n): estimated cross-spectra in units of the model's scale. `n_segments`:
-    segments they are averaged over. `usual_cutoff_hz`: where the cutoff is pulled, weakly, if the band does not show
-    it. `strength`: how strongly the forces' own colours are pulled towards none until the window itself has said so;
-    the weakest pull without it. `workspace`: shared by searches that follow each other; the slopes of a `Maximum` are
-    valid until the next one.
+    waits for them.
+
+    Parameters
+    ----------
+    observed : ndarray, shape (n_groups, n, n)
+        Estimated cross-spectra in units of the model's scale.
+    n_segments : int
+        Segments they are averaged over.
+    usual_cutoff_hz : float
+        Where the cutoff is pulled, weakly, if the band does not show it.
+    strength : float, optional
+        How strongly the forces' own colours are pulled towards none until the window itself has said so; the weakest
+        pull without it.
+    workspace : Workspace, optional
+        Shared by searches that follow each other; the slopes of a `Maximum` are valid until the next one.
     """
 
     def __init__(
@@ -159,10 +174,21 @@ class FisherScoring:
     ) -> Maximum:
         """Search from a starting point.
 
-        `theta` (size,). `near` and `gain`: converged when a full step would move no diagnosed parameter by more than
-        `near` standard errors and would gain less than `gain` in log-likelihood. `derivatives`: those at `theta` if an
-        earlier search has ended there. `hopeless`: whether to give up, from the steps tried and where they have led.
-        Raises numpy.linalg.LinAlgError if the information is singular: the window says nothing about a parameter.
+        Parameters
+        ----------
+        theta : ndarray, shape (size,)
+        near, gain : float
+            Converged when a full step would move no diagnosed parameter by more than `near` standard errors and would
+            gain less than `gain` in log-likelihood.
+        derivatives : Derivatives, optional
+            Those at `theta` if an earlier search has ended there.
+        hopeless : callable, optional
+            Whether to give up, from the steps tried and where they have led.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the information is singular: the window says nothing about a parameter.
         """
         model = self._model
         diagnosed, logarithms = slice(model.cutoff_at), slice(model.level_at.start)
@@ -279,7 +305,10 @@ def whitened_at(point: ModelPoint, observed: ComplexArray) -> Whitened | None:
 def inverse_factor(S: ComplexArray) -> ComplexArray:
     """L⁻¹ of S = L Lᴴ, shape (n_groups, n, n).
 
-    Raises numpy.linalg.LinAlgError if those are no valid spectra.
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If those are no valid spectra.
     """
     return np.asarray(np.linalg.inv(np.linalg.cholesky(S)), dtype=np.complex128)
 

@@ -65,11 +65,21 @@ class SpectralModel:
     """Expected cross-spectra and their derivatives for one machine, set of measured states, and groups of bins.
 
     The parameter vector holds the logarithmic ratios of `STRUCTURAL` to nominal, the logarithms of the low-pass's
-    cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per Hz),
-    their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T. `motions`: what
-    is measured, in units that make all spectra of the order of one. `groups`: frequencies of the spectra.
-    `force_scale`: unit of forces, N/√Hz, so that the elements of C are of the order of one. `shapes`: polynomials of
-    the forces' colour; 0 leaves one low-pass for all.
+    cutoff (Hz) and order, the logarithms of the noise densities of the measured states (in units of `scale`² per
+    Hz), their exponents b, the shape coefficients a (polynomial by polynomial), and the lower triangle of T.
+
+    Parameters
+    ----------
+    machine : Machine
+        Nominal rotor.
+    motions : Motions
+        What is measured, in units that make all spectra of the order of one.
+    groups : BinGroups
+        Frequencies of the spectra.
+    force_scale : float
+        Unit of forces, N/√Hz, so that the elements of C are of the order of one.
+    shapes : int
+        Polynomials of the forces' colour; 0 leaves one low-pass for all.
     """
 
     def __init__(
@@ -111,8 +121,14 @@ class SpectralModel:
     def receptance(self, structural: FloatArray, speed_rad_s: float, w: FloatArray) -> ComplexArray:
         """H(ω) = (-ω²M + jωP + Q)⁻¹ in SI units, shape (n_frequencies, 6, 6).
 
-        `structural` (5,): logarithmic ratios of `STRUCTURAL` to nominal. `speed_rad_s`: speed Ω of the gyroscopic
-        terms. `w` (n_frequencies,): angular frequencies, rad/s.
+        Parameters
+        ----------
+        structural : ndarray, shape (5,)
+            Logarithmic ratios of `STRUCTURAL` to nominal.
+        speed_rad_s : float
+            Speed Ω of the gyroscopic terms.
+        w : ndarray, shape (n_frequencies,)
+            Angular frequencies, rad/s.
         """
         change = self._bearing * np.expm1(structural[:4])
         Q = self._Q + self._Q_shaft * np.expm1(structural[4])
@@ -171,10 +187,19 @@ class SpectralModel:
     def slopes(self, point: ModelPoint, L_inverse: ComplexArray, out: FloatArray | None = None) -> FloatArray:
         """L⁻¹ (∂S/∂θ_a) L⁻ᴴ of every parameter a, packed; the last 21 are by the elements of C, not of T.
 
-        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of G C
-        Hᴴ plus its conjugate transpose. `L_inverse` (n_groups, n, n): inverse Cholesky factors of the spectra. `out`
-        (size, n_groups, n²): where to put them: megabytes, better not allocated at every step. Returns (size, n_groups,
-        n²).
+        With ∂H = -H ∂D H every structural derivative, and every level's, is an outer product of columns of G and of
+        G C Hᴴ plus its conjugate transpose.
+
+        Parameters
+        ----------
+        L_inverse : ndarray, shape (n_groups, n, n)
+            Inverse Cholesky factors of the spectra.
+        out : ndarray, shape (size, n_groups, n²), optional
+            Where to put them: megabytes, better not allocated at every step.
+
+        Returns
+        -------
+        ndarray, shape (size, n_groups, n²)
         """
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G
@@ -209,8 +234,12 @@ class SpectralModel:
     ) -> FloatArray:
         """Packed slope of the spectra by a change of the whole dynamic matrix, `change` times `factor`, sign reversed.
 
-        `whitened` and `response` (n_groups, n_nodes, n, 6): L⁻¹G and L⁻¹GC. `change` (6, 6). `factor` (n_groups,
-        n_nodes).
+        Parameters
+        ----------
+        whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
+            L⁻¹G and L⁻¹GC.
+        change : ndarray, shape (6, 6)
+        factor : ndarray, shape (n_groups, n_nodes)
         """
         unit = self.force_unit * point.colour[:, None, None, :]
         moved = ((whitened / unit) @ change) @ point.H * factor[..., None, None]
@@ -227,8 +256,14 @@ class SpectralModel:
     ) -> FloatArray:
         """Packed slope of the spectra by a change `factor` of one element of the dynamic matrix, sign reversed.
 
-        `whitened` and `response` (n_groups, n_nodes, n, 6): L⁻¹G and L⁻¹GC. `row` and `column`: element of -ω²M + jωP +
-        Q, by degree of freedom. `factor` (n_groups, n_nodes): minus the derivative of that element.
+        Parameters
+        ----------
+        whitened, response : ndarray, shape (n_groups, n_nodes, n, 6)
+            L⁻¹G and L⁻¹GC.
+        row, column : int
+            Element of -ω²M + jωP + Q, by degree of freedom.
+        factor : ndarray, shape (n_groups, n_nodes)
+            Minus the derivative of that element.
         """
         u = whitened[..., row] / (self.force_unit[row] * point.colour[:, None, None, row]) * factor[..., None]
         v = (response @ point.H[:, :, column].conj()[..., None])[..., 0]
@@ -280,8 +315,14 @@ def starting_point(model: SpectralModel, observed: ComplexArray, centre: FloatAr
     """Guess the excitation with the nominal rotor.
 
     Forces follow from the response through the regularised inverse of G, bin group by bin group; their mean, divided by
-    the low-pass that fits its trace best, is the level matrix. `observed` (n_groups, n, n): estimated cross-spectra in
-    units of the model's scale. `centre` (size,): usual values of everything else.
+    the low-pass that fits its trace best, is the level matrix.
+
+    Parameters
+    ----------
+    observed : ndarray, shape (n_groups, n, n)
+        Estimated cross-spectra in units of the model's scale.
+    centre : ndarray, shape (size,)
+        Usual values of everything else.
     """
     groups = model.groups
     w = 2 * np.pi * groups.centre_hz

@@ -83,8 +83,20 @@ def estimate_unbalance(
 
     The vector's covariance is the stochastic part's spectrum over the window length, averaged around Ω as a window of
     that length sees it, plus what the uncertainty of the structural parameters makes of the predicted response.
-    `point`: the model's spectra at the estimate. `covariance` (5, 5): of the logarithmic ratios of the structural
-    parameters. `synchronous` (n_states,): q, SI. Raises EstimationError if the vector says nothing about e.
+
+    Parameters
+    ----------
+    point : ModelPoint
+        The model's spectra at the estimate.
+    covariance : ndarray, shape (5, 5)
+        Of the logarithmic ratios of the structural parameters.
+    synchronous : ndarray of complex, shape (n_states,)
+        q, SI.
+
+    Raises
+    ------
+    EstimationError
+        If the vector says nothing about e.
     """
     return _ratios(machine, model, point, covariance, synchronous, speed_rad_s, duration_s).decided()
 
@@ -169,9 +181,21 @@ def estimate_unbalance_by_hop(
 ) -> Unbalance:
     """Estimate e where the speed varies: every hop at its own speed, with its own vector.
 
-    The hops' own errors are independent; that of the structural parameters is one for all. `machine`, `model`, `point`,
-    `covariance`: as for `estimate_unbalance`. `hop_synchronous` (n_hops, n_states). `hop_speed_rad_s` (n_hops,).
-    `hop_s`: length of a hop, s. Raises EstimationError if a vector says nothing about e.
+    The hops' own errors are independent; that of the structural parameters is one for all.
+
+    Parameters
+    ----------
+    machine, model, point, covariance
+        As for `estimate_unbalance`.
+    hop_synchronous : ndarray of complex, shape (n_hops, n_states)
+    hop_speed_rad_s : ndarray, shape (n_hops,)
+    hop_s : float
+        Length of a hop, s.
+
+    Raises
+    ------
+    EstimationError
+        If a vector says nothing about e.
     """
     hops = [
         _ratios(machine, model, point, covariance, vectors, float(speed), hop_s)

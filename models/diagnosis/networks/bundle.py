@@ -145,7 +145,10 @@ def save_bundle(
 ) -> Bundle:
     """Write a bundle.
 
-    Raises BundleError if a network is not calibrated or the directory cannot be written.
+    Raises
+    ------
+    BundleError
+        If a network is not calibrated or the directory cannot be written.
     """
     arrays: _Arrays = {}
     entries = []
@@ -195,9 +198,17 @@ def save_bundle(
 def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
     """Load a bundle and check that it belongs to a machine.
 
-    `name_or_path`: "lab" (shipped), or a directory. `machine`: the machine it must have been trained for: rotor,
-    operation, condition range, rate and window. Raises BundleError, naming what is missing, damaged, or different, with
-    both values.
+    Parameters
+    ----------
+    name_or_path : str or Path
+        "lab" (shipped), or a directory.
+    machine : Machine
+        The machine it must have been trained for: rotor, operation, condition range, rate and window.
+
+    Raises
+    ------
+    BundleError
+        Naming what is missing, damaged, or different, with both values.
     """
     directory = Path(name_or_path)
     if not directory.is_dir() and (_SHIPPED / str(name_or_path)).is_dir():

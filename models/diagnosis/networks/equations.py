@@ -154,7 +154,10 @@ class SynchronousEquation:
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
         """Rows of one view, SI units.
 
-        Raises EstimationError without a phase reference.
+        Raises
+        ------
+        EstimationError
+            Without a phase reference.
         """
         if view.synchronous is None:
             raise EstimationError(f"{machine.name}: equation 29 without a phase reference")
@@ -240,6 +243,9 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
 def missing(equation: Equation | SynchronousEquation, measured: tuple[str, ...]) -> tuple[str, ...]:
     """What would have to be measured besides, to evaluate an equation.
 
-    `measured`: measured states, with ``theta`` for the phase reference.
+    Parameters
+    ----------
+    measured : tuple of str
+        Measured states, with ``theta`` for the phase reference.
     """
     return tuple(name for name in equation.channels if name not in measured)

@@ -34,7 +34,12 @@ _LEAST_VARIANCE = 1e-3
 class ForceFeatures:
     """Features of one machine's windows before they are condensed.
 
-    `machine`: nominal rotor and window. `states`: measured states to look at; None takes all that the machine measures.
+    Parameters
+    ----------
+    machine : Machine
+        Nominal rotor and window.
+    states : tuple of str or None
+        Measured states to look at; None takes all that the machine measures.
     """
 
     def __init__(self, machine: Machine, states: tuple[str, ...] | None = None) -> None:
@@ -88,7 +93,12 @@ class ForceFeatures:
     def _to_force(self, w: FloatArray, speed_rad_s: FloatArray) -> ComplexArray:
         """Matrices that turn measured states into equivalent forces, shape (n_frequencies, n_dofs, n).
 
-        `w` (n_frequencies,): angular frequencies, rad/s. `speed_rad_s` (n_frequencies,): speed Ω at each of them.
+        Parameters
+        ----------
+        w : ndarray, shape (n_frequencies,)
+            Angular frequencies, rad/s.
+        speed_rad_s : ndarray, shape (n_frequencies,)
+            Speed Ω at each of them.
         """
         rotor = self._machine.rotor
         still = P_matrix(rotor, 0.0)
@@ -109,7 +119,10 @@ class ForceFeatures:
     def force(self, spectrum: npt.NDArray[np.complexfloating]) -> ComplexArray:
         """Cross-spectra of the equivalent forces, shape (n_windows, n_bins, n_dofs, n_dofs).
 
-        `spectrum` (n_windows, n_bins, n, n): cross-spectra of the measured states, SI²/Hz.
+        Parameters
+        ----------
+        spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
+            Cross-spectra of the measured states, SI²/Hz.
         """
         return np.asarray(self._force @ spectrum @ self._force_adjoint, dtype=np.complex128)
 
@@ -158,7 +171,11 @@ class ForceFeatures:
         """Relative disagreement in amplitude of displacement and rate, each of shape (n_windows,), by displacement.
 
         Of the band in which they agree best: sensor noise sets them apart in some bands, a wrong gain in all of them.
-        `consistency` (n_windows, n): from `consistency`.
+
+        Parameters
+        ----------
+        consistency : ndarray, shape (n_windows, n)
+            From `consistency`.
         """
         n = len(self._twice)
         ratio = consistency[:, 1 : 1 + _BANDS * n].reshape(-1, _BANDS, n)
@@ -174,8 +191,13 @@ class ForceFeatures:
         """What equation 29 looks at besides, shape (n_windows, 3 n_dofs).
 
         The rotation-synchronous vectors as forces, in units of the nominal unbalance force (real parts, imaginary
-        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them. `spectrum`
-        (n_windows, n_bins, n, n). `synchronous` (n_windows, n). `speed_rad_s` (n_windows,).
+        parts), and the logarithm of the sampling variance that the stochastic forces beside them give them.
+
+        Parameters
+        ----------
+        spectrum : ndarray of complex, shape (n_windows, n_bins, n, n)
+        synchronous : ndarray of complex, shape (n_windows, n)
+        speed_rad_s : ndarray, shape (n_windows,)
         """
         machine = self._machine
         unbalance = machine.rotor.m2_kg * machine.rotor.e_m * speed_rad_s**2
@@ -227,7 +249,10 @@ class FeatureBasis:
 def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Array, Float32Array]:
     """Mean, shape (n_series, 1, n_bins), and first principal components, shape (n_series, n_bins, n_kept).
 
-    `series` (n_series, n_windows, n_bins): of expected spectra, without sampling error.
+    Parameters
+    ----------
+    series : ndarray, shape (n_series, n_windows, n_bins)
+        Of expected spectra, without sampling error.
     """
     mean = series.mean(axis=1, keepdims=True)
     deviation = (series - mean).astype(np.float64)
@@ -239,8 +264,14 @@ def principal_directions(series: Float32Array, n_kept: int) -> tuple[Float32Arra
 def fit_basis(mean: Float32Array, directions: Float32Array, raw: Float32Array, n_common: int) -> FeatureBasis:
     """Standardise features and measure their covariance.
 
-    `mean` and `directions`: from `principal_directions`. `raw` (n_windows, n_inputs): condensed features of windows
-    with sampling error. `n_common`: how many of the inputs all networks share.
+    Parameters
+    ----------
+    mean, directions : ndarray
+        From `principal_directions`.
+    raw : ndarray, shape (n_windows, n_inputs)
+        Condensed features of windows with sampling error.
+    n_common : int
+        How many of the inputs all networks share.
     """
     centre = raw.mean(axis=0)
     scale = raw.std(axis=0) + np.float32(1e-6)

@@ -54,8 +54,24 @@ def train_network(
 ) -> EquationNetwork:
     """Fit the network of one equation.
 
-    `windows`: own parameters nominal, everything else random. `seed`: of the initial weights. `progress`: called with
-    the fraction done. Not calibrated yet. Raises EstimationError if the fit does not come out finite.
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        Own parameters nominal, everything else random.
+    seed : int
+        Of the initial weights.
+    progress : callable
+        Called with the fraction done.
+
+    Returns
+    -------
+    EquationNetwork
+        Not calibrated yet.
+
+    Raises
+    ------
+    EstimationError
+        If the fit does not come out finite.
     """
     rows = [equation.rows(window_view(window, machine), machine) for window in windows]
     inputs = np.concatenate([row.inputs / row.norm for row in rows])
@@ -99,7 +115,10 @@ def train_network(
 def calibrate(trained: EquationNetwork, windows: Sequence[WindowStatistics], machine: Machine) -> EquationNetwork:
     """Measure the healthy spread on windows that training did not see.
 
-    `windows`: healthy in the equation's own parameters, at least ten, from seeds of their own.
+    Parameters
+    ----------
+    windows : sequence of WindowStatistics
+        Healthy in the equation's own parameters, at least ten, from seeds of their own.
     """
     readings = [
         read_equation(EquationNetwork(trained.equation, trained.network, None), window, machine) for window in windows
@@ -200,12 +219,29 @@ def train_networks(
 ) -> AmortisedNetworks:
     """Train the networks of all equations on a stream of batches.
 
-    `states`: measured states that the features were made of. `principal`: mean and directions that condensed them.
-    `n_common`: features that all networks share; the rest are equation 29's. `batches`: condensed features, shape
-    (n_windows, n_features), and targets, shape (n_windows, 6). `expected_windows`: windows in all batches together: it
-    sets the course of the learning rate. `log_range`: largest drawn logarithmic ratio. `seed`: of initial weights and
-    of the choice from the buffer. `progress`: called with the number of windows of each batch. Raises EstimationError
-    if the batches hold too few windows to start, or the training diverges.
+    Parameters
+    ----------
+    states : tuple of str
+        Measured states that the features were made of.
+    principal : tuple of ndarray
+        Mean and directions that condensed them.
+    n_common : int
+        Features that all networks share; the rest are equation 29's.
+    batches : iterable of (features, logarithmic ratios)
+        Condensed features, shape (n_windows, n_features), and targets, shape (n_windows, 6).
+    expected_windows : int
+        Windows in all batches together: it sets the course of the learning rate.
+    log_range : float
+        Largest drawn logarithmic ratio.
+    seed : int
+        Of initial weights and of the choice from the buffer.
+    progress : callable
+        Called with the number of windows of each batch.
+
+    Raises
+    ------
+    EstimationError
+        If the batches hold too few windows to start, or the training diverges.
     """
     torch.set_num_threads(1)  # the windows are made by processes beside it, and sums keep their order
     generator = torch.Generator().manual_seed(seed)
@@ -272,8 +308,11 @@ def calibrate_networks(
 ) -> AmortisedNetworks:
     """Measure bias and true size of the standard errors on windows simulated in time.
 
-    `groups`: from seeds of their own, one group for every layout of the sources: no window says which one it is of, so
-    the group that needs the larger standard errors decides. Parameters that are not named are nominal.
+    Parameters
+    ----------
+    groups : sequence of iterables of (WindowStatistics, relative changes)
+        From seeds of their own, one group for every layout of the sources: no window says which one it is of, so the
+        group that needs the larger standard errors decides. Parameters that are not named are nominal.
     """
     reader = NetworkDiagnostician(machine, trained)
     found: dict[str, list[FloatArray]] = {}

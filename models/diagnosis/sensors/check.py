@@ -20,10 +20,19 @@ def sensor_findings(
 ) -> tuple[SensorFault, ...]:
     """Check the sensors of a window.
 
-    `reference`: what the sensors were like on the healthy machine; without it only what is impossible for any healthy
-    sensor is found. `channels`: those of the machine, for their names and units. Empty if nothing was found. A channel
-    that is stuck or clipped is not looked at further; where the shaft angle jumps, slips or jitters, channels are not
-    compared: what turns with the shaft stays among what they share.
+    Parameters
+    ----------
+    reference : SensorReference, optional
+        What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
+        found.
+    channels : iterable of Channel
+        Those of the machine, for their names and units.
+
+    Returns
+    -------
+    tuple of SensorFault
+        Empty if nothing was found. A channel that is stuck or clipped is not looked at further; where the shaft angle
+        jumps, slips or jitters, channels are not compared: what turns with the shaft stays among what they share.
     """
     naming = Naming(channels)
     findings = [*stuck(window, naming), *clipped(window, naming)]

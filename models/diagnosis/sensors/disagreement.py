@@ -283,7 +283,11 @@ def swapped(
 ) -> tuple[list[SensorFault], set[MotionPair]]:
     """Find the exchange of two channels of one quantity that restores the pairs that are broken.
 
-    Returns `findings`; `explained`: pairs that need no other explanation.
+    Returns
+    -------
+    findings : list of SensorFault
+    explained : set of MotionPair
+        Pairs that need no other explanation.
     """
     findings: list[SensorFault] = []
     explained: set[MotionPair] = set()

@@ -138,7 +138,15 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
 def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None = None) -> PairReading | None:
     """Compare two sensors of one motion.
 
-    `bands`: what `banded` has made of them. None if one of them shows no fluctuation.
+    Parameters
+    ----------
+    bands : Banded, optional
+        What `banded` has made of them.
+
+    Returns
+    -------
+    PairReading or None
+        None if one of them shows no fluctuation.
     """
     bands = banded(window, pair) if bands is None else bands
     z, v = bands.spectra[:, 0, 0].real, bands.spectra[:, 1, 1].real
@@ -230,7 +238,10 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
 def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, float]:
     """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of one hop.
 
-    Returns `course` (n_hops,); `error`.
+    Returns
+    -------
+    course : ndarray, shape (n_hops,)
+    error : float
     """
     number = motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real

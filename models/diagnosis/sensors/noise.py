@@ -79,8 +79,14 @@ def noisy(
 ) -> list[SensorFault]:
     """Channels whose noise is above what it was on the healthy machine.
 
-    `readings`: of pairs that see the same motion. `reference`: without it, or if it says nothing of noise, nothing is
-    found. `sound`: whether nothing else is wrong with columns.
+    Parameters
+    ----------
+    readings : sequence of PairReading
+        Of pairs that see the same motion.
+    reference : SensorReference or None
+        Without it, or if it says nothing of noise, nothing is found.
+    sound : callable
+        Whether nothing else is wrong with columns.
     """
     if reference is None:
         return []

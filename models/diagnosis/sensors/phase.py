@@ -59,8 +59,12 @@ def phase_faults(
 ) -> list[SensorFault]:
     """At most one finding on the shaft angle.
 
-    `columns`: channels that nothing is wrong with. `reference`: without it a speed that contradicts the vibration is
-    not found.
+    Parameters
+    ----------
+    columns : sequence of int
+        Channels that nothing is wrong with.
+    reference : SensorReference or None
+        Without it a speed that contradicts the vibration is not found.
     """
     vectors, speed = window.hop_synchronous, window.speed_rad_s
     if window.speed_source != "phase reference" or vectors is None or not columns or not abs(speed) > 0:

@@ -31,7 +31,10 @@ def implicated(findings: Iterable[SensorFault]) -> set[str]:
 class Naming:
     """Names of channels and values in their units, for sentences.
 
-    `channels`: those of the machine; what is not among them is called by its state and given in SI units.
+    Parameters
+    ----------
+    channels : iterable of Channel
+        Those of the machine; what is not among them is called by its state and given in SI units.
     """
 
     def __init__(self, channels: Iterable[Channel] = ()) -> None:
@@ -302,7 +305,10 @@ class SensorReference(BaseModel):
 def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReference:
     """Learn from healthy windows that do not overlap.
 
-    Raises EstimationError if there is no window, or a channel shows no fluctuation in one.
+    Raises
+    ------
+    EstimationError
+        If there is no window, or a channel shows no fluctuation in one.
     """
     if not windows:
         raise EstimationError("no healthy window to learn the sensors from")

@@ -42,9 +42,17 @@ def _shared(probability: float, tests: int) -> float:
 def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
     """Thresholds of one window by itself.
 
-    `rate`: probability that a healthy window is called changed, over all parameters together, for example 0.01.
-    `n_parameters`: parameters evaluated in it. Raises ValueError if the rate is not between 0 and 1, or there is no
-    parameter.
+    Parameters
+    ----------
+    rate : float
+        Probability that a healthy window is called changed, over all parameters together, for example 0.01.
+    n_parameters : int
+        Parameters evaluated in it.
+
+    Raises
+    ------
+    ValueError
+        If the rate is not between 0 and 1, or there is no parameter.
     """
     if not 0 < rate < 1 or n_parameters < 1:
         raise ValueError(f"rate is {rate} for {n_parameters} parameters, expected 0 < rate < 1 and at least one")
@@ -59,7 +67,10 @@ def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
 def overshoot_correction(x: float) -> float:
     """Siegmund's ν(x): how much rarer a crossing is when time goes in steps.
 
-    `x`: threshold times the standard deviation of one step; 0 is continuous time, where ν = 1.
+    Parameters
+    ----------
+    x : float
+        Threshold times the standard deviation of one step; 0 is continuous time, where ν = 1.
     """
     if x < 1e-6:
         return 1.0
@@ -73,8 +84,18 @@ def crossing_rate(threshold: float, overlap: int) -> float:
 
     The test value of a window of `overlap` hops is a moving average of independent hops: its autocorrelation falls
     linearly to zero over the window. For such a process the rate is b φ(b) μ ν(b √(2μ)) with μ = 1/overlap.
-    `threshold`: b, in standard errors. `overlap`: hops in a window; 1 for windows that do not overlap. Returns
-    crossings per hop; of -b the same number again.
+
+    Parameters
+    ----------
+    threshold : float
+        b, in standard errors.
+    overlap : int
+        Hops in a window; 1 for windows that do not overlap.
+
+    Returns
+    -------
+    float
+        Crossings per hop; of -b the same number again.
     """
     tail = float(ndtr(-threshold))
     if overlap <= 1:
@@ -89,9 +110,23 @@ def month_thresholds(
 ) -> Thresholds:
     """Thresholds of a sliding window that is tested at every hop.
 
-    `per_month`: expected number of false alarms of the machine in 30 days of data. `hop_s`: data time between tests, s.
-    `overlap`: hops in the window. `n_parameters`: parameters evaluated. `n_stretches`: windows of different lengths
-    tested side by side; each gets an equal share of the rate. Raises ValueError if a number is not positive.
+    Parameters
+    ----------
+    per_month : float
+        Expected number of false alarms of the machine in 30 days of data.
+    hop_s : float
+        Data time between tests, s.
+    overlap : int
+        Hops in the window.
+    n_parameters : int
+        Parameters evaluated.
+    n_stretches : int
+        Windows of different lengths tested side by side; each gets an equal share of the rate.
+
+    Raises
+    ------
+    ValueError
+        If a number is not positive.
     """
     if min(per_month, hop_s) <= 0 or min(overlap, n_parameters, n_stretches) < 1:
         raise ValueError(
@@ -122,8 +157,15 @@ _RATE = 1e-3
 def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
     """Compare two diagnosticians parameter by parameter.
 
-    `first` and `second`: of the same window. Returns one per parameter that at least one of them could read, in the
-    order of `PARAMETERS`.
+    Parameters
+    ----------
+    first, second : Diagnosis
+        Of the same window.
+
+    Returns
+    -------
+    tuple of Agreement
+        One per parameter that at least one of them could read, in the order of `PARAMETERS`.
     """
     one, other = ({reading.name: reading for reading in diagnosis.evaluable} for diagnosis in (first, second))
     between = (first.by, second.by)
@@ -156,9 +198,18 @@ def detectable_changes(
 
     In the scale of the errors the change is (threshold + quantile of the power) times the standard error. The standard
     error is the one with all other parameters free: the change shall not only be noticed, it shall be told from a
-    change of any other parameter, so where estimates hang together the power is higher than stated. `stretch`: what the
-    data says; the errors of a parameter hardly depend on its value. `thresholds`: from the declared rate. `length_s`:
-    length of the data in it, s. `power`: probability of finding the change.
+    change of any other parameter, so where estimates hang together the power is higher than stated.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What the data says; the errors of a parameter hardly depend on its value.
+    thresholds : Thresholds
+        From the declared rate.
+    length_s : float
+        Length of the data in it, s.
+    power : float
+        Probability of finding the change.
     """
     distance, errors = thresholds.first + float(ndtri(power)), np.sqrt(np.diag(stretch.estimate()[1])).tolist()
     return tuple(
@@ -175,8 +226,22 @@ def detectable_changes(
 def length_to_find(found: Detectable, change: float) -> float:
     """Data it takes to find another change of the parameter: standard errors fall as one over the root of the length.
 
-    `found`: smallest change and the length it takes. `change`: relative change that is to be found instead, not 0 and
-    above -1. Returns length, s. Raises ValueError if the change is 0 or -1 and below.
+    Parameters
+    ----------
+    found : Detectable
+        Smallest change and the length it takes.
+    change : float
+        Relative change that is to be found instead, not 0 and above -1.
+
+    Returns
+    -------
+    float
+        Length, s.
+
+    Raises
+    ------
+    ValueError
+        If the change is 0 or -1 and below.
     """
     if change == 0 or not change > -1:
         raise ValueError(f"change of {found.name} to be found is {change}, expected above -1 and not 0")

@@ -64,7 +64,12 @@ def outside_confidence(misfit_z: float) -> float:
 def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
     """Decide one window by itself at a declared rate of false alarms per window.
 
-    `rate`: probability that a healthy window is called changed; the test of the model has the same rate to itself.
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        One diagnostician's opinion.
+    rate : float
+        Probability that a healthy window is called changed; the test of the model has the same rate to itself.
     """
     stretch = stretch_of(diagnosis, 0, 0).complete().believed()
     isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
@@ -74,7 +79,12 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
 def model_test(stretch: Stretch, thresholds: Thresholds) -> tuple[bool, float | None]:
     """Say of a stretch whether it is outside the model, and with what confidence; see `Isolation`.
 
-    `thresholds`: from the declared rate.
+    Parameters
+    ----------
+    stretch : Stretch
+        What it says.
+    thresholds : Thresholds
+        From the declared rate.
     """
     if stretch.misfit_z is None or not math.isfinite(stretch.misfit_z):
         return False, None
@@ -84,7 +94,14 @@ def model_test(stretch: Stretch, thresholds: Thresholds) -> tuple[bool, float | 
 def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:
     """Decide a stretch of data.
 
-    `thresholds`: from the declared rate. `by`: who said it; the readings carry the name.
+    Parameters
+    ----------
+    stretch : Stretch
+        What it says.
+    thresholds : Thresholds
+        From the declared rate.
+    by : str
+        Who said it; the readings carry the name.
     """
     known = stretch.known
     outside, confidence = model_test(stretch, thresholds)
@@ -144,7 +161,14 @@ def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) 
 def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Parameter, ...]:
     """Read some parameters with all others held at nominal.
 
-    `names`: parameters that may differ from nominal; those that were not evaluable are left out. `by`: who said it.
+    Parameters
+    ----------
+    stretch : Stretch
+        What the data says.
+    names : tuple of str
+        Parameters that may differ from nominal; those that were not evaluable are left out.
+    by : str
+        Who said it.
     """
     chosen = [i for i in stretch.known if PARAMETERS[i] in names]
     if not chosen:
@@ -158,7 +182,13 @@ def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Param
 
 
 def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float) -> Parameter:
-    """A parameter's reading from its value and standard error in the scale of the errors."""
+    """A parameter's reading from its value and standard error in the scale of the errors.
+
+    Parameters
+    ----------
+    stretch : Stretch
+        What it was read in.
+    """
     if name != "e":
         return possible_reading(name, by, from_scale(name, value), error * slope(name, value))
     # Where errors put an unbalance that is all but gone below none, it is as much of one on the other side.

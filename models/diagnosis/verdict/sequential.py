@@ -61,7 +61,12 @@ class SequentialSettings:
     ) -> "SequentialSettings":
         """Settings with which a machine is monitored, at its declared rate or at another one.
 
-        `per_month`: another rate. `short`: whether stretches shorter than the window can be evaluated.
+        Parameters
+        ----------
+        per_month : float, optional
+            Another rate.
+        short : bool
+            Whether stretches shorter than the window can be evaluated.
         """
         return cls(
             hop_s=machine.window.hop_s,
@@ -120,7 +125,10 @@ class SequentialState:
     ) -> "SequentialState":
         """State from what `checkpoint` gave, and the `hops`, oldest first, as `hop_arrays` has them.
 
-        Raises CheckpointError if an array is missing or of another form.
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
         """
         state = cls(before=tuple(checked(arrays, "before", np.float64, (len(PARAMETERS),)).tolist()))
         change_ns = checked(arrays, "change_ns", np.int64, (None,))
@@ -181,7 +189,14 @@ def _restored_hop(arrays: Mapping[str, np.ndarray]) -> list[tuple[int, Stretch]]
 class SequentialTest:
     """Looks at one hop after the other.
 
-    `state`: where an earlier test stood. `by`: whose readings these are.
+    Parameters
+    ----------
+    settings : SequentialSettings
+        Lengths and declared rate.
+    state : SequentialState, optional
+        Where an earlier test stood.
+    by : str
+        Whose readings these are.
 
     Attributes
     ----------
@@ -228,8 +243,16 @@ class SequentialTest:
     def update(self, looks: Mapping[int, Stretch]) -> Verdict:
         """Judge one hop.
 
-        `looks`: stretches that end with this hop, by their hops: the full window, and those of the short ones that are
-        there. `wanted` says which suffice. Raises KeyError if the full window is not among them.
+        Parameters
+        ----------
+        looks : mapping of int to Stretch
+            Stretches that end with this hop, by their hops: the full window, and those of the short ones that are
+            there. `wanted` says which suffice.
+
+        Raises
+        ------
+        KeyError
+            If the full window is not among them.
         """
         window_hops = self.settings.window_hops
         own = {hops: looks[hops] for hops in self.settings.short_hops if hops in looks}

@@ -95,7 +95,10 @@ class Stretch:
     def blurred(self, standard_error: float) -> "Stretch":
         """Return the same with an error added that further data does not remove.
 
-        `standard_error`: of every parameter, in the scale of the errors.
+        Parameters
+        ----------
+        standard_error : float
+            Of every parameter, in the scale of the errors.
         """
         return self._widened(standard_error**2 * np.eye(len(self.known)), self.common)
 
@@ -130,7 +133,12 @@ class Stretch:
 def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
     """Put a diagnosis into the form in which stretches add up.
 
-    `start_ns` and `end_ns`: its oldest and newest data.
+    Parameters
+    ----------
+    diagnosis : Diagnosis
+        Of the stretch.
+    start_ns, end_ns : int
+        Its oldest and newest data.
     """
     readings = diagnosis.evaluable
     known = [PARAMETERS.index(reading.name) for reading in readings]
@@ -198,8 +206,12 @@ _PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}
 def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) -> Diagnosis:
     """Return the diagnosis with every parameter in the order of `PARAMETERS`, read or with the reason why not.
 
-    `window`: what it was made of. A stretch of a tenth of the window has three times its errors, and says as much as
-    that. `length_s`: of a full window.
+    Parameters
+    ----------
+    window : WindowStatistics
+        What it was made of. A stretch of a tenth of the window has three times its errors, and says as much as that.
+    length_s : float
+        Of a full window.
     """
     vague = _VAGUE * max(1.0, length_s / window.duration_s) ** 0.5
     found = {reading.name: reading for reading in diagnosis.parameters}
@@ -214,8 +226,10 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
 def with_shared_error(diagnosis: Diagnosis, covariance: FloatArray) -> Diagnosis:
     """Return the diagnosis with an error added that all windows share.
 
-    `covariance` (6, 6): of the values that changes are relative to, in the scale of the errors, in the order of
-    `PARAMETERS`.
+    Parameters
+    ----------
+    covariance : ndarray, shape (6, 6)
+        Of the values that changes are relative to, in the scale of the errors, in the order of `PARAMETERS`.
     """
     readings = diagnosis.evaluable
     at = [PARAMETERS.index(reading.name) for reading in readings]
