@@ -193,7 +193,7 @@ def main() -> int:
     for limit in options.files or ([160] if small else [256, 1024]):
         with tempfile.TemporaryDirectory() as folder, monitor(Path(folder), limit, timeouts) as one:
             for attack in ATTACKS:
-                count = min(attack.count, 80) if small else attack.count
+                count = min(attack.count // 10, 80) if small else attack.count
                 faults += campaign(one, attack, count, seconds, limit, 60.0 if small else 120.0)
             if one.process.poll() is not None:
                 faults.append(f"{limit} files: the monitor ended")

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from benchmarks.studies.paper import PaperEquation, PaperNetwork, paper_rows
 from models.diagnosis.networks.relation import HIDDEN, Network
@@ -38,6 +37,8 @@ def train_paper_network(
     EstimationError
         If there is no window, or the fit does not come out finite.
     """
+    import torch  # noqa: PLC0415  # for whoever trains: it takes seconds
+
     if not windows:
         raise EstimationError(f"{machine.name}: no training window for equation {equation.number}, expected at least 1")
     rows = [paper_rows(equation, window, machine) for window in windows]

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-import asammdf
 import h5py
 import nptdms
 import numpy as np
@@ -130,6 +129,8 @@ def write_tdms(path: Path, columns: Columns) -> None:
 
 
 def write_mf4(path: Path, columns: Columns) -> None:
+    import asammdf  # noqa: PLC0415  # it takes seconds, and every worker reads this module
+
     with asammdf.MDF(version="4.10") as file:
         file.start_time = datetime(2026, 1, 31, 12, tzinfo=UTC)
         units = (("x", "um"), ("v", "mm/s"), ("a", "rad"))

@@ -11,7 +11,7 @@ from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign
 
-DURATION_S = 80.0
+DURATION_S = 74.0
 SEED = 7_730_001
 
 

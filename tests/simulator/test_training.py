@@ -1,5 +1,10 @@
-"""Training in small: the bundle that it writes, that it is repeatable, and that the networks learn."""
+"""Training in small: the bundle that it writes, that it is repeatable, and that the networks learn.
 
+What imports torch is imported in the tests: it takes seconds, and every worker reads this module.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +17,8 @@ from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import read_equation
-from models.diagnosis.networks.training import calibrate, calibrate_networks, train_network, train_networks
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
-from simulator.training.command import train_for
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 
@@ -34,11 +37,23 @@ def windows(machine: Machine, purpose: Purpose, stream: int, count: int, kept: t
     return [simulate_window(draw, number) for number in range(count)]
 
 
+@contextmanager
+def briefly() -> Iterator[None]:
+    """Fewer steps and fewer draws for the principal directions, where nothing is asked of how accurate networks are."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
+        patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 300)
+        yield
+
+
 @pytest.fixture(scope="module")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
     """As the command makes it, of fewer windows than it admits."""
+    from simulator.training.command import train_for  # noqa: PLC0415
+
     folder: Path = tmp_path_factory.mktemp("trained") / "bundle"
-    train_for(SHORT, folder, 4, DRAWS, SEED, 1)
+    with briefly():
+        train_for(SHORT, folder, 4, DRAWS, SEED, 1)
     return load_bundle(folder, SHORT)
 
 
@@ -59,9 +74,12 @@ def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_t
 
 
 def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_told(bundle: Bundle) -> None:
+    from models.diagnosis.networks.training import train_network  # noqa: PLC0415
+
     equation, told = EQUATIONS[1], list[float]()
     material = windows(SHORT, Purpose.TRAINING, 1, 4, equation.kept_nominal)
-    again = train_network(equation, material, SHORT, SEED, told.append)
+    with briefly():
+        again = train_network(equation, material, SHORT, SEED, told.append)
     first = next(one for one in bundle.networks if one.equation.number == equation.number)
     np.testing.assert_array_equal(first.network.W1, again.network.W1)
     assert told[-1] == 1.0
@@ -69,6 +87,8 @@ def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_tol
 
 
 def test_amortised_networks_learn_and_are_trained_again_to_the_last_bit(bundle: Bundle, recipe: FeatureDraws) -> None:
+    from models.diagnosis.networks.training import train_networks  # noqa: PLC0415
+
     draws = recipe
     again = train_networks(
         SHORT,
@@ -103,6 +123,8 @@ def test_a_batch_depends_on_seed_and_number_alone(recipe: FeatureDraws) -> None:
 
 
 def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
+    from models.diagnosis.networks.training import train_networks  # noqa: PLC0415
+
     draws = recipe
     with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
         train_networks(
@@ -118,6 +140,8 @@ def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
 
 
 def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
+    from models.diagnosis.networks.training import calibrate, train_network  # noqa: PLC0415
+
     equation = EQUATIONS[0]
     network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 24, equation.kept_nominal), SHORT, SEED)
     trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 10, equation.kept_nominal), SHORT)
@@ -130,6 +154,8 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
 
 
 def test_calibration_finds_the_true_size_of_the_errors() -> None:
+    from models.diagnosis.networks.training import calibrate_networks  # noqa: PLC0415
+
     shipped = load_bundle("lab", LAB).amortised
     assert shipped is not None
     draws = (Draw(LAB, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
