@@ -8,21 +8,13 @@ from typing import Literal
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.sensor_faults import FaultKind
 
-MODEL = "model"
-"""The alarm that says: outside the model."""
-
-SHAPE = "shape"
-"""The alarm that says: where no equation can be evaluated, a channel's vibration is not as it was."""
-
-STREAM_LOST = "stream-lost"
-"""The alarm that says: no data come any more."""
-
+MODEL = "model"  # the alarm that says: outside the model
+SHAPE = "shape"  # the alarm that says: where no equation can be evaluated, a channel's vibration is not as it was
+STREAM_LOST = "stream-lost"  # the alarm that says: no data come any more
 FAULT, OVERLOADED = "monitor-fault", "monitor-overloaded"
 """The alarms on the monitor itself: a defect, or a history that refuses; and a computer that cannot keep up."""
 
-DATA = "data-"
-"""What the names of all alarms of data health begin with."""
-
+DATA = "data-"  # what the names of all alarms of data health begin with
 GAP, CLOCK, CONFLICT, PHASE_REFERENCE = "data-gap", "data-clock", "data-conflict", "data-phase-reference"
 
 

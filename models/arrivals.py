@@ -30,8 +30,7 @@ from itertools import combinations
 from models.ingest import EARLIER_COURSES, Course
 from models.signals.block import SampleBlock
 
-_ALWAYS_NS = 2**63
-"""Later than any time of a block."""
+_ALWAYS_NS = 2**63  # later than any time of a block
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,13 +215,11 @@ def _same(one: Arrived, other: Arrived) -> bool:
 
 
 _REMEMBERED = 256
-_AHEAD = 64
-"""Blocks by which a publisher may be ahead of what was heard of it, for it to be the same one."""
+_AHEAD = 64  # blocks by which a publisher may be ahead of what was heard of it, for it to be the same one
 _MOST = 8
 _RETURNS = 6
 """Times that each of two publishers has gone on after the other: more than blocks out of order can amount to."""
-_HORIZON_S = 300.0
-"""Length of the data that came in, from all, in which these are counted."""
+_HORIZON_S = 300.0  # length of the data that came in, from all, in which these are counted
 
 
 @dataclass(slots=True, eq=False)

@@ -24,7 +24,6 @@ _MAGIC = b"RWCP"
 _VERSION = 2
 _HEADER = struct.Struct("<4sH16s")
 _LENGTH = struct.Struct("<I")
-
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 

@@ -50,7 +50,6 @@ class UnexplainedError(EstimationError):
 
 _Model = TypeVar("_Model", bound=BaseModel)
 _Place = tuple[int | str, ...]
-
 _LONGEST_SHOWN = 80
 _TYPES = {
     "float": "a number",

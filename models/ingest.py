@@ -28,15 +28,11 @@ from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 
-EARLIER_COURSES = 64
-"""Courses that are remembered, so that repetitions of their blocks are known as such."""
-
-
+EARLIER_COURSES = 64  # courses that are remembered, so that repetitions of their blocks are known as such
 _LATEST_NS = 7_258_118_400_000_000_000
 """The year 2200: a clock that says more is broken, and times beyond 2262 fit nowhere."""
 
-_SURELY_S = 1.0
-"""A block that is next in sequence but later than this has a wrong time rather than a gap before it."""
+_SURELY_S = 1.0  # a block that is next in sequence but later than this has a wrong time rather than a gap before it
 
 
 class Reason(StrEnum):

@@ -184,20 +184,14 @@ def _draw(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.asarray(factor @ rng.standard_normal(scale.size), dtype=np.float64)
 
 
-NONLINEAR = frozenset({"crack", "rub"})
-"""Anomalies that need this plant."""
-
+NONLINEAR = frozenset({"crack", "rub"})  # anomalies that need this plant
 _GRAVITY_M_PER_S2 = 9.81
-_PARTS = 8
-"""Parts of a sample in which the crack's stiffness is constant and the contact force is sampled."""
-
+_PARTS = 8  # parts of a sample in which the crack's stiffness is constant and the contact force is sampled
 _NODES = 32
 _HARMONICS = 10
 _RUN_IN_S = 5.0
 _PIECE_S = 0.5
-_RUNAWAY = 1e3
-"""Radius in clearances beyond which friction has obviously driven the disc off."""
-
+_RUNAWAY = 1e3  # radius in clearances beyond which friction has obviously driven the disc off
 _Y2, _Z2 = STATE_INDEX["y2"], STATE_INDEX["z2"]
 
 

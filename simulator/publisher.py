@@ -27,10 +27,8 @@ from models.signals.link import LinkSettings
 from simulator.stream import JSON_ENCODING, BlockEncoding, BlockStream, RunSummary, block_message, descriptor_payload
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
-
 _LOCAL = LinkSettings(connect=(DEFAULT_CONNECT,))
-_CACHE_BLOCKS = 1200
-"""Two minutes in blocks of 0.1 s: a window, and the time that a monitor takes to come back."""
+_CACHE_BLOCKS = 1200  # two minutes in blocks of 0.1 s: a window, and the time that a monitor takes to come back
 _CACHE_TRUTH = 100
 _HEARTBEAT_S = 0.5
 _POLL_S = 0.02

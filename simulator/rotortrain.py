@@ -21,8 +21,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-_TRAIN = ("torch", "matplotlib", "jinja2", "markupsafe")
-"""What the extra "train" brings."""
+_TRAIN = ("torch", "matplotlib", "jinja2", "markupsafe")  # what the extra "train" brings
 _SEED = 20260101
 _CORES = os.cpu_count() or 1
 _WINDOWS, _DRAWS = 160, 150_000

@@ -66,11 +66,8 @@ class TruthRecord(BaseModel):
 
 
 JSON_ENCODING = "application/json"
-
 BlockEncoding = Literal["raw", "arrow"]
-
-BlockStream = Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]
-"""What `simulator.stream.blocks` returns."""
+BlockStream = Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]  # what `simulator.stream.blocks` returns
 
 
 @dataclass(frozen=True, slots=True)

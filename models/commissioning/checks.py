@@ -20,16 +20,11 @@ _FEWEST_HOPS = 8
 _FEW_WINDOWS = 6
 _MUCH_REFUSED, _TOO_MUCH_REFUSED = 0.01, 0.2
 _STEADY_SPEED = 0.05
-_STEADY_LEVEL = 2.0
-"""Ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute."""
-SAME_SPEED = 0.03
-"""Relative difference within which speeds count as one."""
-_MOST_OUTSIDE = 0.8
-"""Share of healthy windows outside a theory beyond which it is not the machine's."""
-_RATE = 1e-3
-"""Probability that a healthy machine fails a comparison of its own windows."""
-_LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5
-"""Share of a foreign line in the power of a channel's random part."""
+_STEADY_LEVEL = 2.0  # ratio of the rms between the halves of a recording; chance alone reaches 1.3 in half a minute
+SAME_SPEED = 0.03  # relative difference within which speeds count as one
+_MOST_OUTSIDE = 0.8  # share of healthy windows outside a theory beyond which it is not the machine's
+_RATE = 1e-3  # probability that a healthy machine fails a comparison of its own windows
+_LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
 
 class Check(BaseModel):

@@ -34,7 +34,6 @@ from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)
-
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 """What cannot be identified beside stiffness and damping: masses and shaft."""
 
@@ -92,8 +91,7 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
 
 
 _RPM = 30 / np.pi
-SPEED_MARGIN = 0.05
-"""The relations hold no speed; a bearing's film and the unbalance response do."""
+SPEED_MARGIN = 0.05  # the relations hold no speed; a bearing's film and the unbalance response do
 LEVEL_MARGIN = 10.0
 """Random vibration this many times below or above what was seen is another regime: a stopped drive, a mounting come
 loose, a bearing lifted through its clearance."""

@@ -144,12 +144,10 @@ def _streams(path: Path) -> list[str]:
     return [key for key in summarize_recording(path).messages if key.endswith("/stream")]
 
 
-_STEADY = 1.35
-"""Fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data."""
+_STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data
 _STANDS_OUT = 8.0
 _NEIGHBOURHOOD_HZ = 4.0
-_LOBE = 2
-"""A Hann window spreads a line over two bins on either side."""
+_LOBE = 2  # a Hann window spreads a line over two bins on either side
 _FEWEST_SEGMENTS = 6
 _HARMONICS = 12
 

@@ -21,13 +21,11 @@ from models.physics.rotor import PARAMETERS, M_matrix, Q_matrix, RotorParameters
 from models.signals.block import FloatArray
 
 _ROUNDS = 8
-_SETTLED = 0.02
-"""Largest relative move of a parameter in the last round."""
+_SETTLED = 0.02  # largest relative move of a parameter in the last round
 _START_DAMPING = 0.05
 _LEAST_TOLERANCE = 0.05
 _CUTOFF_HZ = (20.0, 300.0)
-_NO_STIFFNESS = 1e5
-"""N/m, in a plane without any sensor: nothing will be read of it."""
+_NO_STIFFNESS = 1e5  # N/m, in a plane without any sensor: nothing will be read of it
 _SCALES = tuple(np.geomspace(0.1, 10.0, 9).tolist())
 
 

@@ -41,15 +41,10 @@ from models.errors import EstimationError
 from models.machine import Machine, MachineFile
 from models.signals.channels import ACCELERATIONS
 
-Read = tuple[str, int, Diagnosis]
-"""Recording, end of the window, and what was read in it."""
-
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how much of it is done, and how much there is."""
-
+Read = tuple[str, int, Diagnosis]  # recording, end of the window, and what was read in it
+Progress = Callable[[str, int, int], None]  # told what is being done, how much of it is done, and how much there is
 _TABLES = ("rotor", "operation", "condition")
-_SHORTEST_HOPS = 4
-"""Fewer say too little of how they scatter."""
+_SHORTEST_HOPS = 4  # fewer say too little of how they scatter
 
 
 @dataclass(frozen=True, slots=True)

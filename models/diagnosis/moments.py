@@ -261,9 +261,7 @@ def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:
 
 
 SpeedSource = Literal["phase reference", "estimated", "unknown"]
-
-STEADY = 0.01
-"""Range of the hops' speeds, relative, up to which one set of coefficients serves the window."""
+STEADY = 0.01  # range of the hops' speeds, relative, up to which one set of coefficients serves the window
 
 
 @dataclass(frozen=True, slots=True)

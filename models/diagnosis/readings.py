@@ -33,8 +33,7 @@ def beyond(value: float, limit: float) -> tuple[str, str]:
     return text, f"{limit:g}"
 
 
-_SEEN = 3.0
-"""Standard errors from which a vector has a direction."""
+_SEEN = 3.0  # standard errors from which a vector has a direction
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +119,7 @@ class UnbalanceVector:
         return math.degrees(math.atan2(y, x)) if seen else None
 
 
-Z95 = 1.959964
-"""Standard errors on either side of a 95 % interval."""
+Z95 = 1.959964  # standard errors on either side of a 95 % interval
 
 
 def interval_95(value: float, standard_error: float, least: float = -math.inf) -> tuple[float, float]:

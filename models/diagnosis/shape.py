@@ -31,14 +31,11 @@ from models.errors import EstimationError
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Shape
 
-FEWEST_WINDOWS = 4
-"""Healthy windows without which nothing is learned; six or more are advised, from several recordings."""
-
+FEWEST_WINDOWS = 4  # healthy windows without which nothing is learned; six or more are advised, from several recordings
 _DIRECTIONS = 3
 _SPEED_TOLERANCE = 0.03
 _LAG_TOLERANCE_S = 1e-9
 _LEAST_P = 1e-300
-
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 

@@ -147,9 +147,7 @@ def combined_waveform(hops: Waveform) -> Waveform:
     )
 
 
-N_BANDS = 24
-"""Bands in which the powers of a hop are kept."""
-
+N_BANDS = 24  # bands in which the powers of a hop are kept
 _ComplexArray = npt.NDArray[np.complex128]
 
 

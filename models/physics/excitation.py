@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from models.physics.rotor import M_matrix, RotorParameters, system_A
 from models.signals.block import FloatArray
 
-FILTER_DAMPING = math.sqrt(0.5)
-"""Damping ratio of the colouring filter: Butterworth, flat up to the cutoff."""
+FILTER_DAMPING = math.sqrt(0.5)  # damping ratio of the colouring filter: Butterworth, flat up to the cutoff
 
 
 class Source(BaseModel):

@@ -76,9 +76,7 @@ _TABLE = {
     "EI": _Parameter("shaft_E_Pa", "shaft bending stiffness", "stiffness"),
 }
 
-PARAMETERS: tuple[str, ...] = tuple(_TABLE)
-"""The diagnosed parameters, in the order in which they are always reported."""
-
+PARAMETERS: tuple[str, ...] = tuple(_TABLE)  # the diagnosed parameters, in the order in which they are always reported
 FAULT_FIELDS: Mapping[str, str] = MappingProxyType({name: row.field for name, row in _TABLE.items()})
 """Parameters a fault can change, and the field that carries them (EI through Young's modulus)."""
 
@@ -120,9 +118,7 @@ def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> Ro
     return rotor.model_copy(update=update)
 
 
-COORDINATES = ("y1", "y2", "psi", "z1", "z2", "phi")
-"""Order of the six degrees of freedom (Eq. 13)."""
-
+COORDINATES = ("y1", "y2", "psi", "z1", "z2", "phi")  # order of the six degrees of freedom (Eq. 13)
 STATES = (*COORDINATES, *(f"{name}_dot" for name in COORDINATES))
 """Order of the twelve states (Eq. 2); the paper counts them from 1."""
 
@@ -192,8 +188,7 @@ def system_A(rotor: RotorParameters, speed_rad_s: float) -> FloatArray:
     return A
 
 
-_LEAST = -1.0
-"""Nothing that is positive by nature can lose all it has and still be there to be read."""
+_LEAST = -1.0  # nothing that is positive by nature can lose all it has and still be there to be read
 
 
 def impossible(change: float, quantity: str) -> str:

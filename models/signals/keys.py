@@ -105,7 +105,6 @@ class MachineKeys:
 _Flow = Literal["ingress", "egress"]
 _USER = re.compile(r"[^\s:]+")
 _PLACE = re.compile(r"(\*|[A-Za-z0-9][A-Za-z0-9_-]{0,63})/(\*|[A-Za-z0-9][A-Za-z0-9_-]{0,63})")
-
 _MODEL = MachineKeys("s", "m")
 
 
@@ -121,7 +120,6 @@ _MONITOR_ALIVE = _topics(_MODEL.monitor_alive)
 _ALIVE = ("/alive/**",)
 _ALL = ("/**", "/**/@adv/**")
 _EVERYWHERE = (f"{PREFIX}/**", f"{PREFIX}/**/@adv/**")
-
 _LISTENED = ("declare_subscriber", "query")
 _LIVELINESS = ("declare_liveliness_subscriber", "liveliness_query")
 _INTERESTS = (*_LISTENED, "declare_queryable", *_LIVELINESS)

@@ -37,8 +37,7 @@ from models.errors import RecordingError
 
 _CHUNK_BYTES = 256 * 1024
 _LENGTH = struct.Struct("<I")
-_RECORD_HEAD = 1 + 8
-"""Bytes before a record's contents in the file: its kind and its length."""
+_RECORD_HEAD = 1 + 8  # bytes before a record's contents in the file: its kind and its length
 _PLAIN, _PREFIXED = "none", "attachment-1"
 _LIBRARY = "rotorwatch"
 _PROFILE = "rotorwatch-1"

@@ -171,9 +171,7 @@ def _structs(table: Table, slot: int, size: int) -> list[tuple[int, int]]:
 
 BLOCK_ENCODING = "application/x-rotorwatch-block"
 ARROW_ENCODING = "application/vnd.apache.arrow.stream"
-REPLAY_MARK = ";replay"
-"""Ends the encoding of a block that is replayed on a machine's own keys."""
-
+REPLAY_MARK = ";replay"  # ends the encoding of a block that is replayed on a machine's own keys
 _HEADER = struct.Struct("<qQdBBHI")  # start_ns, sequence, rate_hz, dtype, channels, run, samples
 HEADER_BYTES = _HEADER.size
 _DTYPES: dict[int, np.dtype[np.float32] | np.dtype[np.float64]] = {1: np.dtype("<f4"), 2: np.dtype("<f8")}

@@ -20,9 +20,7 @@ from simulator.commission.verdict import percent
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """After Okabe and Ito: told apart with any colour vision."""
 INK, GREY, BAND = "#1c2530", "#66727f", "#edf2f6"
-WIDTH_IN = 10.0
-"""Width of every picture, so that letters are of one size on the page."""
-
+WIDTH_IN = 10.0  # width of every picture, so that letters are of one size on the page
 _GRID = "#dde2e6"
 _VARIABLES = {INK: "--ink", GREY: "--grey", _GRID: "--line", BAND: "--band"} | {
     colour: f"--c{number}" for number, colour in enumerate(COLOURS)

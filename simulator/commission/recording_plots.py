@@ -16,8 +16,7 @@ from simulator.commission.verdict import channel_text, channel_unit
 _PANEL_IN = 1.6
 _STYLES = ("-", "--", ":")
 _BEYOND_BAND = 0.04
-_NEAR, _LINE = 0.04, 0.003
-"""Of the width of the picture: speeds that share a mark, and a mark that is drawn as a line."""
+_NEAR, _LINE = 0.04, 0.003  # of the width of the picture: speeds that share a mark, and a mark that is drawn as a line
 _PLACES = ("y1", "z1", "y2", "z2", "psi", "phi")
 _ORDERS = ("", "_dot", "_ddot")
 _RPM = 30 / np.pi

@@ -127,12 +127,10 @@ def listed(words: Iterable[str]) -> str:
 
 
 VERDICT_TEXT = {"commissioned": "commissioned", "limited": "commissioned with limits", "refused": "not commissioned"}
-_ALIKE = 2.0
-"""Errors add as squares: beside one twice as large, the other makes a tenth of the total."""
+_ALIKE = 2.0  # errors add as squares: beside one twice as large, the other makes a tenth of the total
 _MOST_OF_A_LOSS = 0.99
 _MANY_TIMES = 10.0
-_LONGEST_WINDOW_S = 3600.0
-"""A machine file allows no longer one."""
+_LONGEST_WINDOW_S = 3600.0  # a machine file allows no longer one
 
 
 def dominant(parameter: ParameterSummary) -> str:

@@ -26,7 +26,6 @@ from simulator.stream import blocks
 from simulator.timeline import Condition
 
 _BLOCK_S = 5.0
-
 _REALISATION, _EXCITATION, _ANOMALY = 1, 2, 3
 
 
@@ -41,40 +40,32 @@ class Purpose(IntEnum):
 class Layout(IntEnum):
     """How the stochastic force reaches the machine."""
 
-    ONE_SOURCE = 0
-    """One source of random direction over all six degrees of freedom."""
-    INDEPENDENT = 1
-    """Independent sources of random level at bearing and disc, horizontal and vertical."""
+    ONE_SOURCE = 0  # one source of random direction over all six degrees of freedom
+    INDEPENDENT = 1  # independent sources of random level at bearing and disc, horizontal and vertical
 
 
 class Excitation(IntEnum):
     """Colour and level of the stochastic force."""
 
-    SECOND_ORDER = 0
-    """What the likelihood assumes: second-order low-pass, one cutoff for all sources, constant level."""
+    SECOND_ORDER = 0  # what the likelihood assumes: second-order low-pass, one cutoff for all sources, constant level
     FIRST_ORDER = 1
     FOURTH_ORDER = 2
-    OWN_CUTOFFS = 3
-    """Second order, each source with a cutoff of its own; with one source the same as SECOND_ORDER."""
-    HUMP = 4
-    """A hump at 40 to 120 Hz, damping ratio 0.3 to 0.5, with 30 to 80 % of the variance, common to all sources."""
-    DRIFT = 5
-    """The level doubles or halves over the window, linearly or in eight equal ratios; drawn at random."""
+    OWN_CUTOFFS = 3  # second order, each source with a cutoff of its own; with one source the same as SECOND_ORDER
+    HUMP = 4  # a hump at 40 to 120 Hz, damping ratio 0.3 to 0.5, with 30 to 80 % of the variance, common to all sources
+    DRIFT = 5  # the level doubles or halves over the window, linearly or in eight equal ratios; drawn at random
 
 
 class Anomaly(IntEnum):
     """A fault that none of the diagnosed parameters describes; in parentheses its size if none is given."""
 
     NONE = 0
-    CRACK = 1
-    """Breathing crack (0.3 of the shaft's bending stiffness); halved until the machine is stable at its speed."""
+    CRACK = 1  # breathing crack (0.3 of the shaft's bending stiffness); halved until the machine is stable at its speed
     RUB = 2
     """Disc touching the casing (0.2 of the shaft's stiffness), clearance 1.5 times the disc's radial rms.
 
     That is a contact a tenth of the time. Sizes of 1 and more may be unstable on lightly damped machines.
     """
-    ADDED_MASS = 3
-    """Even deposit on the disc (0.07 of its mass)."""
+    ADDED_MASS = 3  # even deposit on the disc (0.07 of its mass)
     GAIN_DRIFT = 4
     """One vibration channel reads wrong (by 0.1), from the start or growing over the window; drawn at random."""
 
@@ -95,7 +86,7 @@ class Draw:
     kept_nominal: tuple[str, ...] = PARAMETERS  # parameters that do not vary
     spread: float = 0.3  # the others vary uniformly by up to this relative amount
     faults: dict[str, float] = field(default_factory=dict)  # fixed relative changes on top
-    layout: Layout | None = None  # none draws one of them at random for each window
+    layout: Layout | None = None  # None draws one of them at random for each window
     # All windows share the condition drawn for number 0; only the realisation of force and noise differs. The number 0
     # itself has another realisation than without.
     fixed_condition: bool = False

@@ -37,14 +37,11 @@ from models.signals.block import FloatArray
 from simulator.training.draws import Purpose
 
 _Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex128])
-
 LOG_RATIO = 0.55
 """Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
 would teach the network to answer "healthy" to everything small."""
 
-_PER_ROTOR = 3
-"""Windows that share a rotor and a speed; excitation, noise, unbalance and realisation are their own."""
-
+_PER_ROTOR = 3  # windows that share a rotor and a speed; excitation, noise, unbalance and realisation are their own
 _HANN = (np.float32(1 / 6), np.float32(4 / 6), np.float32(1 / 6))
 
 
@@ -219,17 +216,11 @@ def _complex_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> npt.NDA
     return np.asarray(parts.view(np.complex64) * np.float32(np.sqrt(0.5)))
 
 
-KEPT = 28
-"""Principal components of every function of frequency; the next ones vary less than the sampling error."""
-
-_STREAM = 50
-"""Keeps the random numbers apart from those of the relation networks' training windows."""
-
+KEPT = 28  # principal components of every function of frequency; the next ones vary less than the sampling error
+_STREAM = 50  # keeps the random numbers apart from those of the relation networks' training windows
 _BASIS_DRAWS = 1500
-_AT_ONCE = 24
-"""Conditions worked on together: more do not fit into a processor's cache and take twice the time."""
-_REALISATIONS = 4
-"""Windows drawn from one condition."""
+_AT_ONCE = 24  # conditions worked on together: more do not fit into a processor's cache and take twice the time
+_REALISATIONS = 4  # windows drawn from one condition
 _CONSISTENCY_ERROR = 0.1
 """Sampling error of the agreement of displacement and rate, in logarithms: larger than the real one (0.02 to 0.05), so
 that no network reads a parameter from an agreement that real sensors do not have."""

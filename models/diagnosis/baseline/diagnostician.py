@@ -107,10 +107,8 @@ def _row_suspicion(diagnosis: Diagnosis, row: Row, single: tuple[str, ...], test
 
 _WORST_ERROR = 0.2
 _RPM = 30 / math.pi
-_GONE = -0.95
-"""A loss beyond this is no loss of a bearing."""
-_LOST = 0.5
-"""Standard error of a stiffness beyond which the relation does not hold in the window at all."""
+_GONE = -0.95  # a loss beyond this is no loss of a bearing
+_LOST = 0.5  # standard error of a stiffness beyond which the relation does not hold in the window at all
 _SURELY_OUTSIDE = 8.0
 
 

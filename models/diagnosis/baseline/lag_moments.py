@@ -24,9 +24,7 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-LONGEST_LAG_STEP_S = 0.00126
-"""Spacing of the lags beyond which a kernel has too few points."""
-
+LONGEST_LAG_STEP_S = 0.00126  # spacing of the lags beyond which a kernel has too few points
 _SPACING_S = 0.004
 _FALLEN_TO = 0.1
 _FALLEN_AT = 3.0  # width times the band's end for cos⁸: a tenth is left there, and a seventieth a third further up
@@ -143,12 +141,8 @@ def passband_hz(deepest: int, band_to_hz: float) -> float:
     return float(min(band_to_hz, f[np.argmax(through < _FALLEN_TO * through[0])]))
 
 
-LAG_FROM_S = 0.036
-"""Shortest lag where the memory of the excitation is not known yet: enough for a cutoff of 25 Hz."""
-
-SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S = 0.014, 0.045
-"""What the shortest lag may be once the memory is known."""
-
+LAG_FROM_S = 0.036  # shortest lag where the memory of the excitation is not known yet: enough for a cutoff of 25 Hz
+SHORTEST_LAG_FROM_S, LONGEST_LAG_FROM_S = 0.014, 0.045  # what the shortest lag may be once the memory is known
 _RANK = 1e-4
 
 

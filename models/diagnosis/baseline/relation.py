@@ -33,8 +33,7 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-_RISE = 4.0
-"""What the criterion gains at two standard errors if the covariance is right."""
+_RISE = 4.0  # what the criterion gains at two standard errors if the covariance is right
 _STEPS = 2.0 * 1.4 ** np.arange(10)
 """Distances that are tried, standard errors: to about twenty times what the covariance says."""
 
@@ -90,8 +89,7 @@ _MEMORY = 1.1
 _CUTOFFS_HZ = np.geomspace(10.0, 300.0, 40)
 _NOISES = np.concatenate([[0.0], np.geomspace(1e-6, 10.0, 25)])
 _LOWEST_RAISED_HZ = 8.0
-_COHERENT = 0.9
-"""Share of the coherence that one source explains: 0.97 to 1 with one, 0.6 to 0.85 with several."""
+_COHERENT = 0.9  # share of the coherence that one source explains: 0.97 to 1 with one, 0.6 to 0.85 with several
 
 
 def lag_beyond_memory(row: RowWindow, combination: FloatArray) -> float:

@@ -19,8 +19,7 @@ from dataclasses import dataclass
 
 from models.physics.rotor import PARAMETERS
 
-ORDERS = ("", "_dot", "_ddot")
-"""Endings of the state variable's name by order of the derivative that is measured."""
+ORDERS = ("", "_dot", "_ddot")  # endings of the state variable's name by order of the derivative that is measured
 
 _PLACES = {
     "y1": "bearing, horizontal",

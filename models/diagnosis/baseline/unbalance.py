@@ -16,9 +16,7 @@ from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 
-SPEED_TOLERANCE = 0.03
-"""Relative deviation of the speed within which synchronous vectors are compared."""
-
+SPEED_TOLERANCE = 0.03  # relative deviation of the speed within which synchronous vectors are compared
 _NEIGHBOURS = (2, 8)
 
 

@@ -29,8 +29,7 @@ from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
 _MOST_STEPS = 6
-_FARTHEST = 0.15
-"""Relative change of the expected spectra (rms) beyond which the weights are no longer their own."""
+_FARTHEST = 0.15  # relative change of the expected spectra (rms) beyond which the weights are no longer their own
 _NEWS = 3.0
 """Standard errors by which a stretch may differ from the window it is part of without being searched for itself."""
 _LEAST_EXCESS_Z, _EXCESS_MARGIN = 4.0, 1.15

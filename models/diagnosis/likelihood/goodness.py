@@ -26,8 +26,7 @@ _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 _UNEQUAL = "shaft stiffer in y than in z"
 _MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
 _LEAST_SUSPECT_Z = 5.0
-_LINEAR = 0.5
-"""Largest one-step estimate that is worth telling: farther out it only says that the thing is not small."""
+_LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
 _LEAST_INFORMATION = 1e-4
 """An alternative of which less than this is left beside the model's own parameters cannot be told from them."""
 
@@ -174,8 +173,7 @@ _MOST_NOISE = 0.3
 """Share of the motion that the theory takes for noise of the sensors though displacement and velocity show it alike,
 up to which a rotor can be seen behind it: a spectrum without resonances is taken for coloured noise, and what is left
 of it fits any rotor."""
-_UNSHARED = 5.0
-"""How many times more noise one sensor of a pair may have than the other."""
+_UNSHARED = 5.0  # how many times more noise one sensor of a pair may have than the other
 MOST_MISFIT, _BLIND = 4.0, 10.0
 """Misfit that is no chance, and how many times less certain than on the rotor as it was most of its parameters may be
 then. Within the model nothing makes them less certain than three times; a line that passes for the one resonance of a

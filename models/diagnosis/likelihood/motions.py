@@ -48,8 +48,7 @@ _FINE_KERNEL = (
 _FINE_KERNEL = _FINE_KERNEL / _FINE_KERNEL.sum()
 _RINGING = 8.0
 """Decay over a segment, in nepers, of the longest ringing mode in the band, below which the fine grid is used."""
-_PER_BANDWIDTH = 0.5
-"""Width of a group over the half-power bandwidth of the nearest mode."""
+_PER_BANDWIDTH = 0.5  # width of a group over the half-power bandwidth of the nearest mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +151,7 @@ def _shared_scatter(edges: list[tuple[int, int]], n_bins: int) -> FloatArray:
 
 
 _ABSENT = -1
-_GAIN_FLOOR = 0.005
-"""Error of a pair's gain that no window length removes: unequal noise and leakage pass for as much."""
+_GAIN_FLOOR = 0.005  # error of a pair's gain that no window length removes: unequal noise and leakage pass for as much
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,7 @@ LOG_NOISE = float(np.log(1e-3))
 _WEAK = 0.05
 """Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of
 low rank, or a channel without visible noise, leaves them undetermined."""
-_COLOUR = 1.0
-"""The same for the noise's colour."""
+_COLOUR = 1.0  # the same for the noise's colour
 _STRENGTHS = np.geomspace(0.5, 2000, 24)
 """How strongly the forces' own colours may be pulled towards none. The window itself says which (D. J. C. MacKay,
 Neural Computation 4 (1992)): forces of one colour cost next to nothing, and a hump is left alone."""

@@ -36,12 +36,8 @@ from models.signals.block import FloatArray
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
 """Parameters that shape the spectra, in the order of the parameter vector."""
 
-SHAPES = 8
-"""Polynomials in √f for the colour of every degree of freedom's force."""
-
-ROWS, COLUMNS = np.tril_indices(6)
-"""Elements of C and T in the order of the parameter vector."""
-
+SHAPES = 8  # polynomials in √f for the colour of every degree of freedom's force
+ROWS, COLUMNS = np.tril_indices(6)  # elements of C and T in the order of the parameter vector
 _BEARING_DOFS = (0, 0, 3, 3)
 
 

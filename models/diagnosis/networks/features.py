@@ -25,7 +25,6 @@ from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray
 
 Float32Array = npt.NDArray[np.float32]
-
 _BANDS = 8
 _FLOOR = 1e-9
 _LEAST_VARIANCE = 1e-3

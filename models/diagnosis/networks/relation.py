@@ -22,8 +22,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation as EquationReading
 from rotorwatch.records.windows import Parameter
 
-HIDDEN = 15
-"""Neurons of the hidden layer, as in the paper."""
+HIDDEN = 15  # neurons of the hidden layer, as in the paper
 
 
 @dataclass(frozen=True, slots=True)

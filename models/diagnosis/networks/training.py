@@ -37,12 +37,10 @@ from models.signals.block import FloatArray
 
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25
-
 _LEVELS = [0.9, 0.95]
 _NORMAL = np.array([[1.644854], [Z95]])
 """Quantiles of |z| that calibrate the standard errors, and the normal distribution's: two scatter less than one."""
-_MAD = 1.4826
-"""Median absolute deviation to standard deviation."""
+_MAD = 1.4826  # median absolute deviation to standard deviation
 
 
 def train_network(
@@ -136,20 +134,16 @@ def calibrate(trained: EquationNetwork, windows: Sequence[WindowStatistics], mac
 
 
 _BATCH = 512
-_PASSES = 3.0
-"""How often a window is seen on average."""
+_PASSES = 3.0  # how often a window is seen on average
 _BUFFER = 160_000
-_WARM_UP = 24_000
-"""Windows in the buffer before the first step: they standardise the inputs."""
+_WARM_UP = 24_000  # windows in the buffer before the first step: they standardise the inputs
 _RATE, _RATE_RISES_OVER = 2e-3, 100
 _WEIGHT_DECAY = 2e-2
-_USUAL = 0.3
-"""Standard deviation of the drawn logarithmic ratios, about: the networks work in units of it."""
+_USUAL = 0.3  # standard deviation of the drawn logarithmic ratios, about: the networks work in units of it
 _NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
 _KNOTS = 3
 _QUANTILES = (0.9, 0.95, 0.98)
-_FEWEST = 30
-"""Windows of one group from which a quantile is believed."""
+_FEWEST = 30  # windows of one group from which a quantile is believed
 
 
 class _Learner:

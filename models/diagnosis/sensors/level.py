@@ -15,20 +15,16 @@ from models.signals.block import FloatArray
 from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
-STILL_S = 0.25
-"""Longest time for which equal samples are put down to quantisation."""
+STILL_S = 0.25  # longest time for which equal samples are put down to quantisation
 FLAT_PART = 0.005
 """Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there."""
-STEP_SPREADS = 8.0
-"""Healthy standard deviations of a hop's mean that a step of it must exceed."""
-STEP_PART = 0.3
-"""Part of the channel's rms that it must exceed besides."""
+STEP_SPREADS = 8.0  # healthy standard deviations of a hop's mean that a step of it must exceed
+STEP_PART = 0.3  # part of the channel's rms that it must exceed besides
 DRIFT_PART = 3.0
 """A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel."""
 MOVED_PART = 3.0
 """The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages."""
-_TOGETHER = 0.3
-"""Where another displacement moves by at least this part of a displacement's step, the shaft has moved."""
+_TOGETHER = 0.3  # where another displacement moves by at least this part of a displacement's step, the shaft has moved
 
 
 def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
@@ -175,10 +171,8 @@ def _shaft(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
     return any(abs(changes[i]) > _TOGETHER * abs(changes[column]) for i in places if i != column)
 
 
-MOST_ERRORS = 6.0
-"""Standard errors beyond which levels jump; the most probable of all moments is tested."""
-_STAY = 3.0
-"""Standard errors within which everything else must stay."""
+MOST_ERRORS = 6.0  # standard errors beyond which levels jump; the most probable of all moments is tested
+_STAY = 3.0  # standard errors within which everything else must stay
 LEAST_JUMP = 0.08
 _FEWEST_SIDE = 3
 

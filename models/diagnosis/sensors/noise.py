@@ -36,28 +36,23 @@ Calibrated on 384 healthy windows, each under another excitation than its refere
 exponential tail through the uppermost tenth reaches 10 in one of a million windows with four pairs of sensors, in ten
 of a million with two.
 """
-ALONE_RISE = 40.0
-"""The same where no other pair says what all sensors do."""
+ALONE_RISE = 40.0  # the same where no other pair says what all sensors do
 FLOOR_RISE, FLOOR_ALONE = 80.0, 5.0
 """Where a motion has one sensor: floor of what the others do not explain over the healthy one, and beyond theirs.
 
 The machine itself may do that under another excitation, though hardly with a flat floor: one of a thousand windows by
 the same reckoning.
 """
-FLOOR_FLAT = 0.5
-"""Part of the bands that must lie on the floor: a machine's own spectrum has resonances."""
+FLOOR_FLAT = 0.5  # part of the bands that must lie on the floor: a machine's own spectrum has resonances
 LINE_RISE = 4.0
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
 """Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line."""
-_FEWEST = 4
-"""Channels that are needed to tell which of them rose alone."""
+_FEWEST = 4  # channels that are needed to tell which of them rose alone
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
 """Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated."""
-_CLEAR = 0.5
-"""One of two sensors is the noisy one if its noise exceeds the other's by more than this part of both."""
+_CLEAR = 0.5  # one of two sensors is the noisy one if its noise exceeds the other's by more than this part of both
 _SURE = 0.15
-_COUNTS = 2.0
-"""Bands in which the noise rose by less do not count for its size."""
+_COUNTS = 2.0  # bands in which the noise rose by less do not count for its size
 
 
 def _alone(rise: FloatArray) -> FloatArray:

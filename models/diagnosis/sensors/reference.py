@@ -57,20 +57,15 @@ class Naming:
         return f"{value_SI / channel.to_si:.3g} {channel.unit}"
 
 
-_FLAT = 2.0
-"""Bands within this factor of the lowest lie on the floor."""
-_LINE_BINS, _BLOCK = 3, 24
-"""Bins that hold a line in Hann segments, and bins of its surroundings."""
-_STANDS_OUT = 6.0
-"""A bin this far above the median of its surroundings may hold a line."""
-_OWN = 4.0
-"""So far it must stand out still where the other channels have explained what they can."""
+_FLAT = 2.0  # bands within this factor of the lowest lie on the floor
+_LINE_BINS, _BLOCK = 3, 24  # bins that hold a line in Hann segments, and bins of its surroundings
+_STANDS_OUT = 6.0  # a bin this far above the median of its surroundings may hold a line
+_OWN = 4.0  # so far it must stand out still where the other channels have explained what they can
 _HARMONIC = 0.002
 """Relative distance from a multiple of half the speed within which a line is the shaft's, beside its range."""
 _RIDGE = 1e-9
 _LEAKAGE = 1.0
-_LEFT = 0.1
-"""Least part of a difference that is still called noise after leakage was taken out."""
+_LEFT = 0.1  # least part of a difference that is still called noise after leakage was taken out
 _SMOOTHED = 3
 
 

@@ -13,11 +13,8 @@ from models.diagnosis.verdict.stretch import Stretch, from_scale, to_scale
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Agreement, Detectable, Parameter
 
-MONTH_S = 30 * 86400.0
-"""The month of "false alarms per month", s."""
-
-_FURTHER = 0.25
-"""Share of the rate at which a parameter is wrongly added to one that is known to have changed."""
+MONTH_S = 30 * 86400.0  # the month of "false alarms per month", s
+_FURTHER = 0.25  # share of the rate at which a parameter is wrongly added to one that is known to have changed
 
 
 @dataclass(frozen=True, slots=True)

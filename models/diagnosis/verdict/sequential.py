@@ -37,8 +37,7 @@ on 150 healthy stretches of each length and either layout of sources (rotor kit,
 by more than 1.04."""
 
 _DOUBLINGS = 6
-_LOWER = np.tril_indices(len(PARAMETERS))
-"""Elements of an information matrix that are remembered: it is symmetric."""
+_LOWER = np.tril_indices(len(PARAMETERS))  # elements of an information matrix that are remembered: it is symmetric
 _CONTRADICTION_RATE = 1e-7
 """Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data."""
 

@@ -29,8 +29,7 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 
 _LINEAR = frozenset({"e"})
-_MOST_LOSS = -0.95
-"""A parameter that reads as lost altogether has no logarithm."""
+_MOST_LOSS = -0.95  # a parameter that reads as lost altogether has no logarithm
 _LEAST_OWN = 1e-4
 """Least share of the total variance that is a window's own: its covariance and the shared one are both estimates."""
 
@@ -193,14 +192,10 @@ def added(stretches: Sequence[Stretch]) -> Stretch:
     )
 
 
-_VAGUE = 0.2
-"""A larger standard error of a full window is no longer one: the reading says nothing."""
-
+_VAGUE = 0.2  # a larger standard error of a full window is no longer one: the reading says nothing
 _NO_PHASE = "no phase reference"
 _NO_ROTOR = "cannot be told without the rotor's own parameters"
-
-_PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}
-"""Plane in which a bearing parameter acts."""
+_PLANES = {"k_by": "y", "c_by": "y", "k_bz": "z", "c_bz": "z"}  # plane in which a bearing parameter acts
 
 
 def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) -> Diagnosis:
