@@ -10,7 +10,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -48,15 +47,9 @@ VersionOption = Annotated[
 
 def bars(*, remaining: bool = False) -> Progress:
     """Bars that are not started yet, with the time taken and, if wanted, the time that remains."""
-    columns: list[ProgressColumn] = [
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-    ]
-    if remaining:
-        columns.append(TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    times = (TimeElapsedColumn(), TimeRemainingColumn()) if remaining else (TimeElapsedColumn(),)
+    shown = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*shown, *times, console=Console(stderr=True))
 
 
 @contextmanager

@@ -163,14 +163,13 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
     def answer(query: zenoh.Query) -> None:
         query.reply(keys.descriptor, descriptor, encoding=JSON_ENCODING)
 
-    declared: list[zenoh.ext.AdvancedPublisher | zenoh.Queryable[None] | zenoh.LivelinessToken] = []
     outlets = _Outlets(
         stream=outlet(keys.stream, zenoh.Priority.DATA_HIGH, _CACHE_BLOCKS),
         descriptor=outlet(keys.descriptor, zenoh.Priority.DATA_HIGH, 1),
         truth=outlet(keys.truth, zenoh.Priority.DATA_HIGH, _CACHE_TRUTH),
     )
-    declared += [outlets.stream, outlets.descriptor, outlets.truth]
-    declared.append(session.declare_queryable(keys.descriptor, answer))
+    declared: list[zenoh.ext.AdvancedPublisher | zenoh.Queryable[None] | zenoh.LivelinessToken]
+    declared = [outlets.stream, outlets.descriptor, outlets.truth, session.declare_queryable(keys.descriptor, answer)]
     declared.append(session.liveliness().declare_token(keys.publisher_alive))
     try:
         yield outlets

@@ -261,12 +261,9 @@ def _exit_codes() -> Iterator[None]:
     """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
     try:
         yield
-    except MachineFileError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(2) from error
     except RotorwatchError as error:
         typer.echo(str(error), err=True)
-        raise typer.Exit(1) from error
+        raise typer.Exit(2 if isinstance(error, MachineFileError) else 1) from error
 
 
 @contextmanager

@@ -8,7 +8,7 @@ within a window.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
@@ -58,17 +58,8 @@ class Waveform:
         """
         mean, rms, minimum, maximum, step = checked(arrays, "levels", np.float64, (5, None))
         at_minimum, at_maximum, longest_run = checked(arrays, "counts", np.int64, (3, mean.size))
-        return cls(
-            n_samples=int(checked(arrays, "n_samples", np.int64, ())),
-            mean=mean,
-            rms=rms,
-            minimum=minimum,
-            maximum=maximum,
-            at_minimum=at_minimum,
-            at_maximum=at_maximum,
-            longest_run=longest_run,
-            step=step,
-        )
+        n_samples = int(checked(arrays, "n_samples", np.int64, ()))
+        return cls(n_samples, mean, rms, minimum, maximum, at_minimum, at_maximum, longest_run, step)
 
 
 def waveform_of(samples: FloatArray) -> Waveform:
@@ -97,32 +88,14 @@ def waveform_of(samples: FloatArray) -> Waveform:
         if first.size < n_samples - 1:
             step[row] = np.abs(np.diff(x[row])[~equal[row]]).min()
     x -= mean[:, None]
-    return Waveform(
-        n_samples=n_samples,
-        mean=mean,
-        rms=np.sqrt(np.einsum("ij,ij->i", x, x) / n_samples),
-        minimum=minimum,
-        maximum=maximum,
-        at_minimum=at_minimum,
-        at_maximum=at_maximum,
-        longest_run=longest_run,
-        step=step,
-    )
+    rms = np.sqrt(np.einsum("ij,ij->i", x, x) / n_samples)
+    return Waveform(n_samples, mean, rms, minimum, maximum, at_minimum, at_maximum, longest_run, step)
 
 
 def stacked_waveform(hops: Sequence[Waveform]) -> Waveform:
     """Put hops of equal length below each other, shape (n_hops, n_channels)."""
-    return Waveform(
-        n_samples=hops[0].n_samples,
-        mean=np.stack([hop.mean for hop in hops]),
-        rms=np.stack([hop.rms for hop in hops]),
-        minimum=np.stack([hop.minimum for hop in hops]),
-        maximum=np.stack([hop.maximum for hop in hops]),
-        at_minimum=np.stack([hop.at_minimum for hop in hops]),
-        at_maximum=np.stack([hop.at_maximum for hop in hops]),
-        longest_run=np.stack([hop.longest_run for hop in hops]),
-        step=np.stack([hop.step for hop in hops]),
-    )
+    _, *names = (one.name for one in fields(Waveform))
+    return Waveform(hops[0].n_samples, *(np.stack([getattr(hop, name) for hop in hops]) for name in names))
 
 
 def combined_waveform(hops: Waveform) -> Waveform:

@@ -16,22 +16,9 @@ from models.commissioning.commissioned import Commissioned, KnowledgeLevel
 from models.commissioning.healthy import HealthyRecording
 from models.errors import RecordingError
 from models.machine import MachineFile
+from simulator.commission import verdict
 from simulator.commission.plots import draw_budget, draw_readings, inline_svg
 from simulator.commission.recording_plots import Portrait, draw_levels, draw_spectra, ordered, portrait
-from simulator.commission.verdict import (
-    budget_sentences,
-    channel_text,
-    channel_unit,
-    dominant,
-    duration,
-    headline,
-    listed,
-    next_steps,
-    parameter_value,
-    percent,
-    significant,
-    smallest_change,
-)
 
 _COMPARED = {
     KnowledgeLevel.FULL: "Each healthy window against the parameters in the machine file.",
@@ -137,18 +124,6 @@ _EQUATIONS = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class _Row:
-    """One line of the table of recordings, in words."""
-
-    name: str
-    start: str
-    used: str
-    gaps: str
-    refused: str
-    speed: str
-
-
 def write_report(
     directory: Path,
     report: CommissioningReport,
@@ -198,7 +173,12 @@ def _render(
     commissioned: Commissioned | None,
 ) -> str:
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"percent": percent, "duration": duration, "channel": channel_text, "listed": listed}
+    environment.filters |= {
+        "percent": verdict.percent,
+        "duration": verdict.duration,
+        "channel": verdict.channel_text,
+        "listed": verdict.listed,
+    }
     template = resources.files("simulator.commission").joinpath(_TEMPLATE).read_text(encoding="utf-8")
     portraits = [portrait(number, one) for number, one in enumerate(recordings, start=1)]
     hashes = {} if commissioned is None else {one.name: one.sha256 for one in commissioned.recordings}
@@ -206,14 +186,14 @@ def _render(
         report=report,
         description=description,
         commissioned=commissioned,
-        headline=headline(report),
-        steps=next_steps(report),
-        budget=budget_sentences(report),
+        headline=verdict.headline(report),
+        steps=verdict.next_steps(report),
+        budget=verdict.budget_sentences(report),
         identified=any(one.identified is not None for one in report.parameters),
         wished=sorted({one.wished for one in report.parameters if one.wished is not None}),
-        dominant=dominant,
-        smallest_change=smallest_change,
-        parameter_value=parameter_value,
+        dominant=verdict.dominant,
+        smallest_change=verdict.smallest_change,
+        parameter_value=verdict.parameter_value,
         equations_text=_EQUATIONS[report.level],
         symbols=_symbols(report),
         pictures=pictures_of(report, [one.name for one in recordings], [one for one in portraits if one is not None]),
@@ -227,7 +207,7 @@ def _render(
 def _symbols(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
     """Quantities that the table of equations calls by their symbols, in words."""
     words = {word.strip(",;") for one in report.equations for word in one.reason.split()}
-    return tuple((word, channel_text(word)) for word in sorted(words) if channel_text(word) != word)
+    return tuple((word, verdict.channel_text(word)) for word in sorted(words) if verdict.channel_text(word) != word)
 
 
 def _speed_range(report: CommissioningReport) -> str:
@@ -244,14 +224,15 @@ def _levels(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
     found = []
     for state in ordered(report.conditions.rms):
         edges = report.conditions.rms[state]
-        unit, scale = channel_unit(state)
-        low, high = (significant(scale * edge, 3) for edge in edges)
-        found.append((channel_text(state), f"{low if low == high else f'{low} to {high}'} {unit}"))
+        unit, scale = verdict.channel_unit(state)
+        low, high = (verdict.significant(scale * edge, 3) for edge in edges)
+        found.append((verdict.channel_text(state), f"{low if low == high else f'{low} to {high}'} {unit}"))
     return tuple(found)
 
 
-def _row(recording: HealthyRecording, seen: Portrait | None) -> _Row:
-    gaps = f"{recording.gaps}, {duration(recording.missing_s)} missing" if recording.gaps else "none"
+def _row(recording: HealthyRecording, seen: Portrait | None) -> dict[str, str]:
+    """One line of the table of recordings, in words."""
+    gaps = f"{recording.gaps}, {verdict.duration(recording.missing_s)} missing" if recording.gaps else "none"
     refused = ", ".join(f"{count} {reason}" for reason, count in recording.refused) or "none"
     start = speed = "–"
     if seen is not None:
@@ -261,4 +242,5 @@ def _row(recording: HealthyRecording, seen: Portrait | None) -> _Row:
         if np.isfinite(seen.speed_hz):
             speed = f"{seen.statistics.speed_rad_s * _RPM:.0f} rpm"
             speed += ", estimated" if seen.statistics.speed_source == "estimated" else ""
-    return _Row(recording.name, start, duration(recording.duration_s), gaps, refused, speed)
+    used = verdict.duration(recording.duration_s)
+    return {"name": recording.name, "start": start, "used": used, "gaps": gaps, "refused": refused, "speed": speed}

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
-from models.commissioning.commission import CommissioningReport, HealthyReading, ParameterSummary
+from models.commissioning.commission import CommissioningReport, ParameterSummary
 from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.stretch import to_scale
 from simulator.commission.verdict import percent
@@ -129,7 +129,7 @@ def _readings(axes: Axes, parameter: ParameterSummary, recordings: Sequence[str]
     labelled = math.ceil(len(recordings) / _MOST_LABELS)
     for name in dict.fromkeys(recordings):
         number = recordings.index(name)
-        own = sorted((one for one in parameter.readings if one.recording == name), key=_time)
+        own = sorted((one for one in parameter.readings if one.recording == name), key=lambda one: one.end_ns)
         if not own:
             continue
         if start:
@@ -149,10 +149,6 @@ def _readings(axes: Axes, parameter: ParameterSummary, recordings: Sequence[str]
     axes.tick_params(axis="x", length=0)
     axes.grid(visible=False, axis="x")
     axes.set_title(f"{parameter.text} ({parameter.name})")
-
-
-def _time(reading: HealthyReading) -> int:
-    return reading.end_ns
 
 
 def draw_budget(report: CommissioningReport) -> Figure | None:

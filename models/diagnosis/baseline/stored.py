@@ -4,7 +4,10 @@ Numbers are written with as many digits as it takes to read the same number back
 same diagnoses as the one that was stored.
 """
 
-from typing import Annotated, Literal, Self
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -13,13 +16,13 @@ from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import Baseline, HeldOutReading, LeftOut
 from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import SynchronousVectors
-from models.signals.block import FloatArray
 
 _STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Vector = tuple[_Number, ...]
 _Matrix = tuple[_Vector, ...]
+_Kind = TypeVar("_Kind")
 
 
 class RelationRecord(BaseModel):
@@ -117,14 +120,7 @@ class BaselineRecord(BaseModel):
         pydantic.ValidationError
             If a number in it is not finite.
         """
-        return cls(
-            relations=tuple(None if one is None else _relation(one) for one in baseline.relations),
-            reasons=baseline.reasons,
-            covariance=_rows(baseline.covariance),
-            rotations=tuple(_rotation(one) for one in baseline.rotations),
-            duration_s=float(baseline.duration_s),
-            consistency=tuple(_left_out(one) for one in baseline.consistency),
-        )
+        return cls.model_validate_json(json.dumps(asdict(baseline), default=lambda numbers: numbers.tolist()))
 
     def diagnostician(self) -> BaselineDiagnostician:
         """What reads windows against it."""
@@ -133,27 +129,16 @@ class BaselineRecord(BaseModel):
     def baseline(self) -> Baseline:
         """The baseline, to the last bit."""
         return Baseline(
-            relations=tuple(None if one is None else _restored(one) for one in self.relations),
-            reasons=self.reasons,
-            covariance=_array(self.covariance),
-            rotations=tuple(
-                SynchronousVectors(
-                    one.coordinates, _array(one.vectors), _array(one.covariance), one.speed_rad_s, one.absolute
-                )
-                for one in self.rotations
+            relations=tuple(
+                None if one is None else _with_arrays(Relation, one, "coefficients", "covariance")
+                for one in self.relations
             ),
+            reasons=self.reasons,
+            covariance=np.array(self.covariance, dtype=np.float64),
+            rotations=tuple(_with_arrays(SynchronousVectors, one, "vectors", "covariance") for one in self.rotations),
             duration_s=self.duration_s,
             consistency=tuple(
-                LeftOut(
-                    row=one.row,
-                    window=one.window,
-                    condition=one.condition,
-                    agreements=tuple(
-                        HeldOutReading(each.parameter, each.change, each.standard_error) for each in one.agreements
-                    ),
-                    misfit=one.misfit,
-                    degrees_of_freedom=one.degrees_of_freedom,
-                )
+                LeftOut(**dict(one) | {"agreements": tuple(HeldOutReading(**dict(each)) for each in one.agreements)})
                 for one in self.consistency
             ),
         )
@@ -166,59 +151,6 @@ def _check_covariance(of: str, matrix: _Matrix, size: int) -> None:
         raise ValueError(f"{of}: a variance is negative")
 
 
-def _relation(one: Relation) -> RelationRecord:
-    return RelationRecord(
-        row=one.row,
-        states=one.states,
-        references=one.references,
-        coefficients=tuple(one.coefficients.tolist()),
-        covariance=_rows(one.covariance),
-        misfit=float(one.misfit),
-        degrees_of_freedom=one.degrees_of_freedom,
-        allowance=float(one.allowance),
-    )
-
-
-def _restored(one: RelationRecord) -> Relation:
-    return Relation(
-        row=one.row,
-        states=one.states,
-        references=one.references,
-        coefficients=_array(one.coefficients),
-        covariance=_array(one.covariance),
-        misfit=one.misfit,
-        degrees_of_freedom=one.degrees_of_freedom,
-        allowance=one.allowance,
-    )
-
-
-def _rotation(one: SynchronousVectors) -> RotationRecord:
-    return RotationRecord(
-        coordinates=one.coordinates,
-        vectors=tuple(one.vectors.tolist()),
-        covariance=_rows(one.covariance),
-        speed_rad_s=float(one.speed_rad_s),
-        absolute=one.absolute,
-    )
-
-
-def _left_out(one: LeftOut) -> _LeftOutRecord:
-    return _LeftOutRecord(
-        row=one.row,
-        window=one.window,
-        condition=one.condition,
-        agreements=tuple(
-            _AgreementRecord(parameter=each.parameter, change=each.change, standard_error=each.standard_error)
-            for each in one.agreements
-        ),
-        misfit=float(one.misfit),
-        degrees_of_freedom=one.degrees_of_freedom,
-    )
-
-
-def _rows(matrix: FloatArray) -> _Matrix:
-    return tuple(tuple(row) for row in matrix.tolist())
-
-
-def _array(numbers: _Vector | _Matrix) -> FloatArray:
-    return np.array(numbers, dtype=np.float64)
+def _with_arrays(kind: Callable[..., _Kind], record: BaseModel, *arrays: str) -> _Kind:
+    fields = dict(record)
+    return kind(**fields | {name: np.array(fields[name], dtype=np.float64) for name in arrays})

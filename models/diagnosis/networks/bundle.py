@@ -12,7 +12,7 @@ Loading refuses a bundle that is damaged or was trained for another machine, and
 
 import hashlib
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -165,9 +165,7 @@ def save_bundle(
                 inputs=trained.equation.input_names,
                 parameters=trained.equation.parameters,
                 hidden=HIDDEN,
-                healthy=HealthyEntry(
-                    windows=healthy.windows, msd=healthy.msd, z_scale=healthy.z_scale, spread=healthy.spread
-                ),
+                healthy=HealthyEntry(**asdict(healthy)),
             )
         )
     entry = None
@@ -252,7 +250,7 @@ def load_bundle(name_or_path: str | Path, machine: Machine) -> Bundle:
 
 def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> EquationNetwork:
     """One equation's network, checked against this program's equation table."""
-    where = f"{directory}: equation {entry.number}"
+    where, healthy = f"{directory}: equation {entry.number}", entry.healthy
     try:
         equation = equation_by_number(entry.number)
     except KeyError:
@@ -262,7 +260,7 @@ def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> Equation
         ("inputs", entry.inputs, equation.input_names),
         ("parameters", entry.parameters, equation.parameters),
         ("hidden", entry.hidden, HIDDEN),
-        ("lengths of z_scale and spread", _lengths(entry.healthy), (len(entry.parameters),) * 2),
+        ("lengths of z_scale and spread", (len(healthy.z_scale), len(healthy.spread)), (len(entry.parameters),) * 2),
     )
     for field, found, expected in checks:
         if found != expected:
@@ -278,8 +276,7 @@ def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> Equation
         if name == "input_scale" and not np.all(array > 0):
             raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
         parts.append(array)
-    healthy = Healthy(entry.healthy.windows, entry.healthy.msd, entry.healthy.z_scale, entry.healthy.spread)
-    return EquationNetwork(equation, Network(*parts), healthy)
+    return EquationNetwork(equation, Network(*parts), Healthy(**dict(healthy)))
 
 
 def _amortised_arrays(amortised: AmortisedNetworks) -> _Arrays:
@@ -298,10 +295,7 @@ def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> Amorti
             "channels": amortised.states,
             "equations": tuple(network.equation for network in amortised.networks),
             "layers": LAYERS,
-            "calibration": {
-                name: {"bias": one.bias, "log_deviation": one.log_deviation, "z_scale": one.z_scale}
-                for name, one in amortised.calibration.items()
-            },
+            "calibration": {name: asdict(one) for name, one in amortised.calibration.items()},
             "calibration_windows": training.network_calibration_windows or training.calibration_windows,
             "novelty_limit": amortised.novelty_limit,
             "log_range": amortised.log_range,
@@ -354,14 +348,8 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
         )
         for number in entry.equations
     )
-    calibration = {
-        name: Calibration(one.bias, one.log_deviation, one.z_scale) for name, one in entry.calibration.items()
-    }
+    calibration = {name: Calibration(**dict(one)) for name, one in entry.calibration.items()}
     return AmortisedNetworks(entry.channels, basis, networks, calibration, entry.novelty_limit, entry.log_range)
-
-
-def _lengths(healthy: HealthyEntry) -> tuple[int, int]:
-    return len(healthy.z_scale), len(healthy.spread)
 
 
 def _differences(trained: Any, present: Any, path: str = "") -> list[str]:

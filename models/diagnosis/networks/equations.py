@@ -190,22 +190,6 @@ def _disc_response_to_e(rotor: RotorParameters, speed_rad_s: float) -> float:
     return float(vector[0].real)
 
 
-def _stiffness_y(rotor: RotorParameters) -> tuple[float, ...]:
-    return (rotor.k_by_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0)
-
-
-def _damping_y(rotor: RotorParameters) -> tuple[float, ...]:
-    return (0.0, 0.0, rotor.c_by_N_s_per_m / rotor.m1_kg, 0.0)
-
-
-def _stiffness_z(rotor: RotorParameters) -> tuple[float, ...]:
-    return (rotor.k_bz_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0)
-
-
-def _damping_z(rotor: RotorParameters) -> tuple[float, ...]:
-    return (0.0, 0.0, rotor.c_bz_N_s_per_m / rotor.m1_kg, 0.0)
-
-
 def _shaft_over_inertia(rotor: RotorParameters) -> tuple[float, ...]:
     """Coefficients of y1, y2 and psi in row 3; the gyroscopic input does not scale with the shaft."""
     L = rotor.shaft_length_m
@@ -219,7 +203,10 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
         title="bearing, horizontal",
         target=Term("y1_dot", rate_reference=True),
         inputs=(Term("y1"), Term("y2"), Term("y1_dot"), Term("y2_dot", rate_reference=True)),
-        signatures={"k_by": _stiffness_y, "c_by": _damping_y},
+        signatures={
+            "k_by": lambda rotor: (rotor.k_by_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0),
+            "c_by": lambda rotor: (0.0, 0.0, rotor.c_by_N_s_per_m / rotor.m1_kg, 0.0),
+        },
     ),
     SynchronousEquation(number="29", title="unbalance at the disc"),
     Equation(
@@ -234,7 +221,10 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
         title="bearing, vertical",
         target=Term("z1_dot", rate_reference=True),
         inputs=(Term("z1"), Term("z2"), Term("z1_dot"), Term("z2_dot", rate_reference=True)),
-        signatures={"k_bz": _stiffness_z, "c_bz": _damping_z},
+        signatures={
+            "k_bz": lambda rotor: (rotor.k_bz_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0),
+            "c_bz": lambda rotor: (0.0, 0.0, rotor.c_bz_N_s_per_m / rotor.m1_kg, 0.0),
+        },
     ),
 )
 """The equations in the paper's order; adding a row here is all it takes."""
