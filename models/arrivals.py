@@ -86,8 +86,6 @@ class Arrivals:
 
         Parameters
         ----------
-        block : SampleBlock
-            As decoded, of whatever form.
         schema_hash : str
             Schema hash the sender named, empty if it named none.
 
@@ -128,24 +126,11 @@ class Arrivals:
         return tuple(found)
 
     def expect(self, run: int, sequence: int) -> None:
-        """Go on in a stream of which everything before a block is there already.
-
-        Parameters
-        ----------
-        run : int
-        sequence : int
-            Of the next block.
-        """
+        """Go on in a stream of which everything before a block is there already."""
         self.resume((Course(run, 0, -_ALWAYS_NS, sequence, _ALWAYS_NS),))
 
     def resume(self, courses: Iterable[Course]) -> None:
-        """Go on where a restored gate stands.
-
-        Parameters
-        ----------
-        courses : iterable of Course
-            `Gate.courses`.
-        """
+        """Go on where a restored gate stands."""
         self._waiting.clear()
         self._earlier.clear()
         self._earlier.extend(courses)

@@ -60,10 +60,6 @@ def to_bytes(arrays: Mapping[str, np.ndarray]) -> bytes:
 def from_bytes(data: bytes) -> dict[str, np.ndarray]:
     """Named arrays from what `to_bytes` gave.
 
-    Parameters
-    ----------
-    data : bytes
-
     Raises
     ------
     CheckpointError
@@ -117,10 +113,6 @@ def checked(
 
     Parameters
     ----------
-    arrays : mapping of str to ndarray
-    name : str
-    kind : type
-        Element type.
     shape : tuple of int or None
         Expected shape; None where any size will do.
 

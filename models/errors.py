@@ -103,8 +103,6 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
 
     Parameters
     ----------
-    fields : object
-        What the file holds.
     place : object
         What the messages begin with: the file, or the argument.
 

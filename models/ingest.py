@@ -102,13 +102,7 @@ class Course:
 
 
 class Gate:
-    """Judges the blocks of one machine in the order of their arrival.
-
-    Parameters
-    ----------
-    machine : MachineFile
-        What the stream must look like.
-    """
+    """Judges the blocks of one machine in the order of their arrival."""
 
     def __init__(self, machine: MachineFile) -> None:
         self._name = f"{machine.site}/{machine.name}"
@@ -163,8 +157,6 @@ class Gate:
 
         Parameters
         ----------
-        block : SampleBlock
-            As decoded.
         schema_hash : str
             Schema hash the sender named, empty if it named none.
         """
@@ -180,10 +172,6 @@ class Gate:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called.
-
-        Parameters
-        ----------
-        arrays : mapping of str to ndarray
 
         Raises
         ------

@@ -74,10 +74,6 @@ def publish(
     on_block : callable, optional
         Called with the summary so far after each block.
 
-    Returns
-    -------
-    RunSummary
-
     Raises
     ------
     MachineFileError

@@ -31,9 +31,6 @@ def record(
         From `simulator.stream.blocks`.
     path : Path
         Name of the recording; it is ``.part`` until complete.
-    encoding : {"raw", "arrow"}
-    overwrite : bool
-        Replace an existing recording.
     stop : threading.Event, optional
         When set, the recording ends after the current block and is complete.
     on_block : callable, optional

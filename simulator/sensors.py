@@ -111,11 +111,8 @@ class SensorBank:
 
     Parameters
     ----------
-    sensors : Sensors
-        Settings from the scenario.
     rms : ndarray, shape (12,)
         Theoretical rms of the states at the start, SI.
-    faults : mapping of channel name to (sample number, active faults), ascending
     rngs : sequence of numpy.random.Generator
         One per channel.
     """
@@ -143,13 +140,7 @@ class SensorBank:
         ]
 
     def measure(self, plant: PlantSamples, first: int) -> npt.NDArray[np.float32] | FloatArray:
-        """Return all channels of consecutive plant samples; shape (n_samples, n_channels), the machine's dtype.
-
-        Parameters
-        ----------
-        first : int
-            Sample number of the first one.
-        """
+        """Return all channels of consecutive plant samples; shape (n_samples, n_channels), the machine's dtype."""
         n_samples = plant.theta_rad.size
         samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)
         for column, sensor in enumerate(self._sensors):

@@ -71,13 +71,7 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
 
 
 def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
-    """Whether a sensor was at fault while the recordings were made.
-
-    Parameters
-    ----------
-    findings : mapping of str to sequence of SensorFault
-        By recording.
-    """
+    """Whether a sensor was at fault while the recordings were made."""
     name = "sensors"
     faults: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
     for recording, found in findings.items():
@@ -168,8 +162,6 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
     ----------
     differences : sequence of str
         Sentences on recordings that differ from the others.
-    speeds_rad_s : mapping of str to float
-        Mean speed of each recording.
     """
     name = "recordings agree"
     if len(speeds_rad_s) < 2:
@@ -199,11 +191,6 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
 
     With one source every channel is a filtered copy of every other, and relations that differ by far fit the same
     recording.
-
-    Parameters
-    ----------
-    windows : mapping of str to sequence of WindowStatistics
-        By recording.
     """
     name = "ways of excitation"
     alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]

@@ -246,8 +246,6 @@ def commission(
         The version before.
     why : str
         Why it is commissioned again.
-    progress : callable, optional
-        Told what is being done, how much of it is done, and how much there is.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]

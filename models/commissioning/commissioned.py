@@ -259,8 +259,6 @@ def load_commissioned(directory: Path, machine: MachineFile, *, same_description
 
     Parameters
     ----------
-    directory : Path
-        The bundle.
     same_description : bool
         Whether channels, window and physics must be as they were.
 

@@ -67,8 +67,6 @@ def healthy_from_blocks(
 
     Parameters
     ----------
-    name : str
-        What the recording is called.
     blocks : iterable of (SampleBlock, str)
         Blocks in their order, each with the hash of the channel descriptor that its sender named, or "".
     until_s : float, optional

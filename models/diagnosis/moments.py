@@ -85,7 +85,6 @@ def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
 
     Parameters
     ----------
-    machine : MachineFile
     lagged : bool
         Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
     """
@@ -178,8 +177,6 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
 
     Parameters
     ----------
-    plan : Plan
-        Sizes.
     samples : ndarray, shape (preamble + hop, n_states [+ 1])
         SI samples as `Plan.to_si` gives them, without a gap; the first `preamble` rows are history.
     level : ndarray, shape (n_states,)

@@ -56,7 +56,6 @@ class Recall:
 
     Parameters
     ----------
-    plan : Plan
     level : ndarray, shape (n_states,) or (0,)
         What was subtracted from all samples.
     arrays : mapping of str to ndarray

@@ -186,11 +186,6 @@ class SlidingWindow:
 
     The same samples give the same hops, whatever blocks they come in. A gap costs the hop it falls into; earlier hops
     stay until the window's allowed span has passed.
-
-    Parameters
-    ----------
-    plan : Plan
-        Sizes.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -227,8 +222,6 @@ class SlidingWindow:
         ----------
         samples : ndarray, shape (n_samples, n_states [+ 1])
             Finite SI samples as `Plan.to_si` gives them.
-        start_ns : int
-            Time of the first sample.
 
         Yields
         ------
@@ -294,8 +287,6 @@ class SlidingWindow:
         ----------
         samples : ndarray, shape (n_samples, n_channels)
             As received, not yet in SI units.
-        start_ns : int
-            Time of the first sample.
         newest : bool
             Whether no later one has been there: everything may be complete now.
         """
@@ -347,11 +338,6 @@ class SlidingWindow:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called; without moments the window `lacks` its samples until they are recalled.
-
-        Parameters
-        ----------
-        arrays : mapping of str to ndarray
-            What `checkpoint` gave.
 
         Raises
         ------

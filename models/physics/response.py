@@ -104,8 +104,6 @@ def discretise(A: FloatArray, B: FloatArray, step_s: float) -> DiscreteSystem:
         Stable system matrix.
     B : ndarray, shape (n, p)
         Input matrix of unit-intensity white noise.
-    step_s : float
-        Sampling interval, s.
 
     Returns
     -------
@@ -138,8 +136,6 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
 
     Parameters
     ----------
-    system : DiscreteSystem
-        F and G.
     state : ndarray, shape (n,)
         State before the first step.
     noise : ndarray, shape (n_samples, n)

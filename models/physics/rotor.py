@@ -92,8 +92,6 @@ def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> Ro
 
     Parameters
     ----------
-    rotor : RotorParameters
-        Parameters before the change.
     relative_changes : mapping of str to float
         Parameter (one of `PARAMETERS`) to relative change, above -1; -0.2 is a loss of 20 %.
 

@@ -92,8 +92,6 @@ def integrated(acceleration: FloatArray, rate_hz: float, times: int, high_pass_h
     ----------
     acceleration : ndarray, shape (n,)
         Equally spaced, without a gap.
-    rate_hz : float
-        Samples per second.
     times : int
         1 for velocity, 2 for displacement.
     high_pass_hz : float

@@ -273,11 +273,6 @@ class LinkSettings(BaseModel):
     def check_reach(self, place: str) -> None:
         """Check that others than programs on this computer have grants, or may do everything in so many words.
 
-        Parameters
-        ----------
-        place : str
-            Settings file or command line, for the message.
-
         Raises
         ------
         MachineFileError
@@ -332,11 +327,6 @@ class LinkSettings(BaseModel):
         """Why a session could not be opened, in plain words.
 
         Zenoh does not tell a program why it was turned away; what may be the reason with these settings is listed.
-
-        Parameters
-        ----------
-        error : str
-            Zenoh's own text.
         """
         if "Address already in use" in error:
             return "address already in use: does another program listen there?"

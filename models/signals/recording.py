@@ -76,8 +76,6 @@ class RecordingWriter:
 
     Parameters
     ----------
-    path : Path
-        Final name.
     overwrite : bool
         Replace a recording that is already there, or a ``.part`` that a crash left.
 
@@ -243,8 +241,6 @@ def read_recording(
 
     Parameters
     ----------
-    keys : collection of str, optional
-        Only these keys.
     from_ns, to_ns : int, optional
         Only log times from `from_ns` up to, and without, `to_ns`.
 

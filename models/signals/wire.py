@@ -34,8 +34,6 @@ def write_arrow(samples: npt.NDArray[Any], metadata: dict[str, str]) -> bytes:
     Parameters
     ----------
     samples : ndarray, shape (n_samples, n_channels)
-    metadata : dict of str to str
-        Metadata of the schema.
     """
     import pyarrow as pa  # noqa: PLC0415  # 50 ms that only users of Arrow should pay
 
@@ -249,7 +247,6 @@ def may_be_block(payload: bytes, attachment: bytes, encoding: str, n_channels: i
 
     Parameters
     ----------
-    payload, attachment, encoding : bytes, bytes, str
     n_channels, most_samples : int
         Of the machine's blocks.
     """

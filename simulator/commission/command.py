@@ -117,12 +117,6 @@ def commission_machine(
 
     Parameters
     ----------
-    name : str
-        Machine file.
-    healthy : sequence of Path
-        Recordings.
-    out : Path
-        Directory of the bundle.
     first_s : float, optional
         Use only the first seconds of every recording.
     wished : float, optional

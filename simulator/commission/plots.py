@@ -67,10 +67,6 @@ def inline_svg(name: str, label: str, paint: Callable[[], Figure | None]) -> Mar
         What it shows, for those who cannot see it.
     paint : callable
         Makes the figure, of width `WIDTH_IN`, or None if there is nothing to draw.
-
-    Returns
-    -------
-    Markup or None
     """
     written = StringIO()
     with style.context(["default", _STYLE]):

@@ -46,13 +46,7 @@ class Portrait:
 
 
 def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
-    """Statistics of a whole recording; None if it holds no usable data.
-
-    Parameters
-    ----------
-    number : int
-        Its number on the page.
-    """
+    """Statistics of a whole recording; None if it holds no usable data."""
     hops = recording.hops
     if not hops:
         return None

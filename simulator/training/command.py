@@ -48,8 +48,6 @@ def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: i
 
     Parameters
     ----------
-    out : Path
-        Directory of the bundle.
     n_windows : int
         Simulated training windows per relation network; half as many for calibration.
     n_draws : int

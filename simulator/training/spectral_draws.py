@@ -100,8 +100,6 @@ class SpectralDraws:
         expected : ndarray of complex, shape (n_windows, n_bins, n, n)
             Expected cross-spectra of any linear combinations of the measured states.
         speed_rad_s : ndarray, shape (n_windows,)
-        count : int
-            How many.
         """
         n_windows, n_bins, n, _ = expected.shape
         # What the regression on the shaft angle takes out of the bins around the rotation: one coefficient's worth.

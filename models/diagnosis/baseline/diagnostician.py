@@ -54,8 +54,6 @@ def gain_suspicion(
     ----------
     diagnosis : Diagnosis
         Readings with their covariance.
-    rows : sequence of Row
-        Learned rows.
     relations : sequence of Relation or None
         What was learned of each.
 
@@ -138,11 +136,6 @@ class BaselineDiagnostician:
 
     Changes of stiffness are relative to the stiffness to ground that holds the bearing, changes of damping and
     unbalance relative to the healthy ones.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        The table it was learned by.
     """
 
     def __init__(self, baseline: Baseline, rows: Sequence[Row] = ROWS) -> None:

@@ -69,8 +69,6 @@ def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashabl
     ----------
     parts : sequence of LagMoments
         One of each healthy window.
-    conditions : sequence
-        What each belongs to.
 
     Returns
     -------
@@ -182,8 +180,6 @@ def learn_baseline(
         own spectra, so that they may differ in speed, load, and level, colour and layout of the excitation.
     conditions : sequence, optional
         What each window belongs to, for example the recording it was cut from; one condition without it.
-    rows : sequence of Row
-        Table of rows.
 
     Raises
     ------
@@ -324,11 +320,6 @@ def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, .
 
     One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
     damping or inertia is not physical, and no interval around it is honest.
-
-    Parameters
-    ----------
-    rows : sequence of Row
-        The table it was learned by.
 
     Returns
     -------

@@ -112,10 +112,6 @@ class LikelihoodFit:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called: the next readings are the same to the last bit.
 
-        Parameters
-        ----------
-        arrays : mapping of str to ndarray
-
         Raises
         ------
         CheckpointError
@@ -439,10 +435,6 @@ class LengthFits:
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called: the next readings are the same to the last bit.
-
-        Parameters
-        ----------
-        arrays : mapping of str to ndarray
 
         Raises
         ------

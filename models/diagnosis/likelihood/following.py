@@ -60,8 +60,6 @@ class Linearised:
         At the search's end.
     left : ndarray, shape (n_levels,)
         What the search left of the data's gradient by the levels.
-    fitted : float
-        Parameters that its window determined.
     """
 
     def __init__(

@@ -131,8 +131,6 @@ class FisherScoring:
     ----------
     observed : ndarray, shape (n_groups, n, n)
         Estimated cross-spectra in units of the model's scale.
-    n_segments : int
-        Segments they are averaged over.
     usual_cutoff_hz : float
         Where the cutoff is pulled, weakly, if the band does not show it.
     strength : float, optional

@@ -66,8 +66,6 @@ class SpectralModel:
 
     Parameters
     ----------
-    machine : Machine
-        Nominal rotor.
     motions : Motions
         What is measured, in units that make all spectra of the order of one.
     groups : BinGroups

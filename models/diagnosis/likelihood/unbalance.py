@@ -187,8 +187,6 @@ def estimate_unbalance_by_hop(
         As for `estimate_unbalance`.
     hop_synchronous : ndarray of complex, shape (n_hops, n_states)
     hop_speed_rad_s : ndarray, shape (n_hops,)
-    hop_s : float
-        Length of a hop, s.
 
     Raises
     ------

@@ -143,13 +143,7 @@ def _not_read(equation: Equation | SynchronousEquation, reason: str) -> Equation
 
 
 class RelationDiagnostician:
-    """Reads the parameters of a window from the residuals of equations (28)-(31).
-
-    Parameters
-    ----------
-    networks : tuple of EquationNetwork
-        The trained networks, calibrated.
-    """
+    """Reads the parameters of a window from the residuals of equations (28)-(31)."""
 
     def __init__(self, machine: Machine, networks: tuple[EquationNetwork, ...]) -> None:
         self._machine = machine

@@ -56,10 +56,6 @@ def train_network(
     ----------
     windows : sequence of WindowStatistics
         Own parameters nominal, everything else random.
-    seed : int
-        Of the initial weights.
-    progress : callable
-        Called with the fraction done.
 
     Returns
     -------

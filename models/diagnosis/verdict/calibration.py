@@ -43,8 +43,6 @@ def window_thresholds(rate: float, n_parameters: int) -> Thresholds:
     ----------
     rate : float
         Probability that a healthy window is called changed, over all parameters together, for example 0.01.
-    n_parameters : int
-        Parameters evaluated in it.
 
     Raises
     ------
@@ -111,12 +109,8 @@ def month_thresholds(
     ----------
     per_month : float
         Expected number of false alarms of the machine in 30 days of data.
-    hop_s : float
-        Data time between tests, s.
     overlap : int
         Hops in the window.
-    n_parameters : int
-        Parameters evaluated.
     n_stretches : int
         Windows of different lengths tested side by side; each gets an equal share of the rate.
 
@@ -201,10 +195,6 @@ def detectable_changes(
     ----------
     stretch : Stretch
         What the data says; the errors of a parameter hardly depend on its value.
-    thresholds : Thresholds
-        From the declared rate.
-    length_s : float
-        Length of the data in it, s.
     power : float
         Probability of finding the change.
     """

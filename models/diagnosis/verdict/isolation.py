@@ -66,8 +66,6 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
 
     Parameters
     ----------
-    diagnosis : Diagnosis
-        One diagnostician's opinion.
     rate : float
         Probability that a healthy window is called changed; the test of the model has the same rate to itself.
     """
@@ -77,32 +75,14 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
 
 
 def model_test(stretch: Stretch, thresholds: Thresholds) -> tuple[bool, float | None]:
-    """Say of a stretch whether it is outside the model, and with what confidence; see `Isolation`.
-
-    Parameters
-    ----------
-    stretch : Stretch
-        What it says.
-    thresholds : Thresholds
-        From the declared rate.
-    """
+    """Say of a stretch whether it is outside the model, and with what confidence; see `Isolation`."""
     if stretch.misfit_z is None or not math.isfinite(stretch.misfit_z):
         return False, None
     return stretch.misfit_z > thresholds.outside, outside_confidence(stretch.misfit_z)
 
 
 def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") -> Isolation:
-    """Decide a stretch of data.
-
-    Parameters
-    ----------
-    stretch : Stretch
-        What it says.
-    thresholds : Thresholds
-        From the declared rate.
-    by : str
-        Who said it; the readings carry the name.
-    """
+    """Decide a stretch of data."""
     known = stretch.known
     outside, confidence = model_test(stretch, thresholds)
     probability = np.zeros(len(PARAMETERS))
@@ -163,12 +143,8 @@ def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Param
 
     Parameters
     ----------
-    stretch : Stretch
-        What the data says.
     names : tuple of str
         Parameters that may differ from nominal; those that were not evaluable are left out.
-    by : str
-        Who said it.
     """
     chosen = [i for i in stretch.known if PARAMETERS[i] in names]
     if not chosen:
@@ -182,13 +158,7 @@ def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Param
 
 
 def reading_of(stretch: Stretch, name: str, by: str, value: float, error: float) -> Parameter:
-    """A parameter's reading from its value and standard error in the scale of the errors.
-
-    Parameters
-    ----------
-    stretch : Stretch
-        What it was read in.
-    """
+    """A parameter's reading from its value and standard error in the scale of the errors."""
     if name != "e":
         return possible_reading(name, by, from_scale(name, value), error * slope(name, value))
     # Where errors put an unbalance that is all but gone below none, it is as much of one on the other side.

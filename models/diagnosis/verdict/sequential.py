@@ -62,8 +62,6 @@ class SequentialSettings:
 
         Parameters
         ----------
-        per_month : float, optional
-            Another rate.
         short : bool
             Whether stretches shorter than the window can be evaluated.
         """
@@ -190,8 +188,6 @@ class SequentialTest:
 
     Parameters
     ----------
-    settings : SequentialSettings
-        Lengths and declared rate.
     state : SequentialState, optional
         Where an earlier test stood.
     by : str

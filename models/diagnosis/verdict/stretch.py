@@ -134,8 +134,6 @@ def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
 
     Parameters
     ----------
-    diagnosis : Diagnosis
-        Of the stretch.
     start_ns, end_ns : int
         Its oldest and newest data.
     """
@@ -205,8 +203,6 @@ def determined(diagnosis: Diagnosis, window: WindowStatistics, length_s: float) 
     ----------
     window : WindowStatistics
         What it was made of. A stretch of a tenth of the window has three times its errors, and says as much as that.
-    length_s : float
-        Of a full window.
     """
     vague = _VAGUE * max(1.0, length_s / window.duration_s) ** 0.5
     found = {reading.name: reading for reading in diagnosis.parameters}
