@@ -122,8 +122,6 @@ def mistakes(error: ValidationError, model: type[BaseModel], fields: object = No
 
     Parameters
     ----------
-    model : type of BaseModel
-        What was expected.
     fields : object, optional
         What was checked; lets a message name the entry of a list.
 

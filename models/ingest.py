@@ -136,11 +136,6 @@ class Gate:
         """Whether a message may be one of the machine's blocks, whatever its time; of Arrow only the size is looked at.
 
         Takes microseconds and changes nothing: any thread may ask.
-
-        Parameters
-        ----------
-        payload, attachment, encoding : bytes, bytes, str
-            See `models.signals.wire`.
         """
         if not may_be_block(payload, attachment, encoding, self._n_channels, self._most_samples):
             return False

@@ -352,11 +352,6 @@ def load_machine(name_or_path: str | Path) -> Machine:
 def load_machine_file(name_or_path: str | Path) -> MachineFile:
     """Load a machine file, whatever is known of the machine; a `Machine` if all its parameters are.
 
-    Parameters
-    ----------
-    name_or_path : str or Path
-        As for `load_machine`.
-
     Raises
     ------
     MachineFileError

@@ -56,11 +56,6 @@ def bars(*, remaining: bool = False) -> Progress:
 def labelled_bars(*, remaining: bool = False) -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar for every label that progress is told of.
 
-    Parameters
-    ----------
-    remaining : bool
-        Also show the time that remains.
-
     Yields
     ------
     callable

@@ -215,11 +215,6 @@ class NonlinearPlant(Plant):
 
     An anomaly that is there from the first sample on has run in for five seconds before it.
 
-    Parameters
-    ----------
-    condition : Condition
-        What holds from the first sample on.
-
     Raises
     ------
     EstimationError

@@ -27,14 +27,10 @@ def record(
 
     Parameters
     ----------
-    stream : iterator of (SampleBlock, tuple of TruthRecord)
-        From `simulator.stream.blocks`.
     path : Path
         Name of the recording; it is ``.part`` until complete.
     stop : threading.Event, optional
         When set, the recording ends after the current block and is complete.
-    on_block : callable, optional
-        Called with the summary so far after each block.
 
     Raises
     ------

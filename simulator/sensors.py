@@ -32,8 +32,6 @@ class Sensor:
     rng : numpy.random.Generator
         Of this sensor alone. One number per sample is drawn whatever the settings are, so that a noise level can
         change without changing the noise.
-    longest_delay_s : float
-        Longest delay it will have.
     """
 
     def __init__(
@@ -75,10 +73,6 @@ class Sensor:
         ----------
         value_SI : ndarray, shape (n,)
             True values, n ≥ 1.
-        noise : ndarray, shape (n,)
-            From `noise`.
-        faults : mapping
-            Active faults, kind to value.
         """
         settings = self._settings
         level = _value(faults, "noise_relative", settings.noise_relative) * self._rms_SI
@@ -113,8 +107,6 @@ class SensorBank:
     ----------
     rms : ndarray, shape (12,)
         Theoretical rms of the states at the start, SI.
-    rngs : sequence of numpy.random.Generator
-        One per channel.
     """
 
     def __init__(

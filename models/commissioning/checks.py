@@ -157,11 +157,6 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
 
     Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
     limits what can be said between the speeds.
-
-    Parameters
-    ----------
-    differences : sequence of str
-        Sentences on recordings that differ from the others.
     """
     name = "recordings agree"
     if len(speeds_rad_s) < 2:

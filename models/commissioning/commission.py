@@ -125,8 +125,6 @@ def parameter_summaries(
         The same windows read against what was learned without them.
     healthy_s, window_s : float
         Data learned from; length of each window in `diagnoses`.
-    wished : float
-        Relative change that is wished to be found.
     short : bool
         Whether stretches shorter than a window are looked at, too: they share the declared rate.
     identified : mapping of str to float
@@ -238,14 +236,8 @@ def commission(
     ----------
     recordings : sequence of HealthyRecording
         One for each file; of one steady condition each.
-    entries : sequence of RecordingEntry
-        What is kept of each file.
     wished : float, optional
         Relative change that shall be found; the alarm limit without it.
-    replaces : Commissioned, optional
-        The version before.
-    why : str
-        Why it is commissioned again.
     """
     knowledge = knowledge_of(machine)
     checks = [check_data(machine, recordings)]

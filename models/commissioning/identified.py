@@ -52,8 +52,6 @@ def identify(
         With masses and shaft in its ``[rotor]``.
     windows : sequence of WindowStatistics
         Healthy ones that do not overlap.
-    progress : callable, optional
-        Told how many rounds are done, and how many there may be.
 
     Raises
     ------

@@ -139,8 +139,6 @@ def parameter_reading(
         One of ``models.physics.rotor.PARAMETERS``.
     by : str
         Who says so: ``likelihood``, ``network`` (amortised), ``relation`` or ``baseline``.
-    change, standard_error : float
-        Relative change from nominal and its standard error.
     vector : UnbalanceVector, optional
         Of e, where there is a phase reference. `change` is then that of its size as long as the heavy spot stays where
         it is, and the size of the vector of change once it has turned.

@@ -196,8 +196,6 @@ def impossible(change: float, quantity: str) -> str:
     ----------
     change : float
         Relative change of something that is positive by nature: a mass, a stiffness, a damping, a gain, a length.
-    quantity : str
-        What it is, in a word or two.
 
     Examples
     --------

@@ -216,8 +216,6 @@ def unit_factor(quantity: str, unit: str) -> float:
 
     Parameters
     ----------
-    quantity : str
-        A `Quantity`.
     unit : str
         As a person or a measuring program writes it; both micro signs are understood.
 

@@ -28,8 +28,6 @@ class EdgeDetector:
     hysteresis : float
         How far the signal must fall below the threshold (rise above it for falling edges) before the next pulse
         counts; 0 counts every crossing.
-    rising : bool
-        Whether pulses begin with a rising edge.
     """
 
     def __init__(self, threshold: float, hysteresis: float, *, rising: bool) -> None:

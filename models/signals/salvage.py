@@ -52,11 +52,6 @@ def salvage_recording(damaged: Path, target: Path) -> Salvage:
     target : Path
         Must not exist; may be the name that `damaged` was to get.
 
-    Returns
-    -------
-    Salvage
-        What was recovered and what was not.
-
     Raises
     ------
     RecordingError

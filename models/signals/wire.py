@@ -54,8 +54,6 @@ def read_arrow(stream: bytes) -> tuple[npt.NDArray[Any], dict[str, bytes]]:
     -------
     samples : ndarray, shape (n_samples, n_channels)
         A read-only view of `stream`.
-    metadata : dict of str to bytes
-        Metadata of the schema.
 
     Raises
     ------
@@ -243,13 +241,7 @@ def sender_of(attachment: bytes, encoding: str) -> tuple[str, int | None]:
 
 
 def may_be_block(payload: bytes, attachment: bytes, encoding: str, n_channels: int, most_samples: int) -> bool:
-    """Whether a message may be a block of a machine, as far as its size and header say; costs a microsecond.
-
-    Parameters
-    ----------
-    n_channels, most_samples : int
-        Of the machine's blocks.
-    """
+    """Whether a message may be a block of a machine, as far as its size and header say; costs a microsecond."""
     most = n_channels * most_samples * 8
     kind = encoding.partition(";")[0]
     if kind == ARROW_ENCODING:

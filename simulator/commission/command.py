@@ -119,14 +119,10 @@ def commission_machine(
     ----------
     first_s : float, optional
         Use only the first seconds of every recording.
-    wished : float, optional
-        Relative change that shall be found.
     why : str
         Why the machine is commissioned again; needed where `out` holds a commissioning already.
     networks : bool
         Whether to train networks, too, where the parameters are known.
-    n_windows, n_draws, seed, processes
-        For training.
 
     Returns
     -------

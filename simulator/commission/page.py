@@ -140,8 +140,6 @@ def write_report(
         Made if it is not there.
     recordings : sequence of HealthyRecording
         What it was made from: for the pictures and the table of recordings.
-    machine : MachineFile, optional
-        For its description.
     commissioned : Commissioned, optional
         What was stored: for what it replaces and why, and the hash of each file.
 

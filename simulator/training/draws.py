@@ -284,12 +284,8 @@ def windows(
 
     Parameters
     ----------
-    numbers : sequence of int
-        Which windows of the series.
     processes : int
         1 stays in this process.
-    progress : callable
-        Called with 1 for each finished window.
     """
     make = partial(simulate_window, draw)
     if processes == 1:

@@ -50,13 +50,6 @@ def gain_suspicion(
 ) -> GainSuspicion | None:
     """Find the row whose changes look most like a gain error of a place with a single sensor.
 
-    Parameters
-    ----------
-    diagnosis : Diagnosis
-        Readings with their covariance.
-    relations : sequence of Relation or None
-        What was learned of each.
-
     Returns
     -------
     GainSuspicion or None

@@ -127,15 +127,7 @@ def gain(frequencies_hz: FloatArray, shape: Shape) -> FloatArray:
 
 
 def passband_hz(deepest: int, band_to_hz: float) -> float:
-    """Frequency, Hz, up to which the kernels let through at least a tenth: the end of the differentiator's valid band.
-
-    Parameters
-    ----------
-    deepest : int
-        Most derivatives on a kernel (`Formation.deepest`).
-    band_to_hz : float
-        Highest frequency of the window's spectra.
-    """
+    """Frequency, Hz, up to which kernels let through at least a tenth: the end of the differentiator's valid band."""
     f = np.linspace(0.0, 2000.0, 8001)
     through = gain(f, shape_for(deepest, band_to_hz))
     return float(min(band_to_hz, f[np.argmax(through < _FALLEN_TO * through[0])]))
@@ -245,10 +237,6 @@ def row_window(row: Row, window: WindowStatistics, states: tuple[str, ...], refe
     ----------
     window : WindowStatistics
         With correlations at lags up to 0.1 s or more.
-    states : tuple of str
-        Measured states that the row may be formed from.
-    references : tuple of str
-        Measured states that may serve as references.
     """
     formation = formation_of([term.motions for term in row.terms], states)
     index = {name: position for position, name in enumerate(window.states)}

@@ -65,11 +65,6 @@ def left_out(row: Row, parts: Sequence[LagMoments], conditions: Sequence[Hashabl
 
     Where there is one condition, windows are left out one by one, or in up to six runs of neighbours.
 
-    Parameters
-    ----------
-    parts : sequence of LagMoments
-        One of each healthy window.
-
     Returns
     -------
     tuple of LeftOut

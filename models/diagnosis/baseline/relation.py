@@ -69,8 +69,6 @@ def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatA
 
     Parameters
     ----------
-    parts : sequence of LagMoments
-        One of each healthy window.
     prior : ndarray, shape (n, n)
         Precision of what was expected of the coefficients.
     b : ndarray, shape (n,)
@@ -254,13 +252,7 @@ def lags_of(row: Row, windows: Sequence[RowWindow]) -> list[float]:
 
 
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
-    """Fit a row without its optional terms and with them.
-
-    Parameters
-    ----------
-    parts : sequence of LagMoments
-        One of each healthy window.
-    """
+    """Fit a row without its optional terms and with them."""
     start = _start(row, parts)
     full = _fit(parts, start, _prior(row, start, minimal=False))
     return _fit(parts, full.coefficients, _prior(row, start, minimal=True)), full

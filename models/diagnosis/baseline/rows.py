@@ -104,8 +104,6 @@ def formation_of(terms: Sequence[Sequence[Motion]], states: Sequence[str]) -> Fo
     ----------
     terms : sequence of sequences of Motion
         Motions of each term; every one's coordinate is measured (see `not_measured`).
-    states : sequence of str
-        What is measured.
     """
     motions = [motion for term in terms for motion in term]
     raised = max(max(0, _measured(motion.coordinate, states)[0] - motion.order) for motion in motions)
@@ -240,8 +238,6 @@ def evaluable_rows(
 
     Parameters
     ----------
-    states : sequence of str
-        Measured state variables and accelerations.
     has_phase_reference : bool
         Or a speed that the vibration's own line is looked for at.
 

@@ -56,8 +56,6 @@ class LikelihoodFit:
 
     Parameters
     ----------
-    machine : Machine
-        Nominal rotor and unbalance phase.
     follow : bool
         Whether windows that follow each other overlap, so that they may be followed.
     """

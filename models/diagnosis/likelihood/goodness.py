@@ -187,8 +187,6 @@ def unexplained_at(
 
     Parameters
     ----------
-    reached : Whitened
-        The point.
     states : ndarray, shape (n_groups, n_states, n_states)
         Estimated cross-spectra of the states, SI.
     times : float

@@ -168,8 +168,6 @@ class Motions:
 
     Parameters
     ----------
-    states : tuple of str
-        Measured states.
     scale : ndarray, shape (n_states,)
         Unit of each, in the ratio of the sensors' noise: the mean amplitude in the band, for want of better.
     """

@@ -131,8 +131,6 @@ class FisherScoring:
     ----------
     observed : ndarray, shape (n_groups, n, n)
         Estimated cross-spectra in units of the model's scale.
-    usual_cutoff_hz : float
-        Where the cutoff is pulled, weakly, if the band does not show it.
     strength : float, optional
         How strongly the forces' own colours are pulled towards none until the window itself has said so; the weakest
         pull without it.

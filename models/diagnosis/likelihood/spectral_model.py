@@ -68,8 +68,6 @@ class SpectralModel:
     ----------
     motions : Motions
         What is measured, in units that make all spectra of the order of one.
-    groups : BinGroups
-        Frequencies of the spectra.
     force_scale : float
         Unit of forces, N/√Hz, so that the elements of C are of the order of one.
     shapes : int

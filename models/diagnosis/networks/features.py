@@ -35,8 +35,6 @@ class ForceFeatures:
 
     Parameters
     ----------
-    machine : Machine
-        Nominal rotor and window.
     states : tuple of str or None
         Measured states to look at; None takes all that the machine measures.
     """

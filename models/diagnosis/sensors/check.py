@@ -25,8 +25,6 @@ def sensor_findings(
     reference : SensorReference, optional
         What the sensors were like on the healthy machine; without it only what is impossible for any healthy sensor is
         found.
-    channels : iterable of Channel
-        Those of the machine, for their names and units.
 
     Returns
     -------

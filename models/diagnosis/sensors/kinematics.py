@@ -231,13 +231,7 @@ def _transfer(bands: Banded, incoherent: FloatArray) -> tuple[ComplexArray, Floa
 
 
 def gain_course(window: WindowStatistics, reading: PairReading, bands: Banded) -> tuple[FloatArray, float]:
-    """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of one hop.
-
-    Returns
-    -------
-    course : ndarray, shape (n_hops,)
-    error : float
-    """
+    """Relative deviation of the pair's gain from its mean, hop by hop, and the standard error of one hop."""
     number = motion_pairs(window.states).index(reading.pair)
     z, v = bands.total[:, 0, 0].real, bands.total[:, 1, 1].real
     incoherent = np.maximum(1 - np.abs(bands.total[:, 1, 0]) ** 2 / (z * v), _FLOOR)

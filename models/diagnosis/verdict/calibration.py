@@ -215,8 +215,6 @@ def length_to_find(found: Detectable, change: float) -> float:
 
     Parameters
     ----------
-    found : Detectable
-        Smallest change and the length it takes.
     change : float
         Relative change that is to be found instead, not 0 and above -1.
 

@@ -190,8 +190,6 @@ class SequentialTest:
     ----------
     state : SequentialState, optional
         Where an earlier test stood.
-    by : str
-        Whose readings these are.
 
     Attributes
     ----------

@@ -130,13 +130,7 @@ class Stretch:
 
 
 def stretch_of(diagnosis: Diagnosis, start_ns: int, end_ns: int) -> Stretch:
-    """Put a diagnosis into the form in which stretches add up.
-
-    Parameters
-    ----------
-    start_ns, end_ns : int
-        Its oldest and newest data.
-    """
+    """Put a diagnosis into the form in which stretches add up."""
     readings = diagnosis.evaluable
     known = [PARAMETERS.index(reading.name) for reading in readings]
     unbalance = diagnosis.unbalance if any(reading.name == "e" for reading in readings) else None
