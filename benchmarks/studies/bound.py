@@ -114,7 +114,7 @@ def cramer_rao(
     synchronous = np.asarray(
         (q1 - 1j * q2)[order] * np.exp(1j * machine.operation.unbalance_phase_rad), dtype=np.complex128
     )
-    e = estimate_unbalance(machine, model, point, covariance, synchronous, true.speed_rad_s, duration_s)
+    e = estimate_unbalance(machine, model, point, covariance, synchronous, true.speed_rad_s, duration_s).decided()
     return bound | {"e": float(np.sqrt(e.variance))}
 
 

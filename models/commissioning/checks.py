@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -40,7 +41,7 @@ class Check(BaseModel):
 
 def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> Check:
     """Whether there is enough data, and how much was lost."""
-    name = "enough data"
+    told = partial(Check, name="enough data")
     hops = sum(len(one.hops) for one in recordings)
     used_s = sum(one.duration_s for one in recordings)
     refused: Counter[str] = Counter()
@@ -59,28 +60,27 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
     wanted_s = _FEW_WINDOWS * window.length_s
     advice = f"record at least {wanted_s:g} s without interruption, in one or several files"
     if hops < _FEWEST_HOPS:
-        return Check(name=name, verdict="refused", text=f"too short: {found}", advice=advice)
+        return told(verdict="refused", text=f"too short: {found}", advice=advice)
     span_s = sum((one.hops[-1].end_ns - one.hops[0].start_ns) / 1e9 for one in recordings if one.hops)
     share = missing_s / span_s
     if share > _TOO_MUCH_REFUSED:
         advice = f"find out why {share:.0%} of the data are missing, and {advice}"
-        return Check(name=name, verdict="refused", text=f"too many gaps: {found}", advice=advice)
+        return told(verdict="refused", text=f"too many gaps: {found}", advice=advice)
     if used_s < wanted_s or share > _MUCH_REFUSED or refused:
-        return Check(name=name, verdict="limited", text=found, advice=advice)
-    return Check(name=name, verdict="passed", text=found)
+        return told(verdict="limited", text=found, advice=advice)
+    return told(verdict="passed", text=found)
 
 
 def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
     """Whether a sensor was at fault while the recordings were made."""
-    name = "sensors"
+    told = partial(Check, name="sensors")
     faults: dict[tuple[str, str, tuple[str, ...]], list[str]] = {}
     for recording, found in findings.items():
         for finding in found:
             faults.setdefault((recording, finding.kind, finding.states), []).append(finding.text)
     if not faults:
-        return Check(name=name, verdict="passed", text="no sensor stuck, clipped, swapped, delayed or in contradiction")
-    return Check(
-        name=name,
+        return told(verdict="passed", text="no sensor stuck, clipped, swapped, delayed or in contradiction")
+    return told(
         verdict="refused",
         text="; ".join(
             f"{recording}: {texts[0]}" + (f" (in {len(texts)} windows)" if len(texts) > 1 else "")
@@ -92,7 +92,7 @@ def check_sensors_of(findings: Mapping[str, Sequence[SensorFault]]) -> Check:
 
 def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     """Whether speed and level held still within each recording."""
-    name = "stationary"
+    told = partial(Check, name="stationary")
     moved = []
     for recording in recordings:
         for window in windows[recording.name]:
@@ -117,9 +117,8 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
                     "that of the first"
                 )
     if not moved:
-        return Check(name=name, verdict="passed", text="speed and level hold still within every recording")
-    return Check(
-        name=name,
+        return told(verdict="passed", text="speed and level hold still within every recording")
+    return told(
         verdict="refused",
         text="; ".join(moved),
         advice="record in steady operation; one file for each speed or load, each of at least two windows",
@@ -128,11 +127,11 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
 
 def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
     """Whether something else than noise and the rotation drives the machine."""
-    name = "second excitation"
+    told = partial(Check, name="second excitation")
     found = [(one.name, line) for one in recordings for line in foreign_lines(one)]
     loud = [(recording, line) for recording, line in found if line.share > _LOUD_LINE]
     if not loud:
-        return Check(name=name, verdict="passed", text="no line but those of the rotation stands out")
+        return told(verdict="passed", text="no line but those of the rotation stands out")
     text = "; ".join(
         f"{recording}: a steady line at {line.frequency_hz:.2f} Hz makes {line.share:.0%} of the random vibration of "
         f"{line.state}"
@@ -149,7 +148,7 @@ def check_lines(recordings: Sequence[HealthyRecording]) -> Check:
             f"shaft angle; if it is not, {advice}"
         )
     dominant = unknown_speed or any(line.share > _DOMINANT_LINE for _, line in loud)
-    return Check(name=name, verdict="refused" if dominant else "limited", text=text, advice=advice)
+    return told(verdict="refused" if dominant else "limited", text=text, advice=advice)
 
 
 def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, float]) -> Check | None:
@@ -158,23 +157,21 @@ def check_recordings(differences: Sequence[str], speeds_rad_s: Mapping[str, floa
     Where they do not but ran at different speeds, the machine may be one whose bearings depend on the speed: that
     limits what can be said between the speeds.
     """
-    name = "recordings agree"
+    told = partial(Check, name="recordings agree")
     if len(speeds_rad_s) < 2:
         return None
     if not differences:
-        return Check(name=name, verdict="passed", text=f"one relation holds in all {len(speeds_rad_s)} recordings")
+        return told(verdict="passed", text=f"one relation holds in all {len(speeds_rad_s)} recordings")
     text = "; ".join(differences)
     speeds = sorted(speeds_rad_s.values())
     if speeds[-1] <= speeds[0] * (1 + SAME_SPEED) or not np.all(np.isfinite(speeds)):
-        return Check(
-            name=name,
+        return told(
             verdict="refused",
             text=f"{text}, at one speed",
             advice="the machine was not the same in all of them, or the load changes its bearing: commission on "
             "recordings of one load, or find out what changed",
         )
-    return Check(
-        name=name,
+    return told(
         verdict="limited",
         text=f"{text}; a baseline is kept for each speed, and nothing is said between the speeds",
         advice="record at more speeds between these if the machine runs there",
@@ -187,15 +184,14 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     With one source every channel is a filtered copy of every other, and relations that differ by far fit the same
     recording.
     """
-    name = "ways of excitation"
+    told = partial(Check, name="ways of excitation")
     alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]
     if len(alone) < len(windows):
-        return Check(name=name, verdict="passed", text="several independent forces move the machine")
+        return told(verdict="passed", text="several independent forces move the machine")
     if len(alone) > 1:
         text = f"one source moves everything in each of {len(alone)} recordings; together they can tell more"
-        return Check(name=name, verdict="passed", text=text)
-    return Check(
-        name=name,
+        return told(verdict="passed", text=text)
+    return told(
         verdict="limited",
         text="one source moves everything, in the only recording: what else holds the shaft cannot be told "
         "for certain, and some later readings may be off by more than their intervals say",
@@ -214,15 +210,15 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
     only_shapes : bool
         There is none at all, and each channel is only compared with its own healthy form.
     """
-    name = "relations determined"
+    told = partial(Check, name="relations determined")
     if not reasons:
-        return Check(name=name, verdict="passed", text="the recordings determine every relation these sensors allow")
+        return told(verdict="passed", text="the recordings determine every relation these sensors allow")
     advice = "measure what is missing, or record a second condition: another speed, another load, a louder machine"
     text = "; ".join(dict.fromkeys(reasons))
     if only_shapes:
         text += "; each channel will only be called changed or not changed, and no part of the machine will be named"
         advice += "; a machine that is more than one bearing and one disc may stay beyond these relations"
-    return Check(name=name, verdict="limited", text=text, advice=advice)
+    return told(verdict="limited", text=text, advice=advice)
 
 
 def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:

@@ -58,11 +58,6 @@ class ShapeSpread(BaseModel):
             raise ValueError(f"channel {self.channel}: mean and directions have {sorted(lengths)} lags, expected one")
         return self
 
-    @property
-    def beyond_sampling(self) -> float:
-        """Scatter of the healthy windows over that of sampling alone: 1 where the excitation did not vary."""
-        return math.sqrt(self.variance / len(self.directions))
-
 
 class HealthyShape(BaseModel):
     """What the correlation functions of a healthy machine look like."""

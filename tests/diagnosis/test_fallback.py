@@ -71,8 +71,9 @@ def test_the_spread_holds_what_the_excitation_did_where_it_was_seen() -> None:
     other_colours = [recorded(7, 1, condition=number)[0] for number in range(2, 26)]
     assert sum(any(one.verdict == "changed" for one in one_colour.judge(window)) for window in other_colours) > 12
     colours = learn_shape(other_colours[:12])
-    assert all(one.beyond_sampling > 2 for one in colours.channels)
-    assert all(one.beyond_sampling < 1.6 for one in one_colour.channels)
+    # Scatter of the healthy windows over that of sampling alone: 1 where the excitation did not vary.
+    assert all(one.variance / len(one.directions) > 2**2 for one in colours.channels)
+    assert all(one.variance / len(one.directions) < 1.6**2 for one in one_colour.channels)
     flagged = sum(any(one.verdict == "changed" for one in colours.judge(window, 0.05)) for window in other_colours[12:])
     assert binomtest(flagged, 12, 0.05, alternative="greater").pvalue > 0.005
 

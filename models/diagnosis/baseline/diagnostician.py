@@ -131,6 +131,8 @@ class BaselineDiagnostician:
     unbalance relative to the healthy ones.
     """
 
+    by = "baseline"
+
     def __init__(self, baseline: Baseline, rows: Sequence[Row] = ROWS) -> None:
         self._baseline = baseline
         self._rows = learned_rows(rows)
@@ -149,11 +151,6 @@ class BaselineDiagnostician:
         for at, relation in zip(self._slices, baseline.relations, strict=True):
             if relation is not None:
                 self._coefficients[at] = relation.coefficients
-
-    @property
-    def by(self) -> str:
-        """Name under which it is reported."""
-        return "baseline"
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: what cannot be read carries its reason."""

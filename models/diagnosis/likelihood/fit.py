@@ -60,6 +60,8 @@ class LikelihoodFit:
         Whether windows that follow each other overlap, so that they may be followed.
     """
 
+    by = "likelihood"
+
     def __init__(self, machine: Machine, *, follow: bool = False) -> None:
         self._machine = machine
         self._usual_cutoff_hz = math.sqrt(machine.condition.cutoff_hz[0] * machine.condition.cutoff_hz[1])
@@ -71,11 +73,6 @@ class LikelihoodFit:
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
         self._groups: dict[bytes, BinGroups] = {}
         self._workspace = Workspace()
-
-    @property
-    def by(self) -> str:
-        """Name under which it is reported."""
-        return "likelihood"
 
     def reset(self) -> None:
         """Start the next window cold."""
@@ -257,7 +254,7 @@ class LikelihoodFit:
             return estimate_unbalance_by_hop(*known, window.hop_synchronous, window.hop_speed_rad_s, hop_s)
         if window.synchronous is None:
             raise EstimationError(f"{self._machine.name}: no phase reference")
-        return estimate_unbalance(*known, window.synchronous, speed, window.duration_s)
+        return estimate_unbalance(*known, window.synchronous, speed, window.duration_s).decided()
 
     def _followed_or_searched(
         self, window: WindowStatistics, excluded: npt.NDArray[np.bool_], scale: FloatArray, speed: float

@@ -38,7 +38,7 @@ class Unbalance:
 
 
 @dataclass(frozen=True, slots=True)
-class _Ratios:
+class UnbalanceRatios:
     """The unbalance over the nominal one: real with the phase as known, and as real and imaginary part without."""
 
     # (3,): the real number; real and imaginary part
@@ -76,8 +76,8 @@ def estimate_unbalance(
     synchronous: ComplexArray,
     speed_rad_s: float,
     duration_s: float,
-) -> Unbalance:
-    """Estimate e from q of x_n = Re{q e^{jθ}}.
+) -> UnbalanceRatios:
+    """Estimate e from q of x_n = Re{q e^{jθ}}; `UnbalanceRatios.decided` makes one answer of it.
 
     The vector's covariance is the stochastic part's spectrum over the window length, averaged around Ω as a window of
     that length sees it, plus what the uncertainty of the structural parameters makes of the predicted response.
@@ -96,18 +96,6 @@ def estimate_unbalance(
     EstimationError
         If the vector says nothing about e.
     """
-    return _ratios(machine, model, point, covariance, synchronous, speed_rad_s, duration_s).decided()
-
-
-def _ratios(
-    machine: Machine,
-    model: SpectralModel,
-    point: ModelPoint,
-    covariance: FloatArray,
-    synchronous: ComplexArray,
-    speed_rad_s: float,
-    duration_s: float,
-) -> _Ratios:
     rotor = machine.rotor
     w = np.array([speed_rad_s])
     phase = np.exp(1j * machine.operation.unbalance_phase_rad)
@@ -147,7 +135,7 @@ def _ratios(
         with_structural[at] = -spread @ (weight @ J) @ covariance
         between = float(spread[0, -1])
     foreign = _foreign(machine.name, q2, design @ values[1:], total)
-    return _Ratios(values, variances, between, with_structural, foreign)
+    return UnbalanceRatios(values, variances, between, with_structural, foreign)
 
 
 def _foreign(name: str, q2: FloatArray, explained: FloatArray, total: FloatArray) -> str:
@@ -194,7 +182,7 @@ def estimate_unbalance_by_hop(
         If a vector says nothing about e.
     """
     hops = [
-        _ratios(machine, model, point, covariance, vectors, float(speed), hop_s)
+        estimate_unbalance(machine, model, point, covariance, vectors, float(speed), hop_s)
         for vectors, speed in zip(hop_synchronous, hop_speed_rad_s, strict=True)
     ]
     precision = np.linalg.inv(covariance)
@@ -207,7 +195,7 @@ def estimate_unbalance_by_hop(
     together = np.einsum("ha,hai->ai", weight, shared)
     left = together @ precision @ together.T
     between = np.array([hop.between for hop in hops]) - common[:, 1, 2]
-    return _Ratios(
+    return UnbalanceRatios(
         np.einsum("ha,ha->a", weight, np.array([hop.values for hop in hops])),
         np.einsum("ha,ha->a", weight**2, own) + np.diag(left),
         float(weight[:, 1] ** 2 @ between + left[1, 2]),

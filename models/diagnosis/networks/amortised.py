@@ -82,14 +82,11 @@ class AmortisedNetworks:
 class NetworkDiagnostician:
     """Reads all parameters of a window from the amortised networks."""
 
+    by = "network"
+
     def __init__(self, machine: Machine, amortised: AmortisedNetworks) -> None:
         self._machine, self._amortised = machine, amortised
         self._features = ForceFeatures(machine, amortised.states)
-
-    @property
-    def by(self) -> str:
-        """Name under which it is reported."""
-        return "network"
 
     def inputs(self, window: WindowStatistics) -> Float32Array | None:
         """Standardised inputs, shape (1, n_inputs), those of equation 29 only with a phase reference.

@@ -130,26 +130,13 @@ class SynchronousEquation:
 
     number: str
     title: str
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Own parameters."""
-        return ("e",)
-
-    @property
-    def kept_nominal(self) -> tuple[str, ...]:
-        """Parameters that do not vary in its training windows: the shaft stands in this row too (k22, k23)."""
-        return ("e", "EI")
-
-    @property
-    def input_names(self) -> tuple[str, ...]:
-        """Names of the inputs in order."""
-        return ("R[n,y1]", "Ω²R[n,y1]", "Ω⁴R[n,y1]", "Ω²R[n,z1]", "Ω²R[n,n]", "Ω⁴R[n,n]", "Ω⁶R[n,n]")
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Measured states it needs, and the phase reference."""
-        return (*_REFERENCES, "theta")
+    parameters: tuple[str, ...] = ("e",)
+    # The shaft stands in this row too (k22, k23).
+    kept_nominal: tuple[str, ...] = ("e", "EI")
+    input_names: tuple[str, ...] = (
+        "R[n,y1]", "Ω²R[n,y1]", "Ω⁴R[n,y1]", "Ω²R[n,z1]", "Ω²R[n,n]", "Ω⁴R[n,n]", "Ω⁶R[n,n]"
+    )  # fmt: skip
+    channels: tuple[str, ...] = (*_REFERENCES, "theta")
 
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
         """Rows of one view, SI units.

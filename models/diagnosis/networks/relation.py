@@ -145,14 +145,11 @@ def _not_read(equation: Equation | SynchronousEquation, reason: str) -> Equation
 class RelationDiagnostician:
     """Reads the parameters of a window from the residuals of equations (28)-(31)."""
 
+    by = "relation"
+
     def __init__(self, machine: Machine, networks: tuple[EquationNetwork, ...]) -> None:
         self._machine = machine
         self._networks = {trained.equation.number: trained for trained in networks}
-
-    @property
-    def by(self) -> str:
-        """Name under which it is reported."""
-        return "relation"
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
