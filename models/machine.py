@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.alarm_names import ALARMS
 from models.errors import MachineFileError, checked, did_you_mean, read_toml
@@ -22,7 +22,6 @@ from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 _SHIPPED = Path(__file__).parent / "machines"
 
 
@@ -30,10 +29,8 @@ def _whole(value: float) -> bool:
     return abs(value - round(value)) < 1e-9 * max(1.0, abs(value))
 
 
-class Operation(BaseModel):
+class Operation(BaseModel, extra="forbid", frozen=True):
     """How the machine runs."""
-
-    model_config = _STRICT
 
     speed_rpm: float = Field(gt=0, le=1e6, description="nominal speed")
     speed_tolerance: float = Field(default=0.2, ge=0, lt=1, description="relative speed range, trained and evaluated")
@@ -47,10 +44,8 @@ class Operation(BaseModel):
         return self.speed_rpm * 2 * math.pi / 60
 
 
-class ConditionRange(BaseModel):
+class ConditionRange(BaseModel, extra="forbid", frozen=True):
     """Operating conditions the networks are trained for."""
-
-    model_config = _STRICT
 
     cutoff_hz: tuple[float, float] = Field(description="cutoff frequency of the excitation, from and to")
     stochastic_to_1x: tuple[float, float] = Field(
@@ -70,10 +65,8 @@ class ConditionRange(BaseModel):
         return self
 
 
-class WindowSettings(BaseModel):
+class WindowSettings(BaseModel, extra="forbid", frozen=True):
     """The sliding window: its length, how often it is evaluated, and what is computed in it."""
-
-    model_config = _STRICT
 
     length_s: float = Field(default=60.0, gt=0, le=3600, description="window length")
     hop_s: float = Field(default=5.0, gt=0, le=600, description="one report per hop; also the sub-block of the errors")
@@ -106,10 +99,8 @@ class WindowSettings(BaseModel):
         return round(self.length_s / self.hop_s)
 
 
-class IngestSettings(BaseModel):
+class IngestSettings(BaseModel, extra="forbid", frozen=True):
     """When a block is refused, and when silence is called missing data."""
-
-    model_config = _STRICT
 
     block_from_s: float = Field(default=0.001, gt=0, le=1, description="shortest accepted block")
     block_to_s: float = Field(default=2.0, gt=0, le=60, description="longest accepted block")
@@ -132,10 +123,8 @@ class IngestSettings(BaseModel):
         return self
 
 
-class AlarmLimits(BaseModel):
+class AlarmLimits(BaseModel, extra="forbid", frozen=True):
     """Limits of one parameter's relative change."""
-
-    model_config = _STRICT
 
     raise_above: float = Field(default=0.10, gt=0, lt=1, description="alert when the change is larger, either sign")
     clear_below: float = Field(default=0.06, gt=0, lt=1, description="back to normal when smaller")
@@ -158,10 +147,8 @@ def _known_alarms(field: str, names: Iterable[str]) -> None:
         raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARMS)}{hint}")
 
 
-class SuppressRule(BaseModel):
+class SuppressRule(BaseModel, extra="forbid", frozen=True):
     """When some alarms are suppressed by design: while another alarm's condition is there, or outside some speed."""
-
-    model_config = _STRICT
 
     alarms: tuple[str, ...] = Field(min_length=1, description="which, by name")
     while_alarm: str | None = Field(default=None, description="as long as the condition of this alarm is there")
@@ -197,10 +184,8 @@ class SuppressRule(BaseModel):
         )
 
 
-class AlarmSettings(BaseModel):
+class AlarmSettings(BaseModel, extra="forbid", frozen=True):
     """When a parameter change becomes an alarm; all times are data time."""
-
-    model_config = _STRICT
 
     limits: AlarmLimits = AlarmLimits()
     parameters: dict[str, AlarmLimits] = Field(default={}, description="limits of single parameters instead")
@@ -238,10 +223,8 @@ class AlarmSettings(BaseModel):
         return self.parameters.get(name, self.limits)
 
 
-class MachineFile(BaseModel):
+class MachineFile(BaseModel, extra="forbid", frozen=True):
     """One machine: identity, sensors, window, ingest and alarms, and as much as is known of its physics."""
-
-    model_config = _STRICT
 
     site: str
     name: str

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.errors import MachineFileError, checked, did_you_mean, read_toml
 from models.machine import Machine, load_machine
@@ -17,7 +17,6 @@ from models.physics.excitation import Source
 from models.physics.rotor import PARAMETERS
 from models.signals.channels import Channel, Quantity
 
-_STRICT = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 _SHIPPED = Path(__file__).parent / "scenarios"
 _FAULT = re.compile(r"(?P<parameter>\w+)=(?P<change>[-+.\deE]+)@(?P<at_s>[.\deE]+)")
 SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "clip", "delay", "swapped", "none"]
@@ -31,18 +30,14 @@ LONGEST_DELAY_S = 1.0  # most by which a sensor can be late
 _WITH_RAMP = ("offset", "gain", "noise_relative")
 
 
-class NamedSource(Source):
+class NamedSource(Source, extra="forbid", frozen=True, allow_inf_nan=False):
     """An independent source of coloured force with a name that events refer to."""
-
-    model_config = _STRICT
 
     name: str = Field(min_length=1, max_length=64, description="unique name, as events refer to it")
 
 
-class SensorSettings(BaseModel):
+class SensorSettings(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """How one sensor turns the true value into samples: (value + noise) · gain + offset, rounded to a step."""
-
-    model_config = _STRICT
 
     noise_relative: float = Field(
         default=0.0, ge=0, le=100, description="rms of the noise over the channel's own theoretical rms at the start"
@@ -55,10 +50,8 @@ class SensorSettings(BaseModel):
     step_SI: float = Field(default=0.0, ge=0, description="quantisation step: m, m/s, rad or rad/s; 0 = none")
 
 
-class ChannelSettings(BaseModel):
+class ChannelSettings(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Settings of one channel; what is left out is as for all channels."""
-
-    model_config = _STRICT
 
     noise_relative: float | None = Field(default=None, ge=0, le=100)
     noise_corner_hz: float | None = Field(default=None, gt=0, le=1e6)
@@ -83,19 +76,15 @@ class Sensors(SensorSettings):
         return SensorSettings.model_validate({**common, **own})
 
 
-class Rub(BaseModel):
+class Rub(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """Where the disc may touch the casing; how hard is the size of the event that brings it there."""
-
-    model_config = _STRICT
 
     clearance_m: float = Field(gt=0, le=0.1, description="radial, around the disc's place at rest")
     friction: float = Field(default=0.1, ge=0, le=1, description="sliding friction coefficient")
 
 
-class Event(BaseModel):
+class Event(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """One change at one time: of a parameter, the speed, the excitation, a source, a sensor, or outside the model."""
-
-    model_config = _STRICT
 
     at_s: float = Field(ge=0)  # start of the change, data seconds from the first sample
     ramp_s: float = Field(default=0.0, ge=0)  # duration of the change; 0 is a step. Ramps advance in steps of 0.1 s
@@ -200,10 +189,8 @@ class Event(BaseModel):
             raise ValueError(f"sensor_fault {self.sensor_fault!r} cannot ramp, only {', '.join(_WITH_RAMP)} can")
 
 
-class Scenario(BaseModel):
+class Scenario(BaseModel, extra="forbid", frozen=True, allow_inf_nan=False):
     """A machine, what excites it, how its sensors are, and what happens when."""
-
-    model_config = _STRICT
 
     name: str = Field(default="scenario", description="shown in truth records; the file's name if left out")
     description: str = ""

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
@@ -23,10 +23,8 @@ from simulator.sensors import SensorBank
 from simulator.timeline import Condition, compile_timeline
 
 
-class TruthRecord(BaseModel):
+class TruthRecord(BaseModel, extra="forbid", frozen=True):
     """The true condition from one time on; sent at the start, at every change, and every second during a ramp."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     time_ns: int = Field(description="acquisition time of the first sample this is true for, ns since 1970 UTC")
     data_s: float = Field(description="the same, seconds from the first sample")

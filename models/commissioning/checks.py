@@ -6,7 +6,7 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.commissioning.healthy import HealthyRecording, foreign_lines
 from models.diagnosis.baseline.relation import one_source
@@ -28,10 +28,8 @@ _RATE = 1e-3  # probability that a healthy machine fails a comparison of its own
 _LOUD_LINE, _DOMINANT_LINE = 0.05, 0.5  # share of a foreign line in the power of a channel's random part
 
 
-class Check(BaseModel):
+class Check(BaseModel, extra="forbid", frozen=True):
     """One question about the recordings, and its answer."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(description="what was asked")
     verdict: Literal["passed", "limited", "refused"]

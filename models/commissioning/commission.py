@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 from scipy.special import ndtri
 
 from models.commissioning.checks import Check, check_data, check_lines, check_sensors_of, check_steady
@@ -31,14 +31,11 @@ from models.errors import EstimationError
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 
-_JSON = ConfigDict(extra="forbid", frozen=True)
 _POWER = 0.95
 
 
-class EquationRow(BaseModel):
+class EquationRow(BaseModel, extra="forbid", frozen=True):
     """One row of the equation table, and whether these sensors allow it."""
-
-    model_config = _JSON
 
     number: str
     title: str
@@ -47,10 +44,8 @@ class EquationRow(BaseModel):
     reason: str = Field(default="", description="why it is not used")
 
 
-class HealthyReading(BaseModel):
+class HealthyReading(BaseModel, extra="forbid", frozen=True):
     """One parameter in one healthy window, read against what was learned on other data where there is enough of it."""
-
-    model_config = _JSON
 
     recording: str
     end_ns: int
@@ -58,10 +53,8 @@ class HealthyReading(BaseModel):
     standard_error: float
 
 
-class ParameterSummary(BaseModel):
+class ParameterSummary(BaseModel, extra="forbid", frozen=True):
     """What is known of one parameter."""
-
-    model_config = _JSON
 
     name: str
     text: str
@@ -81,10 +74,8 @@ class ParameterSummary(BaseModel):
     readings: tuple[HealthyReading, ...] = ()
 
 
-class CommissioningReport(BaseModel):
+class CommissioningReport(BaseModel, extra="forbid", frozen=True):
     """The whole report."""
-
-    model_config = _JSON
 
     site: str
     machine: str

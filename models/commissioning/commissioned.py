@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.networks.bundle import Bundle, load_bundle
@@ -33,7 +33,6 @@ from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
 """What cannot be identified beside stiffness and damping: masses and shaft."""
 
@@ -98,10 +97,8 @@ loose, a bearing lifted through its clearance."""
 _Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class OperatingRange(BaseModel):
+class OperatingRange(BaseModel, extra="forbid", frozen=True):
     """Speeds and levels of random vibration in the healthy windows."""
-
-    model_config = _STRICT
 
     speed_rpm: tuple[_Positive, _Positive] | None = Field(
         default=None, description="slowest and fastest mean speed of a window; none without a speed"
@@ -159,10 +156,8 @@ _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition"}
 
 
-class RecordingEntry(BaseModel):
+class RecordingEntry(BaseModel, extra="forbid", frozen=True):
     """One healthy recording that was used."""
-
-    model_config = _STRICT
 
     name: str
     sha256: str = Field(description="of the file")
@@ -172,10 +167,8 @@ class RecordingEntry(BaseModel):
     gaps: int = Field(ge=0)
 
 
-class IdentifiedRecord(BaseModel):
+class IdentifiedRecord(BaseModel, extra="forbid", frozen=True):
     """A rotor whose stiffness, damping and unbalance were identified."""
-
-    model_config = _STRICT
 
     machine: dict[str, Any] = Field(description="rotor, operation and condition as in a machine file")
     names: tuple[str, ...] = Field(description="parameters that were identified")
@@ -196,19 +189,15 @@ class IdentifiedRecord(BaseModel):
         return np.array(self.covariance, dtype=np.float64)
 
 
-class ConditionBaseline(BaseModel):
+class ConditionBaseline(BaseModel, extra="forbid", frozen=True):
     """A baseline and the conditions it was learned in."""
-
-    model_config = _STRICT
 
     conditions: OperatingRange
     baseline: BaselineRecord
 
 
-class Commissioned(BaseModel):
+class Commissioned(BaseModel, extra="forbid", frozen=True):
     """What a machine's monitor compares later data with."""
-
-    model_config = _STRICT
 
     format: Literal[1] = 1
     site: str

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 from scipy.special import fdtrc, ndtri
 
 from models.diagnosis.window import WindowStatistics
@@ -39,10 +39,8 @@ _LEAST_P = 1e-300
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class ShapeSpread(BaseModel):
+class ShapeSpread(BaseModel, extra="forbid", frozen=True, strict=True):
     """Healthy shape of one channel and its spread."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     channel: str = Field(min_length=1)
     mean: tuple[_Finite, ...] = Field(min_length=2)  # ρ at the lags
@@ -59,10 +57,8 @@ class ShapeSpread(BaseModel):
         return self
 
 
-class HealthyShape(BaseModel):
+class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
     """What the correlation functions of a healthy machine look like."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     windows: int = Field(ge=FEWEST_WINDOWS)  # healthy windows it was learned from
     window_s: float = Field(gt=0, allow_inf_nan=False)  # length of the shortest of them

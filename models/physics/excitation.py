@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.physics.rotor import M_matrix, RotorParameters, system_A
 from models.signals.block import FloatArray
@@ -17,10 +17,8 @@ from models.signals.block import FloatArray
 FILTER_DAMPING = math.sqrt(0.5)  # damping ratio of the colouring filter: Butterworth, flat up to the cutoff
 
 
-class Source(BaseModel):
+class Source(BaseModel, extra="forbid", frozen=True):
     """One independent source of coloured force."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     cutoff_hz: float = Field(gt=0, le=1e5)  # cutoff frequency of the colouring filter
     # Column of S (Eq. 15) on (y1, y2, psi, z1, z2, phi): dimensionless on translations, m (lever arm) on tilts.

@@ -6,15 +6,13 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.signals.block import FloatArray
 
 
-class KnownRotor(BaseModel):
+class KnownRotor(BaseModel, extra="forbid", frozen=True):
     """What is known of a rotor's parameters; see `RotorParameters` for the meaning of each."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     m1_kg: float | None = Field(default=None, gt=0, le=1e5)
     m2_kg: float | None = Field(default=None, gt=0, le=1e5)

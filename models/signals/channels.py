@@ -7,11 +7,9 @@ from collections.abc import Iterable
 from enum import StrEnum
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from models.errors import did_you_mean
-
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 
 
 class Quantity(StrEnum):
@@ -63,10 +61,8 @@ ACCELERATIONS: tuple[str, ...] = tuple(
 """What accelerometers measure: rates of states, in the order in which they follow the states in statistics."""
 
 
-class Channel(BaseModel):
+class Channel(BaseModel, extra="forbid", frozen=True):
     """One column of a stream."""
-
-    model_config = _STRICT
 
     # Free name, unique in the stream ("XE-101").
     name: str = Field(
@@ -138,13 +134,11 @@ def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
     return _STATE.sub(lambda found: names.get(found[0], found[0]), text)
 
 
-class ChannelDescriptor(BaseModel):
+class ChannelDescriptor(BaseModel, frozen=True):
     """Columns, rate and number format of one machine's stream, as served on the ``descriptor`` key.
 
     Publishers and recordings may be of a later version: fields that are not known here are passed over.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     site: str
     machine: str

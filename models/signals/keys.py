@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, Field, model_validator
 
 from models.errors import MachineFileError
 
@@ -141,10 +141,8 @@ def _place(text: str) -> str:
 _Places = tuple[Annotated[str, AfterValidator(_place)], ...]
 
 
-class Grant(BaseModel):
+class Grant(BaseModel, extra="forbid", frozen=True):
     """What some users, or owners of certificates, may do; everything else is refused to them."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     who: tuple[Annotated[str, AfterValidator(_name)], ...] = Field(
         min_length=1, description="user names, where there are passwords; else common names of certificates"

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.errors import MachineFileError, checked, did_you_mean, read_toml
 from models.signals.keys import Grant, access_control
@@ -177,7 +177,7 @@ _ENCRYPTED = ("tls/", "quic/")
 _SECRETS = {"password": "password_file", "passwords": "passwords_file"}
 
 
-class TlsSettings(BaseModel):
+class TlsSettings(BaseModel, extra="forbid", frozen=True):
     """Certificates of endpoints that begin with ``tls/``; all files are PEM.
 
     Examples
@@ -185,8 +185,6 @@ class TlsSettings(BaseModel):
     >>> TlsSettings(root_certificate="ca.pem", certificate="pump-7.pem", key="pump-7.key", mutual=True).mutual
     True
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     root_certificate: Path | None = Field(
         default=None, description="certificate of the authority by which the other side's certificate must be issued"
@@ -207,13 +205,11 @@ class TlsSettings(BaseModel):
         return self
 
 
-class LinkSettings(BaseModel):
+class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=True):
     """Endpoints and mode of a Zenoh session; the defaults stay on loopback and start no discovery.
 
     Multicast and gossip discovery are always off: a program talks to the endpoints it was given and no other.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
     mode: Literal["peer", "client", "router"] = Field(default="peer", description="role in the Zenoh network")
     listen: tuple[str, ...] = Field(default=(), description='endpoints to listen on, as "tcp/127.0.0.1:7447"')
@@ -444,9 +440,7 @@ class LinkSettings(BaseModel):
         return {"access_control": json.dumps(access_control(self.grants, known_by))}
 
 
-class _LinkFile(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
-
+class _LinkFile(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=True):
     link: LinkSettings
 
 

@@ -97,4 +97,4 @@ def test_changed_parameters() -> None:
 def test_machine_is_frozen() -> None:
     machine: Machine = load_machine("lab")
     with pytest.raises(ValueError, match="frozen"):
-        machine.rate_hz = 1.0
+        machine.rate_hz = 1.0  # type: ignore[misc]  # as a program without a type checker may try

@@ -10,14 +10,13 @@ from dataclasses import asdict
 from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
 from models.diagnosis.baseline.learned import Baseline, HeldOutReading, LeftOut
 from models.diagnosis.baseline.relation import Relation
 from models.diagnosis.baseline.unbalance import SynchronousVectors
 
-_STRICT = ConfigDict(extra="forbid", frozen=True, strict=True)
 _Number = Annotated[float, Field(allow_inf_nan=False)]
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Vector = tuple[_Number, ...]
@@ -25,10 +24,8 @@ _Matrix = tuple[_Vector, ...]
 _Kind = TypeVar("_Kind")
 
 
-class RelationRecord(BaseModel):
+class RelationRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     """One learned row."""
-
-    model_config = _STRICT
 
     row: str
     states: tuple[str, ...] = Field(min_length=1)
@@ -45,10 +42,8 @@ class RelationRecord(BaseModel):
         return self
 
 
-class RotationRecord(BaseModel):
+class RotationRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     """Synchronous vectors at one speed."""
-
-    model_config = _STRICT
 
     coordinates: tuple[str, ...] = Field(min_length=1)
     vectors: _Vector
@@ -65,20 +60,16 @@ class RotationRecord(BaseModel):
         return self
 
 
-class _AgreementRecord(BaseModel):
+class _AgreementRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     """A healthy window's reading of one parameter against the others."""
-
-    model_config = _STRICT
 
     parameter: str
     change: _Number
     standard_error: _Positive
 
 
-class _LeftOutRecord(BaseModel):
+class _LeftOutRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     """A healthy window against the others."""
-
-    model_config = _STRICT
 
     row: str
     window: int = Field(ge=0)
@@ -88,10 +79,8 @@ class _LeftOutRecord(BaseModel):
     degrees_of_freedom: int = Field(ge=1)
 
 
-class BaselineRecord(BaseModel):
+class BaselineRecord(BaseModel, extra="forbid", frozen=True, strict=True):
     """What was learned on a healthy machine, as plain numbers."""
-
-    model_config = _STRICT
 
     format: Literal[1] = 1
     relations: tuple[RelationRecord | None, ...]  # one for each learned row, or null

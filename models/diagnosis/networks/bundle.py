@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -29,7 +29,6 @@ from models.errors import BundleError, did_you_mean, mistakes
 from models.machine import Machine
 
 _SHIPPED = Path(__file__).parents[2] / "bundles"
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 _Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
 _FORMAT = 2
 _PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
@@ -37,10 +36,8 @@ _BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
 _ARRAYS = ("input_scale", "W1", "b1", "W2", "b2")
 
 
-class HealthyEntry(BaseModel):
+class HealthyEntry(BaseModel, extra="forbid", frozen=True):
     """Healthy spread of one equation, see `models.diagnosis.networks.relation.Healthy`."""
-
-    model_config = _STRICT
 
     windows: int = Field(ge=1)
     msd: float = Field(ge=0)
@@ -48,10 +45,8 @@ class HealthyEntry(BaseModel):
     spread: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
 
 
-class EquationEntry(BaseModel):
+class EquationEntry(BaseModel, extra="forbid", frozen=True):
     """One equation of the bundle."""
-
-    model_config = _STRICT
 
     number: str
     channels: tuple[str, ...] = Field(description="measured states in order, references first")
@@ -62,20 +57,16 @@ class EquationEntry(BaseModel):
     healthy: HealthyEntry
 
 
-class CalibrationEntry(BaseModel):
+class CalibrationEntry(BaseModel, extra="forbid", frozen=True):
     """Calibration of one parameter, see `models.diagnosis.networks.amortised.Calibration`."""
-
-    model_config = _STRICT
 
     bias: float = Field(allow_inf_nan=False)
     log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
     z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
 
 
-class AmortisedEntry(BaseModel):
+class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
     """The amortised networks, see `models.diagnosis.networks.amortised.AmortisedNetworks`."""
-
-    model_config = _STRICT
 
     channels: tuple[str, ...] = Field(min_length=1, description="measured states in order")
     units: Literal["SI"] = Field(default="SI", description="units of the channels")
@@ -87,10 +78,8 @@ class AmortisedEntry(BaseModel):
     log_range: float = Field(gt=0, allow_inf_nan=False)
 
 
-class Training(BaseModel):
+class Training(BaseModel, extra="forbid", frozen=True):
     """How the bundle was made: enough to make it again."""
-
-    model_config = _STRICT
 
     seed: int
     training_windows: int
@@ -100,10 +89,8 @@ class Training(BaseModel):
     versions: dict[str, str]
 
 
-class Manifest(BaseModel):
+class Manifest(BaseModel, extra="forbid", frozen=True):
     """What a bundle says about itself."""
-
-    model_config = _STRICT
 
     format: int
     machine: str

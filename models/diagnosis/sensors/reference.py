@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import BaseModel, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.sensors.kinematics import Banded, PairReading, banded, read_pair, same
@@ -208,13 +208,8 @@ def _lines(window: WindowStatistics, columns: Sequence[int]) -> dict[int, tuple[
     return found
 
 
-_STRICT = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
-
-
-class NoiseReference(BaseModel):
+class NoiseReference(BaseModel, extra="forbid", frozen=True, strict=True, allow_inf_nan=False):
     """Noise on the healthy machine, mean over the windows, in the bands of `models.diagnosis.sensors.reference`."""
-
-    model_config = _STRICT
 
     density: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="two-sided, SI²/Hz")
     share: tuple[Annotated[float, Field(gt=0)], ...] = Field(description="over the channels' own mean squares, 1/Hz")
@@ -227,10 +222,8 @@ class NoiseReference(BaseModel):
         return self
 
 
-class _WithNoise(BaseModel):
+class _WithNoise(BaseModel, extra="forbid", frozen=True, strict=True, allow_inf_nan=False):
     """A reference that may be older than the check of noise; then it is written as it was read."""
-
-    model_config = _STRICT
 
     noise: NoiseReference | None = Field(default=None, description="None where it was not learned")
 
@@ -267,10 +260,8 @@ class PairReference(_WithNoise):
     same: float = Field(ge=-1, le=1, description="how much of it they show alike, at the same time and size")
 
 
-class SensorReference(BaseModel):
+class SensorReference(BaseModel, extra="forbid", frozen=True, strict=True, allow_inf_nan=False):
     """What healthy windows say of the sensors; as JSON it comes back bit for bit."""
-
-    model_config = _STRICT
 
     # Healthy windows it was learned from, and the hops in them.
     n_windows: int = Field(ge=1)
