@@ -11,9 +11,8 @@ from rotorwatch.records.sensor_faults import FaultKind
 MODEL = "model"  # the alarm that says: outside the model
 SHAPE = "shape"  # the alarm that says: where no equation can be evaluated, a channel's vibration is not as it was
 STREAM_LOST = "stream-lost"  # the alarm that says: no data come any more
+# The alarms on the monitor itself: a defect, or a history that refuses; and a computer that cannot keep up.
 FAULT, OVERLOADED = "monitor-fault", "monitor-overloaded"
-"""The alarms on the monitor itself: a defect, or a history that refuses; and a computer that cannot keep up."""
-
 DATA = "data-"  # what the names of all alarms of data health begin with
 GAP, CLOCK, CONFLICT, PHASE_REFERENCE = "data-gap", "data-clock", "data-conflict", "data-phase-reference"
 

@@ -202,8 +202,8 @@ def _same(one: Arrived, other: Arrived) -> bool:
 _REMEMBERED = 256
 _AHEAD = 64  # blocks by which a publisher may be ahead of what was heard of it, for it to be the same one
 _MOST = 8
+# Times that each of two publishers has gone on after the other: more than blocks out of order can amount to.
 _RETURNS = 6
-"""Times that each of two publishers has gone on after the other: more than blocks out of order can amount to."""
 _HORIZON_S = 300.0  # length of the data that came in, from all, in which these are counted
 
 

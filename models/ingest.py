@@ -29,9 +29,8 @@ from models.signals.block import SampleBlock
 from models.signals.wire import ARROW_ENCODING, decode_block, may_be_block
 
 EARLIER_COURSES = 64  # courses that are remembered, so that repetitions of their blocks are known as such
+# The year 2200: a clock that says more is broken, and times beyond 2262 fit nowhere.
 _LATEST_NS = 7_258_118_400_000_000_000
-"""The year 2200: a clock that says more is broken, and times beyond 2262 fit nowhere."""
-
 _SURELY_S = 1.0  # a block that is next in sequence but later than this has a wrong time rather than a gap before it
 
 

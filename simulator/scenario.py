@@ -20,12 +20,10 @@ from models.signals.channels import Channel, Quantity
 _SHIPPED = Path(__file__).parent / "scenarios"
 _FAULT = re.compile(r"(?P<parameter>\w+)=(?P<change>[-+.\deE]+)@(?P<at_s>[.\deE]+)")
 SensorFault = Literal["offset", "gain", "noise_relative", "stuck", "dropout", "clip", "delay", "swapped", "none"]
+# Kinds of sensor fault that have a value.
 SENSOR_FAULTS_WITH_VALUE = ("offset", "gain", "noise_relative", "clip", "delay")
-"""Kinds of sensor fault that have a value."""
-
+# What can go wrong that no diagnosed parameter describes, and the largest size of it.
 ANOMALIES: Mapping[str, float] = MappingProxyType({"crack": 0.8, "rub": 10.0, "added_mass": 10.0})
-"""What can go wrong that no diagnosed parameter describes, and the largest size of it."""
-
 LONGEST_DELAY_S = 1.0  # most by which a sensor can be late
 _WITH_RAMP = ("offset", "gain", "noise_relative")
 

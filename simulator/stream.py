@@ -95,9 +95,8 @@ def descriptor_payload(machine: MachineFile) -> bytes:
     return machine.descriptor.model_dump_json().encode()
 
 
+# 2026-01-01T00:00:00Z: a fixed start, so that the same scenario makes the same bytes.
 DEFAULT_START_NS = 1_767_225_600_000_000_000
-"""2026-01-01T00:00:00Z: a fixed start, so that the same scenario makes the same bytes."""
-
 _PIECE_S = 0.5
 
 

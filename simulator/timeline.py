@@ -19,9 +19,8 @@ from simulator.scenario import ANOMALIES, SENSOR_FAULTS_WITH_VALUE, Event, Named
 
 RAMP_STEP_S = 0.1  # length of the steps a ramp is made of
 _TRUTH_STEP_S = 1.0
+# Active faults of one sensor: kind to value, None where the kind has no value; a swap is "swapped with NAME".
 SensorFaults = Mapping[str, float | None]
-"""Active faults of one sensor: kind to value, None where the kind has no value; a swap is "swapped with NAME"."""
-
 SWAPPED_WITH = "swapped with "  # how the kind of a swap begins
 _Target = tuple[str, ...]
 _Values = tuple[float, ...]

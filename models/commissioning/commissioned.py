@@ -33,8 +33,8 @@ from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
+# What cannot be identified beside stiffness and damping: masses and shaft.
 _GEOMETRY = ("m1_kg", "m2_kg", "I2_kg_m2", "I2p_kg_m2", "shaft_length_m", "shaft_diameter_m", "shaft_E_Pa")
-"""What cannot be identified beside stiffness and damping: masses and shaft."""
 
 
 class KnowledgeLevel(StrEnum):
@@ -91,9 +91,9 @@ def knowledge_of(machine: MachineFile) -> Knowledge:
 
 _RPM = 30 / np.pi
 SPEED_MARGIN = 0.05  # the relations hold no speed; a bearing's film and the unbalance response do
+# Random vibration this many times below or above what was seen is another regime: a stopped drive, a mounting come
+# loose, a bearing lifted through its clearance.
 LEVEL_MARGIN = 10.0
-"""Random vibration this many times below or above what was seen is another regime: a stopped drive, a mounting come
-loose, a bearing lifted through its clearance."""
 _Positive = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 

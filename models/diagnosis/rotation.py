@@ -20,12 +20,12 @@ _SURROUNDINGS_HZ = 3.0
 _SWEEP_PER_S = 0.005  # fastest sweep looked for, as a part of the expected speed and second
 _PADDING = 4
 _REFINEMENTS = 5
+# Relative difference of speed between neighbouring hops that one shaft may have, its sweep taken into account: a
+# lightly damped resonance looks like a line, but its peak wanders by its width.
 _NEIGHBOUR = 0.004
-"""Relative difference of speed between neighbouring hops that one shaft may have, its sweep taken into account: a
-lightly damped resonance looks like a line, but its peak wanders by its width."""
 _RESOLVED = 0.25  # part of a hop's frequency resolution below which no difference is believed
+# Relative distance from the straight course through most of the hops, beyond which a peak is another one.
 _COURSE = 0.03
-"""Relative distance from the straight course through most of the hops, beyond which a peak is another one."""
 _FOLLOWED_PART = 0.8
 _STRONG, _FEW_HOPS = 15.0, 6  # a stretch of a few hops needs lines that stand out by themselves
 

@@ -75,14 +75,12 @@ _TABLE = {
 }
 
 PARAMETERS: tuple[str, ...] = tuple(_TABLE)  # the diagnosed parameters, in the order in which they are always reported
+# Parameters a fault can change, and the field that carries them (EI through Young's modulus).
 FAULT_FIELDS: Mapping[str, str] = MappingProxyType({name: row.field for name, row in _TABLE.items()})
-"""Parameters a fault can change, and the field that carries them (EI through Young's modulus)."""
-
+# Each parameter in a vibration engineer's words.
 PARAMETER_TEXT: Mapping[str, str] = MappingProxyType({name: row.text for name, row in _TABLE.items()})
-"""Each parameter in a vibration engineer's words."""
-
+# What kind of quantity each parameter is.
 QUANTITY: Mapping[str, str] = MappingProxyType({name: row.quantity for name, row in _TABLE.items()})
-"""What kind of quantity each parameter is."""
 
 
 def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> RotorParameters:
@@ -115,11 +113,10 @@ def changed(rotor: RotorParameters, relative_changes: Mapping[str, float]) -> Ro
 
 
 COORDINATES = ("y1", "y2", "psi", "z1", "z2", "phi")  # order of the six degrees of freedom (Eq. 13)
+# Order of the twelve states (Eq. 2); the paper counts them from 1.
 STATES = (*COORDINATES, *(f"{name}_dot" for name in COORDINATES))
-"""Order of the twelve states (Eq. 2); the paper counts them from 1."""
-
+# Position of each state, counted from 0.
 STATE_INDEX: Mapping[str, int] = MappingProxyType({name: index for index, name in enumerate(STATES)})
-"""Position of each state, counted from 0."""
 
 
 def M_matrix(rotor: RotorParameters) -> FloatArray:

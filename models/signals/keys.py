@@ -122,8 +122,8 @@ _ALL = ("/**", "/**/@adv/**")
 _EVERYWHERE = (f"{PREFIX}/**", f"{PREFIX}/**/@adv/**")
 _LISTENED = ("declare_subscriber", "query")
 _LIVELINESS = ("declare_liveliness_subscriber", "liveliness_query")
+# What tells a partner who listens and who asks. Nothing is read or written by it, and without it nothing is sent.
 _INTERESTS = (*_LISTENED, "declare_queryable", *_LIVELINESS)
-"""What tells a partner who listens and who asks. Nothing is read or written by it, and without it nothing is sent."""
 
 
 def _name(text: str) -> str:

@@ -170,9 +170,8 @@ def _text(field: str, path: Path) -> str:
         raise MachineFileError(f"link.{field}: {path}: not a text file") from error
 
 
+# Key segments that could begin any key: no wildcards, no empty ones.
 NAMESPACE_PATTERN = r"^([A-Za-z0-9][A-Za-z0-9_.-]*(/[A-Za-z0-9][A-Za-z0-9_.-]*)*)?$"
-"""Key segments that could begin any key: no wildcards, no empty ones."""
-
 _ENCRYPTED = ("tls/", "quic/")
 _SECRETS = {"password": "password_file", "passwords": "passwords_file"}
 

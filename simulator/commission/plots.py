@@ -17,8 +17,8 @@ from models.diagnosis.readings import Z95
 from models.diagnosis.verdict.stretch import to_scale
 from simulator.commission.verdict import percent
 
+# After Okabe and Ito: told apart with any colour vision.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""After Okabe and Ito: told apart with any colour vision."""
 INK, GREY, BAND = "#1c2530", "#66727f", "#edf2f6"
 WIDTH_IN = 10.0  # width of every picture, so that letters are of one size on the page
 _GRID = "#dde2e6"

@@ -27,8 +27,8 @@ from simulator.training.draws import Draw, Layout, Purpose, draw_condition, wind
 from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 
 _CONDITIONS_PER_BATCH = 480
+# Windows of either layout that calibrate the amortised networks, per training window of a relation network.
 _CALIBRATION_SHARE = 3
-"""Windows of either layout that calibrate the amortised networks, per training window of a relation network."""
 _CALIBRATION_STREAM = 20
 
 

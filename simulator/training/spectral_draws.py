@@ -37,10 +37,9 @@ from models.signals.block import FloatArray
 from simulator.training.draws import Purpose
 
 _Complex = TypeVar("_Complex", npt.NDArray[np.complex64], npt.NDArray[np.complex128])
+# Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
+# would teach the network to answer "healthy" to everything small.
 LOG_RATIO = 0.55
-"""Every parameter is drawn log-uniformly from -42 % to +73 %: wide, continuous, and without a peak at healthy, which
-would teach the network to answer "healthy" to everything small."""
-
 _PER_ROTOR = 3  # windows that share a rotor and a speed; excitation, noise, unbalance and realisation are their own
 _HANN = (np.float32(1 / 6), np.float32(4 / 6), np.float32(1 / 6))
 
@@ -219,12 +218,11 @@ _STREAM = 50  # keeps the random numbers apart from those of the relation networ
 _BASIS_DRAWS = 1500
 _AT_ONCE = 24  # conditions worked on together: more do not fit into a processor's cache and take twice the time
 _REALISATIONS = 4  # windows drawn from one condition
+# Sampling error of the agreement of displacement and rate, in logarithms: larger than the real one (0.02 to 0.05), so
+# that no network reads a parameter from an agreement that real sensors do not have.
 _CONSISTENCY_ERROR = 0.1
-"""Sampling error of the agreement of displacement and rate, in logarithms: larger than the real one (0.02 to 0.05), so
-that no network reads a parameter from an agreement that real sensors do not have."""
-
+# Condensed features, shape (n_windows, n_inputs), and logarithmic ratios of the parameters, shape (n_windows, 6).
 Batch = tuple[Float32Array, Float32Array]
-"""Condensed features, shape (n_windows, n_inputs), and logarithmic ratios of the parameters, shape (n_windows, 6)."""
 
 
 @dataclass(frozen=True, slots=True)

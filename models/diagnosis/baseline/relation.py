@@ -34,8 +34,8 @@ from models.errors import EstimationError
 from models.signals.block import FloatArray
 
 _RISE = 4.0  # what the criterion gains at two standard errors if the covariance is right
+# Distances that are tried, standard errors: to about twenty times what the covariance says.
 _STEPS = 2.0 * 1.4 ** np.arange(10)
-"""Distances that are tried, standard errors: to about twenty times what the covariance says."""
 
 
 def stretching(criterion: Callable[[FloatArray], float], b: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -37,12 +37,12 @@ from models.signals.block import FloatArray
 
 _COLD_STEPS, _WARM_STEPS = 100, 15
 _NEAR, _GAIN = 0.15, 3.0  # converged: no diagnosed parameter would move by more than this many standard errors
+# A cold search finds its region on groups three times as wide.
 _COARSE, _COARSE_STEPS, _COARSE_NEAR, _COARSE_GAIN = 3.0, 25, 1.0, 30.0
-"""A cold search finds its region on groups three times as wide."""
 _GROUPS = 150  # the band over the widest group
+# Steps after which a cold search is given up where it is still so many times further off than is evaluated. In windows
+# that the theory explains most searches have ended by then.
 _PATIENCE, _HOPELESS = 30, 2.0
-"""Steps after which a cold search is given up where it is still so many times further off than is evaluated. In
-windows that the theory explains most searches have ended by then."""
 _OUTSIDE = "a sensor is at fault, or something outside the model has changed"
 _SYNCHRONOUS_BINS = 3
 _FOLLOWED = 12  # windows in a row that may start from one window's units and slopes before a search takes its own

@@ -30,11 +30,11 @@ from models.signals.block import FloatArray
 
 _MOST_STEPS = 6
 _FARTHEST = 0.15  # relative change of the expected spectra (rms) beyond which the weights are no longer their own
+# Standard errors by which a stretch may differ from the window it is part of without being searched for itself.
 _NEWS = 3.0
-"""Standard errors by which a stretch may differ from the window it is part of without being searched for itself."""
+# A stretch further from the theory than this is searched for itself. The margin: at another level all of it counts as
+# excess.
 _LEAST_EXCESS_Z, _EXCESS_MARGIN = 4.0, 1.15
-"""A stretch further from the theory than this is searched for itself. The margin: at another level all of it counts
-as excess."""
 
 
 @dataclass(frozen=True, slots=True)

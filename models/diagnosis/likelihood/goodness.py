@@ -21,14 +21,14 @@ from models.machine import Machine
 from models.physics.rotor import PARAMETER_TEXT, Q_shaft, impossible
 from models.signals.block import FloatArray
 
+# Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z.
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
-"""Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z."""
 _UNEQUAL = "shaft stiffer in y than in z"
 _MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
 _LEAST_SUSPECT_Z = 5.0
 _LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
+# An alternative of which less than this is left beside the model's own parameters cannot be told from them.
 _LEAST_INFORMATION = 1e-4
-"""An alternative of which less than this is left beside the model's own parameters cannot be told from them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,25 +159,25 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     return names, np.stack(slopes)
 
 
+# No stiffness or damping is believed to have changed by more than a factor of five within the model.
 _MOST_LOG_RATIO = float(np.log(5))
-"""No stiffness or damping is believed to have changed by more than a factor of five within the model."""
+# Mean squared excess over its expectation, beyond which there is nothing to follow: the next search starts cold.
 _MOST_EXCESS = 100.0
-"""Mean squared excess over its expectation, beyond which there is nothing to follow: the next search starts cold."""
+# Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
+# Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17.
 _MOST_DEVIATION = 0.2
-"""Deviation of the spectra from the theory (relative, rms, less what sampling makes) up to which readings mean a thing.
-Where parameters of the model changed, by whatever, it stays below 0.05; a rub or a small mass makes up to 0.17."""
+# The same where a parameter would have changed by more than a factor of two: a rub or a mass hardly moves them, and a
+# change as large as that must explain the window.
 _LARGE, _MOST_DEVIATION_LARGE = float(np.log(2)), 0.1
-"""The same where a parameter would have changed by more than a factor of two: a rub or a mass hardly moves them, and a
-change as large as that must explain the window."""
+# Share of the motion that the theory takes for noise of the sensors though displacement and velocity show it alike, up
+# to which a rotor can be seen behind it: a spectrum without resonances is taken for coloured noise, and what is left of
+# it fits any rotor.
 _MOST_NOISE = 0.3
-"""Share of the motion that the theory takes for noise of the sensors though displacement and velocity show it alike,
-up to which a rotor can be seen behind it: a spectrum without resonances is taken for coloured noise, and what is left
-of it fits any rotor."""
 _UNSHARED = 5.0  # how many times more noise one sensor of a pair may have than the other
+# Misfit that is no chance, and how many times less certain than on the rotor as it was most of its parameters may be
+# then. Within the model nothing makes them less certain than three times; a line that passes for the one resonance of a
+# softer shaft leaves bearings anywhere.
 MOST_MISFIT, _BLIND = 4.0, 10.0
-"""Misfit that is no chance, and how many times less certain than on the rotor as it was most of its parameters may be
-then. Within the model nothing makes them less certain than three times; a line that passes for the one resonance of a
-softer shaft leaves bearings anywhere."""
 
 
 def unexplained_at(

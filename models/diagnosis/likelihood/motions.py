@@ -33,21 +33,19 @@ from models.physics.rotor import COORDINATES, STATE_INDEX, system_A
 from models.signals.block import FloatArray
 from models.signals.channels import ACCELERATIONS
 
+# Independent averages per half-overlapped Hann segment and bin: one over the sum of the squared correlations with all
+# neighbouring segments and bins.
 AVERAGES_PER_BIN = 0.4737
-"""Independent averages per half-overlapped Hann segment and bin: one over the sum of the squared correlations with all
-neighbouring segments and bins."""
-
+# Squared correlations with the bin itself and the two next to it: within a segment, and twice with a neighbour.
 _SCATTER = AVERAGES_PER_BIN * np.array([1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069])
-"""Squared correlations with the bin itself and the two next to it: within a segment, and twice with a neighbour."""
-
 _KERNEL = np.array([1.0, 4.0, 1.0]) / 6
 _OFFSETS = np.arange(-2.5, 2.6, 0.5)  # in bins
 _FINE_KERNEL = (
     np.where(np.abs(_OFFSETS) == 1, 0.5, np.sinc(_OFFSETS) / np.where(np.abs(_OFFSETS) == 1, 1, 1 - _OFFSETS**2)) ** 2
 )
 _FINE_KERNEL = _FINE_KERNEL / _FINE_KERNEL.sum()
+# Decay over a segment, in nepers, of the longest ringing mode in the band, below which the fine grid is used.
 _RINGING = 8.0
-"""Decay over a segment, in nepers, of the longest ringing mode in the band, below which the fine grid is used."""
 _PER_BANDWIDTH = 0.5  # width of a group over the half-power bandwidth of the nearest mode
 
 

@@ -10,21 +10,20 @@ from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, ModelPoint
 from models.diagnosis.moments import ComplexArray
 from models.signals.block import FloatArray
 
+# Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude).
 LOG_NOISE = float(np.log(1e-3))
-"""Usual noise density of a channel, relative to its mean density in the band (3 % in amplitude)."""
-
+# Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of low
+# rank, or a channel without visible noise, leaves them undetermined.
 _WEAK = 0.05
-"""Weak pull of levels and noise towards their usual values: without it the search wanders off where an excitation of
-low rank, or a channel without visible noise, leaves them undetermined."""
 _COLOUR = 1.0  # the same for the noise's colour
+# How strongly the forces' own colours may be pulled towards none. The window itself says which (D. J. C. MacKay, Neural
+# Computation 4 (1992)): forces of one colour cost next to nothing, and a hump is left alone.
 _STRENGTHS = np.geomspace(0.5, 2000, 24)
-"""How strongly the forces' own colours may be pulled towards none. The window itself says which (D. J. C. MacKay,
-Neural Computation 4 (1992)): forces of one colour cost next to nothing, and a hump is left alone."""
+# How often a search asks for the strength anew, and the change of its logarithm that is not worth more steps.
 _LOOKS, _SAME_STRENGTH = 3, 0.5
-"""How often a search asks for the strength anew, and the change of its logarithm that is not worth more steps."""
+# The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
+# keeps the order: on coarse groups a filter of order nought would pass for anything.
 _CUTOFF, _ORDER, _FIXED = 1.0, 10.0, 1e4
-"""The same for the low-pass: its logarithms have standard deviations of 1 and 0.3. A model without shapes of its own
-keeps the order: on coarse groups a filter of order nought would pass for anything."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,9 +33,8 @@ from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, Q_shaft
 from models.signals.block import FloatArray
 
+# Parameters that shape the spectra, in the order of the parameter vector.
 STRUCTURAL = ("k_by", "c_by", "k_bz", "c_bz", "EI")
-"""Parameters that shape the spectra, in the order of the parameter vector."""
-
 SHAPES = 8  # polynomials in √f for the colour of every degree of freedom's force
 ROWS, COLUMNS = np.tril_indices(6)  # elements of C and T in the order of the parameter vector
 _BEARING_DOFS = (0, 0, 3, 3)
@@ -297,8 +296,8 @@ def _summed(left: ComplexArray, right: ComplexArray) -> ComplexArray:
 
 
 _START_NOISE = float(np.log(2e-3))
+# Power, relative to the forced response, below which forces are not reconstructed: noise would pass for them.
 _REGULARISED = 1e-2
-"""Power, relative to the forced response, below which forces are not reconstructed: noise would pass for them."""
 _VISIBLE = 0.02
 _LEAST_LEVEL = 1e-3
 

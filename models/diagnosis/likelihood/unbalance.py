@@ -20,9 +20,9 @@ from models.errors import EstimationError
 from models.machine import Machine
 from models.signals.block import FloatArray
 
+# Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
+# and probes are not mounted better than to a few degrees.
 _TURNED, _LEAST_TURN = 6.0, 0.05
-"""Standard errors, and part of the unbalance, by which the heavy spot must have moved to count as turned: angle sensors
-and probes are not mounted better than to a few degrees."""
 _GAIN = 0.15  # relative error of every motion: what sensors, and a rotor that is not quite that of the model, make
 _RATE = 1e-6  # probability that vectors of an unbalance are taken for those of something else
 

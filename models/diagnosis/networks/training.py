@@ -38,8 +38,8 @@ from models.signals.block import FloatArray
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25
 _LEVELS = [0.9, 0.95]
+# Quantiles of |z| that calibrate the standard errors, and the normal distribution's: two scatter less than one.
 _NORMAL = np.array([[1.644854], [Z95]])
-"""Quantiles of |z| that calibrate the standard errors, and the normal distribution's: two scatter less than one."""
 _MAD = 1.4826  # median absolute deviation to standard deviation
 
 

@@ -15,13 +15,13 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 MOST_ERRORS = 5.0  # standard errors beyond which two sensors disagree
+# Gains that differ by less are calibration where there is no reference; with one, changes that are smaller.
 LEAST_GAIN, LEAST_GAIN_CHANGE = 0.06, 0.015
-"""Gains that differ by less are calibration where there is no reference; with one, changes that are smaller."""
 LEAST_COURSE = 0.02  # change of the gain within a window that is not reported
+# The same for delays. A delay of a quarter of a millisecond already reads as a quarter of a bearing's damping.
 LEAST_DELAY_S, LEAST_DELAY_CHANGE_S = 1e-4, 3e-5
-"""The same for delays. A delay of a quarter of a millisecond already reads as a quarter of a bearing's damping."""
+# Of a disagreement, the channel that accounts for it shows all but this part, and the other one less than it.
 _ALIKE = 1 / 3
-"""Of a disagreement, the channel that accounts for it shows all but this part, and the other one less than it."""
 _SAME_SPEED = 0.01
 _SURE = 0.2  # standard error of a channel's own change, as a part of the disagreement, up to which it may convict
 
@@ -251,8 +251,8 @@ BROKEN = 0.9  # two sensors of one motion that share less than this do not see t
 _SUSPECT = 0.985  # below this they may see each other's: two places of a stiff shaft move much alike
 _RESTORED = 0.97  # what every pair must share again after the exchange, unless less was usual when healthy
 _CLEARLY = 5.0  # how much smaller the exchange must make what the worse of the pairs does not share
+# Relative difference of rotation vectors that tells which of two exchanges restores the healthy pattern.
 _CROSSED = 0.25
-"""Relative difference of rotation vectors that tells which of two exchanges restores the healthy pattern."""
 
 
 def _usual(reference: SensorReference | None, first: str, second: str) -> float:

@@ -17,8 +17,8 @@ from models.signals.block import FloatArray
 LONGEST_DELAY_S = 0.02  # longest delay that is looked for
 _DELAY_STEP_S = 2.5e-4
 _AS_GOOD = 0.98  # a shorter delay that fits this well is preferred: a narrow band repeats itself after a period
+# Standard errors within which the rotation must agree with the rest of the motion, or it is not counted (runout).
 _LINE_FITS = 5.0
-"""Standard errors within which the rotation must agree with the rest of the motion, or it is not counted (runout)."""
 _RUNOUT = 0.03  # logarithm of the gain by which the rotation must differ besides
 _HANN_LOSS = 0.95  # part of the data's information that is left in half-overlapping Hann segments
 _FLOOR = 1e-10

@@ -16,14 +16,14 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 
 STILL_S = 0.25  # longest time for which equal samples are put down to quantisation
+# Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there.
 FLAT_PART = 0.005
-"""Part of a hop's samples at its own limit that is put down to chance, beside what a quantised sine has there."""
 STEP_SPREADS = 8.0  # healthy standard deviations of a hop's mean that a step of it must exceed
 STEP_PART = 0.3  # part of the channel's rms that it must exceed besides
+# A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel.
 DRIFT_PART = 3.0
-"""A slow drift of the mean over a window, as of a gap voltage, is allowed up to this many rms of the channel."""
+# The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages.
 MOVED_PART = 3.0
-"""The mean may differ from the reference by this many rms of the channel: temperature and load move gap voltages."""
 _TOGETHER = 0.3  # where another displacement moves by at least this part of a displacement's step, the shaft has moved
 
 

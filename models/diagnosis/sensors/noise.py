@@ -45,11 +45,11 @@ the same reckoning.
 """
 FLOOR_FLAT = 0.5  # part of the bands that must lie on the floor: a machine's own spectrum has resonances
 LINE_RISE = 4.0
+# Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line.
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
-"""Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line."""
 _FEWEST = 4  # channels that are needed to tell which of them rose alone
+# Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated.
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
-"""Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated."""
 _CLEAR = 0.5  # one of two sensors is the noisy one if its noise exceeds the other's by more than this part of both
 _SURE = 0.15
 _COUNTS = 2.0  # bands in which the noise rose by less do not count for its size

@@ -23,19 +23,19 @@ LEAST_SLIP_RAD = 0.2  # slip from hop to hop; thermal bending turns vectors, too
 LEAST_JITTER = 0.05  # power of the line left at the speed over that of the line taken out: jitter of 0.47 rad
 LEAST_WILD_JITTER = 0.1  # the same where jitter makes the speed jump about, and the line is taken out hop by hop
 _ERRATIC = 2.5  # ups and downs of the speed over its range: 1 for a run-up, 2 there and back
+# Range in which the shaft's true speed is looked for then, relative to the slowest and fastest hop.
 _WILD_SPEEDS = (0.7, 1.5)
-"""Range in which the shaft's true speed is looked for then, relative to the slowest and fastest hop."""
 _JITTER_ERRORS = 6.0
+# Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number.
 _STEADY_TURNS, _WHOLE_TURNS = 0.02, 0.05
-"""Turns of a hop by which a steady shaft's may differ, and by which a loss may differ from a whole number."""
 _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
 _ALIKE = 0.25
 _STAY = 3.0
 _LENGTH = 0.15  # relative change of the vectors' common length that still counts as none
 _LINE_BINS, _AROUND_BINS = 1, 12
 _LINE_STRENGTH = 15.0  # a line is one where the channels' mean power stands out by this factor
+# The rotation is gone below this part of its healthy amplitude, and is elsewhere within this factor of it.
 _GONE, _THERE = 1 / 3, 3.0
-"""The rotation is gone below this part of its healthy amplitude, and is elsewhere within this factor of it."""
 
 
 @dataclass(frozen=True, slots=True)

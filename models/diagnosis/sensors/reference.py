@@ -61,8 +61,8 @@ _FLAT = 2.0  # bands within this factor of the lowest lie on the floor
 _LINE_BINS, _BLOCK = 3, 24  # bins that hold a line in Hann segments, and bins of its surroundings
 _STANDS_OUT = 6.0  # a bin this far above the median of its surroundings may hold a line
 _OWN = 4.0  # so far it must stand out still where the other channels have explained what they can
+# Relative distance from a multiple of half the speed within which a line is the shaft's, beside its range.
 _HARMONIC = 0.002
-"""Relative distance from a multiple of half the speed within which a line is the shaft's, beside its range."""
 _RIDGE = 1e-9
 _LEAKAGE = 1.0
 _LEFT = 0.1  # least part of a difference that is still called noise after leakage was taken out

@@ -141,8 +141,8 @@ def _crossed(per_hop: float, overlap: int) -> float:
     return float(brentq(lambda b: math.log(crossing_rate(b, overlap) / per_hop), low, high, xtol=1e-10))
 
 
+# Probability that two diagnosticians who are both right are said to disagree in a window, about any parameter.
 _RATE = 1e-3
-"""Probability that two diagnosticians who are both right are said to disagree in a window, about any parameter."""
 
 
 def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:

@@ -31,15 +31,14 @@ from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Finding, Parameter, Verdict
 
+# Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
+# on 150 healthy stretches of each length and either layout of sources (rotor kit, seed 301) z of no parameter scatters
+# by more than 1.04.
 _SHORT_HOPS = (2, 4, 7)
-"""Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
-on 150 healthy stretches of each length and either layout of sources (rotor kit, seed 301) z of no parameter scatters
-by more than 1.04."""
-
 _DOUBLINGS = 6
 _LOWER = np.tril_indices(len(PARAMETERS))  # elements of an information matrix that are remembered: it is symmetric
+# Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data.
 _CONTRADICTION_RATE = 1e-7
-"""Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data."""
 
 
 @dataclass(frozen=True, slots=True)

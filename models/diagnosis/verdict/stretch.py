@@ -30,8 +30,8 @@ from rotorwatch.records.windows import Parameter
 
 _LINEAR = frozenset({"e"})
 _MOST_LOSS = -0.95  # a parameter that reads as lost altogether has no logarithm
+# Least share of the total variance that is a window's own: its covariance and the shared one are both estimates.
 _LEAST_OWN = 1e-4
-"""Least share of the total variance that is a window's own: its covariance and the shared one are both estimates."""
 
 
 def to_scale(name: str, change: float) -> float:
