@@ -83,11 +83,11 @@ def publish(
     """
     stop = Event() if stop is None else stop
     with _session(settings) as session, _declared(session, machine, settings.pace) as outlets:
-        if settings.wait_for_subscriber_s is not None:
-            _wait_for_subscriber(session, machine.keys, settings, stop)
-        outlets.descriptor.put(descriptor_payload(machine))
         # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
         probe = session.declare_publisher(machine.keys.stream)
+        if settings.wait_for_subscriber_s is not None:
+            _wait_for_subscriber(session, probe, machine.keys, settings, stop)
+        outlets.descriptor.put(descriptor_payload(machine))
         summary = _send(outlets, probe, machine, stream, settings, stop, on_block)
         probe.undeclare()  # type: ignore[no-untyped-call]
         if not stop.is_set():
@@ -174,10 +174,10 @@ def _declared(session: zenoh.Session, machine: MachineFile, pace: float | None) 
             item.undeclare()  # type: ignore[no-untyped-call]
 
 
-def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, settings: PublishSettings, stop: Event) -> None:
+def _wait_for_subscriber(
+    session: zenoh.Session, probe: zenoh.Publisher, keys: MachineKeys, settings: PublishSettings, stop: Event
+) -> None:
     link, timeout_s = settings.link, settings.wait_for_subscriber_s or 0.0
-    # The advanced publisher does not say whether it has subscribers; a plain one on the same key does.
-    probe = session.declare_publisher(keys.stream)
     deadline = time.monotonic() + timeout_s
     while not probe.matching_status.matching:  # type: ignore[attr-defined]  # the stub says bool
         if stop.wait(_POLL_S):
@@ -189,7 +189,6 @@ def _wait_for_subscriber(session: zenoh.Session, keys: MachineKeys, settings: Pu
             elif link.connect:
                 why = f": {link.refusal()}"
             raise PublishError(f"nobody subscribed to {keys.stream} within {timeout_s:g} s{why}")
-    probe.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _send(

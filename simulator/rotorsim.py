@@ -6,9 +6,8 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -38,16 +37,7 @@ app = typer.Typer(
 )
 
 
-class _Encoding(StrEnum):
-    RAW = "raw"
-    ARROW = "arrow"
-
-
-class _Mode(StrEnum):
-    PEER = "peer"
-    CLIENT = "client"
-
-
+_Mode = Literal["peer", "client"]
 _ScenarioArgument = Annotated[
     str, typer.Argument(metavar="SCENARIO", help="Shipped scenario by name, or the path of a scenario file.")
 ]
@@ -66,7 +56,9 @@ _FaultOption = Annotated[
     ),
 ]
 _BlockOption = Annotated[float, typer.Option("--block-s", help="Length of a block, s; 0.02 to 0.5 is sensible.")]
-_EncodingOption = Annotated[_Encoding, typer.Option(help="Raw samples with a fixed header, or Arrow IPC streams.")]
+_EncodingOption = Annotated[
+    Literal["raw", "arrow"], typer.Option(help="Raw samples with a fixed header, or Arrow IPC streams.")
+]
 
 
 @app.callback()
@@ -88,7 +80,7 @@ def publish(
         ),
     ] = "1",
     block_s: _BlockOption = 0.1,
-    encoding: _EncodingOption = _Encoding.RAW,
+    encoding: _EncodingOption = "raw",
     connect: Annotated[
         list[str] | None, typer.Option(help="Endpoint to connect to, default tcp/127.0.0.1:7447. Repeatable.")
     ] = None,
@@ -145,7 +137,7 @@ def publish(
         settings = PublishSettings(
             link=_link(link_file, mode, listen, connect),
             pace=factor,
-            encoding=encoding.value,
+            encoding=encoding,
             wait_for_subscriber_s=wait_for_subscriber_s,
             linger_s=linger_s,
         )
@@ -165,7 +157,7 @@ def record(
     duration_s: _DurationOption = None,
     fault: _FaultOption = None,
     block_s: _BlockOption = 0.1,
-    encoding: _EncodingOption = _Encoding.RAW,
+    encoding: _EncodingOption = "raw",
     start: Annotated[str, typer.Option(help="Time of the first sample, ISO 8601 (UTC if no zone).")] = (
         "2026-01-01T00:00:00Z"
     ),
@@ -195,7 +187,7 @@ def record(
         with _stop_on_signal() as stop, _progress(loaded.duration_s, "") as on_block:
             stream = _stream(loaded, rig, block_s, start_ns, run)
             summary = record_stream(
-                rig, stream, output, encoding=encoding.value, overwrite=overwrite, stop=stop, on_block=on_block
+                rig, stream, output, encoding=encoding, overwrite=overwrite, stop=stop, on_block=on_block
             )
         typer.echo(f"recorded {summary.blocks} blocks, {summary.data_s:.1f} s of data, in {output}")
 
@@ -226,7 +218,7 @@ def _link(file: Path | None, mode: _Mode | None, listen: list[str] | None, conne
     """What the file says, and the command line over it; without either, a monitor on this computer."""
     from simulator.publisher import DEFAULT_CONNECT  # noqa: PLC0415  # keeps --help quick
 
-    update: dict[str, object] = {} if mode is None else {"mode": mode.value}
+    update: dict[str, object] = {} if mode is None else {"mode": mode}
     if listen or connect:
         update |= {"listen": tuple(listen or ()), "connect": tuple(connect or ())}
     link = LinkSettings(connect=(DEFAULT_CONNECT,)) if file is None else load_link(file)

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from operator import itemgetter
 
 import numpy as np
 import numpy.typing as npt
@@ -164,18 +165,14 @@ class SensorBank:
     def _stretches(self, name: str, first: int, n_samples: int) -> list[tuple[int, int, SensorFaults]]:
         """Rows during which one channel's faults stay the same."""
         states = self._faults.get(name, ())
-        begin, end = (bisect_right(states, sample, key=_sample) for sample in (first, first + n_samples - 1))
+        begin, end = (bisect_right(states, sample, key=itemgetter(0)) for sample in (first, first + n_samples - 1))
         cuts = [0, *(sample - first for sample, _ in states[begin:end]), n_samples]
         return [(begin, end, _in_force(states, first + begin)) for begin, end in pairwise(cuts)]
 
 
 def _in_force(states: Sequence[tuple[int, SensorFaults]], sample: int) -> SensorFaults:
-    past = bisect_right(states, sample, key=_sample)
+    past = bisect_right(states, sample, key=itemgetter(0))
     return states[past - 1][1] if past else _NO_FAULT
-
-
-def _sample(state: tuple[int, SensorFaults]) -> int:
-    return state[0]
 
 
 def _value(faults: SensorFaults, kind: str, otherwise: float) -> float:
