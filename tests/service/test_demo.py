@@ -19,7 +19,7 @@ from tests.service.live import endpoint, until
 from tests.service.preloaded import ran
 
 ROOT = Path(__file__).parents[2]
-HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "200"))
+HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "130"))
 
 
 _started: list[subprocess.Popen[str]] = []

@@ -68,7 +68,7 @@ def test_every_kind_as_png_and_svg(faulty: Path, tmp_path: Path, kind: str) -> N
 def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffix: str) -> None:
     """In another process, with another matplotlibrc."""
     one, other = tmp_path / f"one.{suffix}", tmp_path / f"other.{suffix}"
-    arguments = ["--from", "10", "--to", "30", "--cascade"]
+    arguments = ["--from", "10", "--to", "30", "--cascade", "--size", "4x3"]
     assert run("waterfall", faulty, *arguments, "--out", one)[0] == 0
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: yellow\nfont.size: 20\n", encoding="utf-8")
     environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7"}

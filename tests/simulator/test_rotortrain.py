@@ -39,8 +39,8 @@ def test_train_writes_a_bundle_that_fits_the_machine(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_machine_file_that_is_not_there_is_exit_code_2_and_a_sentence(tmp_path: Path) -> None:
-    done = run("train", "--machine", "none.toml", "--out", str(tmp_path / "x"))
-    assert done.returncode == 2
+    done = CliRunner().invoke(app, ["train", "--machine", "none.toml", "--out", str(tmp_path / "x")])
+    assert done.exit_code == 2
     assert "none.toml: no such machine file" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "x").exists()
