@@ -1,16 +1,18 @@
-"""``rotortrain commission`` as a process: what it writes, what it refuses, and how a commissioning is replaced."""
+"""``rotortrain commission``: what it writes, what it refuses, and how a commissioning is replaced."""
 
+import contextlib
 import json
 import os
 import re
-import subprocess
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner, Result
 
 from models.commissioning.commissioned import load_commissioned
 from models.machine import load_machine_file
 from simulator.recorder import record
+from simulator.rotortrain import app
 from tests.commissioning.rotor_kit import LAB, stream
 from tests.service.preloaded import ran
 
@@ -19,42 +21,43 @@ SHIPPED = (ROOT / "models" / "machines" / "lab.toml").read_text(encoding="utf-8"
 NOTHING_KNOWN = re.sub(r"\[(rotor|operation|condition)\].*?(?=\n\[)", "", SHIPPED, flags=re.DOTALL)
 
 
-def run(folder: Path, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    variables = {**os.environ, "COLUMNS": "200"}
-    return ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
+def run(folder: Path, *arguments: str | Path) -> Result:
+    with contextlib.chdir(folder):
+        return CliRunner(env={"COLUMNS": "200"}).invoke(app, ["commission", *map(str, arguments)])
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("commission")
     (place / "machine.toml").write_text(NOTHING_KNOWN, encoding="utf-8")
-    for name, duration_s, seed in (("monday", 100.0, 81), ("friday", 80.0, 82), ("short", 20.0, 83)):
+    for name, duration_s, seed in (("monday", 80.0, 81), ("friday", 70.0, 82), ("short", 20.0, 83)):
         record(LAB, ((block, ()) for block in stream(duration_s, seed)), place / f"{name}.mcap")
     return place
 
 
 def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reason(folder: Path) -> None:
     arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "friday.mcap", "--out", "kit")
-    found = run(folder, *arguments)
+    variables = {**os.environ, "COLUMNS": "200"}
+    found = ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
     assert found.returncode == 0, found.stderr
     assert "bundle: kit" in found.stdout
     machine = load_machine_file(folder / "machine.toml")
     first = load_commissioned(folder / "kit", machine)
     assert (first.version, first.replaces, first.level) == (1, None, "none")
     assert [one.name for one in first.recordings] == ["monday.mcap", "friday.mcap"]
-    assert [one.used_s for one in first.recordings] == [95.0, 75.0]
+    assert [one.used_s for one in first.recordings] == [75.0, 65.0]
     assert len({one.sha256 for one in first.recordings}) == 2
     report = json.loads((folder / "kit" / "report.json").read_text(encoding="utf-8"))
     assert report["identity"] == first.identity
     assert "<html" in (folder / "kit" / "report.html").read_text(encoding="utf-8")
 
     again = run(folder, *arguments)
-    assert again.returncode == 2
+    assert again.exit_code == 2
     assert "kit holds version 1 of the commissioning of demo/lab: say why it is replaced" in again.stderr
     assert load_commissioned(folder / "kit", machine) == first
 
     again = run(folder, *arguments, "--why", "bearing exchanged")
-    assert again.returncode == 0, again.stderr
+    assert again.exit_code == 0, again.stderr
     second = load_commissioned(folder / "kit", machine)
     assert (second.version, second.replaces, second.why) == (2, first.identity, "bearing exchanged")
     assert json.loads((folder / "kit" / "commissioned-1.json").read_text(encoding="utf-8"))["version"] == 1
@@ -62,7 +65,7 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
 
 def test_a_recording_that_is_not_fit_is_refused_with_what_to_record(folder: Path) -> None:
     found = run(folder, "--machine", "machine.toml", "--healthy", "short.mcap", "--out", "never")
-    assert found.returncode == 3
+    assert found.exit_code == 3
     assert "too short: 15 s of usable data" in " ".join(found.stdout.split())
     assert not (folder / "never" / "commissioned.json").exists()
     report = json.loads((folder / "never" / "report.json").read_text(encoding="utf-8"))
@@ -73,10 +76,10 @@ def test_a_recording_that_is_not_fit_is_refused_with_what_to_record(folder: Path
 def test_recordings_and_machine_files_that_cannot_be_used(folder: Path) -> None:
     (folder / "other.toml").write_text(NOTHING_KNOWN.replace('name = "lab"', 'name = "pump"', 1), encoding="utf-8")
     found = run(folder, "--machine", "other.toml", "--healthy", "monday.mcap", "--out", "never")
-    assert found.returncode == 2
+    assert found.exit_code == 2
     assert "no hop of 5 s of demo/pump in it; it holds rotorwatch/demo/lab/stream" in found.stderr
     (folder / "broken.toml").write_text(NOTHING_KNOWN + "\nnonsense = 1\n", encoding="utf-8")
     found = run(folder, "--machine", "broken.toml", "--healthy", "monday.mcap", "--out", "never")
-    assert found.returncode == 2
+    assert found.exit_code == 2
     assert "nonsense" in found.stderr
     assert "Traceback" not in found.stderr
