@@ -23,11 +23,14 @@ from contextlib import closing
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
+
 from models.commissioning.commissioned import install
 from models.signals.block import SampleBlock
 from models.signals.wire import encode_block
 from service.history.records import Retention
 from service.history.store import Store
+from service.history.windows import BUCKET, packed
 from service.settings.service import LogSettings, QueueSettings
 from service.stream.inbox import RawBlock
 from service.stream.worker import Clocks, MachineWorker
@@ -53,20 +56,25 @@ def written() -> int:
 
 
 def age(file: Path, before_ns: int, days: float) -> int:
-    """Give every series the buckets of so many days; return how many."""
+    """Give every machine the buckets of so many days; return how many."""
     count = round(days * 86_400 * 10**9 / BUCKET_NS)
+    end_ns = before_ns // BUCKET_NS * BUCKET_NS
+    rng = np.random.default_rng(1)
     with closing(sqlite3.connect(file, timeout=60.0)) as database:
-        series = [number for (number,) in database.execute("SELECT series_id FROM series")]
-        end_ns = before_ns // BUCKET_NS * BUCKET_NS
-        database.executemany(
-            "INSERT INTO buckets (series_id, start_ns, length_ns, recorded_ns, count, minimum, maximum, total, errors, "
-            "errors_total) VALUES (?, ?, ?, ?, 120, -0.1, 0.1, 0.5, 120, 1.5)",
-            (
-                (one, end_ns - back * BUCKET_NS, BUCKET_NS, end_ns - back * BUCKET_NS)
-                for back in range(count, 0, -1)
-                for one in series
-            ),
-        )
+        series: dict[int, list[int]] = {}
+        for series_id, machine_id in database.execute("SELECT series_id, machine_id FROM series"):
+            series.setdefault(machine_id, []).append(series_id)
+        records = {machine_id: np.zeros(len(own), BUCKET) for machine_id, own in series.items()}
+        for back in range(count, 0, -1):
+            for machine_id, own in series.items():
+                one = records[machine_id]
+                one["series_id"], one["count"], one["errors"] = own, 120, 120
+                for name in ("minimum", "maximum", "total", "errors_total"):
+                    one[name] = rng.standard_normal(len(own))
+                start_ns = end_ns - back * BUCKET_NS
+                row = machine_id, start_ns, BUCKET_NS, start_ns, packed(one)
+                columns = "(machine_id, start_ns, length_ns, recorded_ns, readings)"
+                database.execute(f"INSERT INTO buckets {columns} VALUES (?, ?, ?, ?, ?)", row)  # noqa: S608  # ours
         database.commit()
         database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     return count * len(series)

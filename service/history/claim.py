@@ -23,7 +23,6 @@ from service.history.records import CheckpointHead, Step, StoredEvent, StoredRea
 __all__ = ["Bundle", "Claim", "PackedReport", "pack", "unpack"]
 
 _LARGEST = 2**63
-_READINGS_PER_REPORT = 20
 _LEVEL = 15
 # Never changed: every report that was ever written is read with it, those of before it existed too.
 _LIKE_REPORTS = zstandard.ZstdCompressionDict(
@@ -44,7 +43,7 @@ class Bundle:
     """Steps of one machine as one step: in order, written whole or not at all."""
 
     reports: deque[PackedReport] = field(default_factory=deque)
-    readings: deque[tuple[int, StoredReading]] = field(default_factory=deque)
+    readings: deque[tuple[int, tuple[StoredReading, ...]]] = field(default_factory=deque)
     events: list[StoredEvent] = field(default_factory=list)
     head: CheckpointHead | None = None
     new_parts: dict[str, bytes] = field(default_factory=dict)
@@ -71,7 +70,7 @@ class Claim:
     Attributes
     ----------
     most_reports : int
-        Reports that wait while the database fails; of readings, twenty times as many.
+        Reports that wait while the database fails, and steps whose readings do.
     machine_id : int
         Number in the database.
     owner : str
@@ -121,7 +120,7 @@ class Claim:
         bundles = [bundle for bundle in (self.attempt, self.waiting) if bundle is not None]
         numbers = [event.sequence for bundle in bundles for event in bundle.events]
         n_reports = sum(len(bundle.reports) for bundle in bundles) + self.dropped_reports
-        n_readings = sum(len(bundle.readings) for bundle in bundles) + self.dropped_readings
+        n_readings = sum(len(step) for bundle in bundles for _, step in bundle.readings) + self.dropped_readings
         events = f"alarm events {min(numbers)} to {max(numbers)}" if numbers else "alarm events: none"
         return f"the state to go on from, reports: {n_reports}, readings: {n_readings}, {events}"
 
@@ -131,7 +130,8 @@ class Claim:
         waiting.steps += 1
         waiting.events.extend(step.events)
         waiting.reports.extend(reports)
-        waiting.readings.extend((recorded_ns, reading) for reading in step.readings)
+        if step.readings:
+            waiting.readings.append((recorded_ns, step.readings))
         if step.checkpoint is not None:
             new = dict(step.checkpoint.new_parts)
             waiting.head = step.checkpoint.head
@@ -140,9 +140,8 @@ class Claim:
         while len(waiting.reports) > self.most_reports:
             waiting.reports.popleft()
             self.dropped_reports += 1
-        while len(waiting.readings) > self.most_reports * _READINGS_PER_REPORT:
-            waiting.readings.popleft()
-            self.dropped_readings += 1
+        while len(waiting.readings) > self.most_reports:
+            self.dropped_readings += len(waiting.readings.popleft()[1])
 
     def take(self) -> Bundle | None:
         """What is to be written next: what was tried before, unchanged, or else everything that waits."""

@@ -157,25 +157,23 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection to read with, all of it at one point in time in SQLite; raises as `rows` does."""
+        """A connection to read with, all of it at one point in time; raises as `rows` does."""
         with self.plainly(), self.alone() if self.in_memory else nullcontext(), self.using(self.answer_s) as connection:
+            if not self.is_sqlite:
+                connection.execution_options(isolation_level="REPEATABLE READ")
             yield connection
 
     @contextmanager
-    def writing(self, limit_s: float | None = None, *, repeatable: bool = False) -> Iterator[Connection]:
+    def writing(self, limit_s: float | None = None) -> Iterator[Connection]:
         """A connection within a transaction, committed at the end; raises as `rows` does.
 
         Parameters
         ----------
         limit_s : float, optional
             How long the lock, and then the transaction, may take, if not as long as usual.
-        repeatable : bool
-            Whether all statements must see the same, which they do in SQLite anyhow.
         """
         with self.plainly(), self.alone(limit_s), self.using(limit_s or self.answer_s) as connection:
             self.to_write(connection)
-            if repeatable and not self.is_sqlite:
-                connection.execution_options(isolation_level="REPEATABLE READ")
             with connection.begin():
                 yield connection
 

@@ -2,34 +2,23 @@
 
 import math
 from collections import ChainMap, defaultdict
-from collections.abc import Iterable, Mapping, MutableMapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import zstandard
-from sqlalchemy import ColumnElement, Connection, Table, case, delete, insert, or_, select, update
+from sqlalchemy import Connection, Table, delete, insert, or_, select, update
 
 from service.history.claim import Bundle, Claim
 from service.history.database import Database
 from service.history.records import StoredEvent, StoreError
-from service.history.tables import (
-    alarm_events,
-    buckets,
-    checkpoint_parts,
-    checkpoints,
-    evaluations,
-    machines,
-    open_buckets,
-    readings,
-    reports,
-    series,
-)
+from service.history.tables import alarm_events, checkpoint_parts, checkpoints, machines, reports, series, windows
+from service.history.windows import READING, fill_buckets, packed
 
 __all__ = ["SeriesNumbers", "write_group"]
 
 SeriesNumbers = dict[tuple[int, str, str], int]
-_ADDED = ("count", "total", "errors", "errors_total")
-_GREATEST = ("recorded_ns", "maximum")
 _Rows = defaultdict[Table, list[dict[str, Any]]]
 
 
@@ -55,11 +44,14 @@ def write_group(
         The attempts that were refused, with the reason, and numbers of series that are valid once the transaction is
         committed.
     """
-    query = select(machines).where(machines.c.machine_id.in_([claim.machine_id for claim in claims])).with_for_update()
-    found = {row.machine_id: row for row in connection.execute(query)}
+    newest = (windows.c.machine_id == machines.c.machine_id) & (windows.c.number == machines.c.windows)
+    query = select(machines, windows.c.end_ns).outerjoin(windows, newest).with_for_update(of=machines)
+    query = query.where(machines.c.machine_id.in_([claim.machine_id for claim in claims]))
+    # Locked in one order, whoever writes: two on one server must not wait for each other.
+    found = {row.machine_id: row for row in connection.execute(query.order_by(machines.c.machine_id))}
     refused: dict[Claim, StoreError] = {}
     new_series: SeriesNumbers = {}
-    rows = _Rows(list)
+    rows, complete = _Rows(list), list[tuple[int, int, int]]()
     for claim in claims:
         bundle, machine = claim.attempt, found.get(claim.machine_id)
         if bundle is None:
@@ -82,19 +74,27 @@ def write_group(
         ]
         numbers = ChainMap(new_series, known)
         _add_series(connection, claim.machine_id, bundle, numbers)
+        new = _new_windows(claim.machine_id, bundle, machine.windows + 1, numbers)
+        rows[windows] += new
+        # Windows wait for the bucket of their time to be complete, which it is when one of another time comes.
+        places = [(machine.end_ns or 0) // bucket_ns, *(row["end_ns"] // bucket_ns for row in new)]
+        others = [number for number, place in enumerate(places, machine.windows) if place != places[-1]]
+        bucketed = max(others, default=machine.bucketed)
+        if machine.bucketed < bucketed:
+            complete.append((claim.machine_id, machine.bucketed, bucketed))
         counted = {
             "steps": claim.written + 1,
             "reports": machine.reports + len(bundle.reports),
-            "evaluations": _add_readings(rows, of, bundle, machine.evaluations, numbers, bucket_ns),
+            "windows": machine.windows + len(new),
+            "bucketed": bucketed,
         }
         connection.execute(update(machines).where(machines.c.machine_id == claim.machine_id).values(counted))
         _write_checkpoint(connection, claim.machine_id, bundle)
-    in_buckets = rows.pop(buckets, [])
     for table, values in rows.items():
         if values:
             connection.execute(insert(table), values)
-    if in_buckets:
-        _fill_buckets(database, connection, in_buckets)
+    for machine_id, after, last in complete:
+        fill_buckets(database, connection, machine_id, after, last, bucket_ns)
     return refused, new_series
 
 
@@ -126,7 +126,7 @@ def _add_series(
     connection: Connection, machine_id: int, bundle: Bundle, numbers: MutableMapping[tuple[int, str, str], int]
 ) -> None:
     """Look up the numbers of the bundle's series, and give numbers to new ones."""
-    wanted = {(machine_id, reading.quantity, reading.name) for _, reading in bundle.readings}
+    wanted = {(machine_id, each.quantity, each.name) for _, step in bundle.readings for each in step}
     if wanted <= numbers.keys():
         return
     of_machine = select(series.c.quantity, series.c.name, series.c.series_id).where(series.c.machine_id == machine_id)
@@ -137,82 +137,24 @@ def _add_series(
         numbers.update({(machine_id, row.quantity, row.name): row.series_id for row in connection.execute(of_machine)})
 
 
-def _add_readings(
-    rows: _Rows,
-    of: dict[str, int],
-    bundle: Bundle,
-    number: int,
-    numbers: Mapping[tuple[int, str, str], int],
-    bucket_ns: int,
-) -> int:
-    """Number windows on from what the machine has; return the last number."""
-    window, seen = None, set[int]()
-    for recorded_ns, reading in bundle.readings:
-        series_id = numbers[of["machine_id"], reading.quantity, reading.name]
-        value, error = reading.value, reading.standard_error
-        if window != (recorded_ns, reading.end_ns) or series_id in seen:
-            window, seen = (recorded_ns, reading.end_ns), set()
-            number += 1
-            rows[evaluations].append(of | {"number": number, "end_ns": reading.end_ns, "recorded_ns": recorded_ns})
-        seen.add(series_id)
-        rows[readings].append(of | {"number": number, "series_id": series_id, "value": value, "standard_error": error})
-        if math.isfinite(value) and (error is None or math.isfinite(error)):  # what is infinite has no mean
-            start_ns = reading.end_ns // bucket_ns * bucket_ns
-            rows[buckets].append(
-                {
-                    "series_id": series_id, "start_ns": start_ns, "length_ns": bucket_ns, "recorded_ns": recorded_ns,
-                    "count": 1, "minimum": value, "maximum": value, "total": value,
-                    "errors": int(error is not None), "errors_total": error or 0.0,
-                }
-            )  # fmt: skip
-    return number
-
-
-def _fill_buckets(database: Database, connection: Connection, rows: list[dict[str, Any]]) -> None:
-    """Add readings to the open buckets; those that they lie beyond are closed."""
-    filling = open_buckets.c
-    wanted = filling.series_id.in_({row["series_id"] for row in rows})
-    # Locked in one order, whoever writes: two monitors on one server must not wait for each other.
-    query = select(open_buckets).where(wanted).order_by(filling.series_id).with_for_update()
-    there = {row["series_id"]: dict(row) for row in connection.execute(query).mappings()}
-    closed: dict[tuple[int, int, int], dict[str, Any]] = {}
-    for row in rows:
-        before = there.get(row["series_id"])
-        if before is not None and _place(before) == _place(row):
-            _add(before, row)
-            continue
-        if before is not None:
-            _add(closed.setdefault(_place(before), before), before)
-        there[row["series_id"]] = row
-    _upsert(database, connection, open_buckets, there.values(), filling.series_id)
-    if closed:
-        stored = buckets.c
-        _upsert(database, connection, buckets, closed.values(), stored.series_id, stored.start_ns, stored.length_ns)
-
-
-def _place(row: Mapping[str, Any]) -> tuple[int, int, int]:
-    return row["series_id"], row["start_ns"], row["length_ns"]
-
-
-def _add(bucket: dict[str, Any], more: Mapping[str, Any]) -> None:
-    if bucket is not more:
-        bucket |= {name: bucket[name] + more[name] for name in _ADDED}
-        bucket |= {name: max(bucket[name], more[name]) for name in _GREATEST}
-        bucket["minimum"] = min(bucket["minimum"], more["minimum"])
-
-
-def _upsert(
-    database: Database, connection: Connection, table: Table, rows: Iterable[dict[str, Any]], *key: ColumnElement[int]
-) -> None:
-    """Write open buckets as they are, and add closed ones to what is stored of them."""
-    made, stored = database.insert(table), table.c
-    new = made.excluded
-    changes: dict[str, Any] = {one.name: new[one.name] for one in stored if one.name != "series_id"}
-    if table is buckets:
-        changes = {name: stored[name] + new[name] for name in _ADDED}
-        changes |= {name: case((new[name] > stored[name], new[name]), else_=stored[name]) for name in _GREATEST}
-        changes["minimum"] = case((new.minimum < stored.minimum, new.minimum), else_=stored.minimum)
-    connection.execute(made.on_conflict_do_update(index_elements=key, set_=changes), sorted(rows, key=_place))
+def _new_windows(
+    machine_id: int, bundle: Bundle, number: int, numbers: Mapping[tuple[int, str, str], int]
+) -> list[dict[str, Any]]:
+    """Readings of one time are a window, numbered from `number` on; one of a series that is in it begins another."""
+    made: list[tuple[dict[str, int], dict[int, tuple[float, float]]]] = []
+    for recorded_ns, reading in ((recorded_ns, each) for recorded_ns, step in bundle.readings for each in step):
+        series_id = numbers[machine_id, reading.quantity, reading.name]
+        times = {"end_ns": reading.end_ns, "recorded_ns": recorded_ns}
+        if not made or made[-1][0] != times or series_id in made[-1][1]:
+            made.append((times, {}))
+        error = math.nan if reading.standard_error is None else reading.standard_error
+        made[-1][1][series_id] = reading.value, error
+    return [
+        {"machine_id": machine_id, "number": place}
+        | times
+        | {"readings": packed(np.array([(series_id, *one) for series_id, one in sorted(held.items())], READING))}
+        for place, (times, held) in enumerate(made, number)
+    ]
 
 
 def _write_checkpoint(connection: Connection, machine_id: int, bundle: Bundle) -> None:

@@ -1,5 +1,6 @@
 """What one machine writes into the history and reads from it."""
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
@@ -13,12 +14,14 @@ from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
 from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport, StoreError
 from service.history.shared import EVENT
-from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evaluations, readings, reports, series
+from service.history.tables import alarm_events, checkpoint_parts, checkpoints, reports, series, windows
 from service.history.trend import trend
+from service.history.windows import READING, unpacked
 from service.history.writer import Writer
 
 __all__ = ["MachineStore"]
 
+_AT_ONCE = 1000  # windows
 _HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
 
 
@@ -29,8 +32,11 @@ class MachineStore:
     fails; they see what is committed.
     """
 
-    def __init__(self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, database: Database, writer: Writer, claim: Claim, now_ns: Callable[[], int], bucket_ns: int
+    ) -> None:
         self._database = database
+        self._bucket_ns = bucket_ns
         self._writer = writer
         self._claim = claim
         self._now_ns = now_ns
@@ -199,21 +205,24 @@ class MachineStore:
         after, limit : int
             At most so many windows with a greater number: the last number of the page before.
         """
-        window, reading, of = evaluations.c, readings.c, series.c
-        same = (reading.machine_id == window.machine_id) & (reading.number == window.number)
-        series_id = select(of.series_id).where(
-            of.machine_id == self._claim.machine_id, of.quantity == quantity, of.name == name
-        )
-        query = select(window.number, window.end_ns, reading.value, reading.standard_error)
-        query = query.join_from(evaluations, readings, same & (reading.series_id == series_id.scalar_subquery()))
+        window, of, found = windows.c, series.c, list[Reading]()
+        named = (of.machine_id == self._claim.machine_id, of.quantity == quantity, of.name == name)
+        query = select(window.number, window.end_ns, window.readings).order_by(window.number)
+        query = query.execution_options(yield_per=min(_checked(limit), _AT_ONCE))
         with self._database.reading() as connection:
-            chosen = self._windows(connection, window, since_ns, until_ns)
-            query = query.where(*chosen, *_past(window.number, after, None)).order_by(window.number)
-            rows = connection.execute(query.limit(_checked(limit))).all()
-        return tuple(
-            Reading(number=number, end_ns=end_ns, value=value, standard_error=error)
-            for number, end_ns, value, error in rows
-        )
+            series_id = connection.scalar(select(of.series_id).where(*named))
+            chosen = [*self._windows(connection, window, since_ns, until_ns), *_past(window.number, after, None)]
+            with connection.execute(query.where(*chosen)) as windows_found:
+                for rows in windows_found.partitions():
+                    places, readings = unpacked([row.readings for row in rows], READING)
+                    own = readings["series_id"] == series_id
+                    for place, (_, value, error) in zip(places[own].tolist(), readings[own].tolist(), strict=True):
+                        number, end_ns, _ = rows[place]
+                        known = None if math.isnan(error) else error
+                        found.append(Reading(number=number, end_ns=end_ns, value=value, standard_error=known))
+                    if len(found) >= limit or series_id is None:
+                        break
+        return tuple(found[:limit])
 
     def downsampled(
         self,
@@ -239,7 +248,8 @@ class MachineStore:
             At most this many buckets for each name; those without a reading are left out.
         """
         with self._database.reading() as connection:
-            return trend(connection, self._claim.machine_id, quantity, names, since_ns, until_ns, _checked(points))
+            of = connection, self._claim.machine_id, self._bucket_ns
+            return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
 
     def _follow(self, events: Sequence[StoredEvent]) -> int:
         """The last sequence after these events."""

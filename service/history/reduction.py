@@ -8,7 +8,8 @@ from sqlalchemy import Connection, Table, delete, func, select, text, update
 
 from service.history.database import Database
 from service.history.records import Dropped, Retention, StoreError
-from service.history.tables import buckets, evaluations, machines, open_buckets, readings, reports, series
+from service.history.tables import buckets, machines, reports, series, windows
+from service.history.windows import fill_buckets
 
 __all__ = ["Reduction"]
 
@@ -51,11 +52,8 @@ class Reduction:
         with self._turn:
             return Dropped(
                 reports=self._repeat(reports, now_ns - round(kept.reports_days * _DAY_NS)),
-                windows=self._repeat(evaluations, now_ns - round(kept.readings_days * _DAY_NS)),
-                buckets=sum(
-                    self._repeat(table, now_ns - round(max(kept.buckets_days, kept.readings_days) * _DAY_NS))
-                    for table in (buckets, open_buckets)
-                ),
+                windows=self._repeat(windows, now_ns - round(kept.readings_days * _DAY_NS)),
+                buckets=self._repeat(buckets, now_ns - round(max(kept.buckets_days, kept.readings_days) * _DAY_NS)),
             )
 
     def _run(self) -> None:
@@ -76,42 +74,45 @@ class Reduction:
         return total
 
     def _batch(self, table: Table, until_ns: int) -> int:
-        with self._database.writing(repeatable=True) as connection:
+        with self._database.writing() as connection:
             if not self._database.is_sqlite:
                 lock = text("SELECT pg_try_advisory_xact_lock(:high, :low)")
                 if not connection.scalar(lock, {"high": _LOCK[0], "low": _LOCK[1]}):
                     return 0  # another monitor is at it
-            if table in {reports, evaluations}:
-                numbers = connection.scalars(select(machines.c.machine_id)).all()
+            if table is not buckets:
+                numbers = connection.scalars(select(machines.c.machine_id).order_by(machines.c.machine_id)).all()
                 most = max(1, _BATCH // max(1, len(numbers)))
-                return sum(_drop_first(connection, table, each, until_ns, self._now_ns(), most) for each in numbers)
+                return sum(self._drop_first(connection, table, each, until_ns, most) for each in numbers)
             oldest = select(table.c.recorded_ns).where(table.c.recorded_ns < until_ns)
             oldest = oldest.order_by(table.c.recorded_ns).limit(_BATCH)
             boundary_ns = connection.scalar(select(func.max(oldest.subquery().c.recorded_ns)))
             return connection.execute(delete(table).where(table.c.recorded_ns <= (boundary_ns or -1))).rowcount
 
+    def _drop_first(self, connection: Connection, table: Table, machine_id: int, until_ns: int, most: int) -> int:
+        """Drop what one machine has had longest, up to the last old one of so many; return how many.
 
-def _drop_first(connection: Connection, table: Table, machine_id: int, until_ns: int, now_ns: int, most: int) -> int:
-    """Drop what one machine has had longest, up to the last old one of so many; return how many.
-
-    Numbers say what came first. Where the computer's clock was ahead, its times do not: what such rows stand before was
-    recorded later, and they go with it.
-    """
-    row, last = table.c, -1
-    while True:
-        query = select(row.number, row.recorded_ns).where(row.machine_id == machine_id, row.number > last)
-        found = connection.execute(query.order_by(row.number).limit(most)).all()
-        old = [number for number, recorded_ns in found if recorded_ns < until_ns]
-        if old:
-            break
-        if len(found) < most or any(recorded_ns <= now_ns for _, recorded_ns in found):
-            return 0
-        last = found[-1].number
-    chosen = (row.machine_id == machine_id, row.number <= old[-1])
-    if table is evaluations:
-        end_ns = connection.scalar(select(func.max(row.end_ns)).where(*chosen))
-        behind = (series.c.machine_id == machine_id, series.c.dropped_ns < end_ns)
-        connection.execute(update(series).where(*behind).values(dropped_ns=end_ns))
-        gone = (readings.c.machine_id == machine_id, readings.c.number <= old[-1])
-        connection.execute(delete(readings).where(*gone))
-    return connection.execute(delete(table).where(*chosen)).rowcount
+        Numbers say what came first. Where the computer's clock was ahead, its times do not: what such rows stand before
+        was recorded later, and they go with it.
+        """
+        row, last, now_ns = table.c, -1, self._now_ns()
+        while True:
+            query = select(row.number, row.recorded_ns).where(row.machine_id == machine_id, row.number > last)
+            found = connection.execute(query.order_by(row.number).limit(most)).all()
+            old = [number for number, recorded_ns in found if recorded_ns < until_ns]
+            if old:
+                break
+            if len(found) < most or any(recorded_ns <= now_ns for _, recorded_ns in found):
+                return 0
+            last = found[-1].number
+        chosen = (row.machine_id == machine_id, row.number <= old[-1])
+        if table is windows:
+            of = machines.c.machine_id == machine_id
+            bucketed = connection.execute(select(machines.c.bucketed).where(of).with_for_update()).scalar_one()
+            if bucketed < old[-1]:
+                bucket_ns = self._retention.bucket_s * 10**9
+                fill_buckets(self._database, connection, machine_id, bucketed, old[-1], bucket_ns)
+                connection.execute(update(machines).where(of).values(bucketed=old[-1]))
+            end_ns = connection.scalar(select(func.max(row.end_ns)).where(*chosen))
+            behind = (series.c.machine_id == machine_id, series.c.dropped_ns < end_ns)
+            connection.execute(update(series).where(*behind).values(dropped_ns=end_ns))
+        return connection.execute(delete(table).where(*chosen)).rowcount

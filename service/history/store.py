@@ -42,7 +42,7 @@ class Store:
     retry_s : float
         Time between attempts while the database fails, in seconds.
     waiting_reports : int
-        Reports of one machine that wait in memory meanwhile; of readings, twenty times as many.
+        Reports of one machine that wait in memory meanwhile, and steps whose readings do.
     now_ns : callable
         The computer's time, nanoseconds since 1970 UTC.
 
@@ -72,7 +72,8 @@ class Store:
         now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._database = Database(url, timeout_s)
-        self._writer = Writer(self._database, retry_s, waiting_reports, retention.bucket_s * 10**9)
+        self._bucket_ns = retention.bucket_s * 10**9
+        self._writer = Writer(self._database, retry_s, waiting_reports, self._bucket_ns)
         self._reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
         self.alarms = AlarmLog(self._database)
@@ -147,7 +148,7 @@ class Store:
         StoreError
             If another monitor writes it, or the database fails.
         """
-        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns)
+        return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns, self._bucket_ns)
 
     def retain(self, now_ns: int) -> Dropped:
         """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.

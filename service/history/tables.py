@@ -4,8 +4,9 @@
 
     machines --< alarm_events                      the log of alarms; triggers refuse to change it
              --< reports                           the newest, whole and compressed
-             --< evaluations --< readings >-- series    a window's numbers: one row for the window, one for each number
-                    open_buckets, buckets >-- series    the same reduced, filled as they come, and kept longer
+             --< windows                           each with its readings in one value: see `windows.py`
+             --< buckets                           the same of many windows, reduced, and kept longer
+             --< series                            what the numbers in both stand for
              --- checkpoints --< checkpoint_parts  where a monitor goes on from
     tokens    audit_log    webhook_cursors
 """
@@ -17,11 +18,11 @@ from sqlalchemy import BigInteger, Double, Integer, LargeBinary, Text
 from sqlalchemy.types import TypeEngine
 
 __all__ = [
-    "REVISION", "alarm_events", "audit_log", "buckets", "checkpoint_parts", "checkpoints", "evaluations", "machines",
-    "metadata", "open_buckets", "readings", "reports", "series", "tokens", "webhook_cursors",
+    "REVISION", "alarm_events", "audit_log", "buckets", "checkpoint_parts", "checkpoints", "machines", "metadata",
+    "reports", "series", "tokens", "webhook_cursors", "windows",
 ]  # fmt: skip
 
-REVISION = "0003"
+REVISION = "0004"
 """The migration that ends with these tables."""
 
 metadata = sa.MetaData(
@@ -50,7 +51,9 @@ machines = sa.Table(
     # Who may write: a monitor that finds another's mark in `owner` has been replaced.
     *_filled(Text, "site", "name", "owner"),
     # How many there have been; a step that is sent twice is known by its number.
-    *_filled(BigInteger, "steps", "reports", "evaluations"),
+    *_filled(BigInteger, "steps", "reports", "windows"),
+    # The readings of windows up to this number are in buckets.
+    sa.Column("bucketed", BigInteger, nullable=False, server_default=sa.text("0")),
     sa.UniqueConstraint("site", "name"),
 )
 
@@ -81,14 +84,14 @@ reports = sa.Table(
     sa.Index(None, "machine_id", "end_ns"),
 )
 
-evaluations = sa.Table(
-    "evaluations",
+windows = sa.Table(
+    "windows",
     metadata,
     _machine_id(),
     *_filled(BigInteger, "number", "end_ns", "recorded_ns"),
+    *_filled(LargeBinary, "readings"),
     sa.PrimaryKeyConstraint("machine_id", "number"),
     sa.Index(None, "machine_id", "end_ns"),
-    sqlite_with_rowid=False,
 )
 
 series = sa.Table(
@@ -102,42 +105,14 @@ series = sa.Table(
     sa.UniqueConstraint("machine_id", "quantity", "name"),
 )
 
-# The greatest number of rows by far: nothing but the numbers, in the order in which they come.
-readings = sa.Table(
-    "readings",
-    metadata,
-    *_filled(Integer, "machine_id"),
-    *_filled(BigInteger, "number"),
-    *_filled(Integer, "series_id"),
-    *_filled(Double, "value"),
-    sa.Column("standard_error", Double, nullable=True),
-    sa.PrimaryKeyConstraint("machine_id", "number", "series_id"),
-    sqlite_with_rowid=False,
-)
-
-
-def _reduced() -> tuple[sa.Column[Any], ...]:
-    return (
-        sa.Column("series_id", Integer, sa.ForeignKey("series.series_id"), nullable=False),
-        *_filled(BigInteger, "start_ns", "length_ns", "recorded_ns", "count"),
-        *_filled(Double, "minimum", "maximum", "total"),
-        *_filled(BigInteger, "errors"),
-        *_filled(Double, "errors_total"),
-    )
-
-
 buckets = sa.Table(
     "buckets",
     metadata,
-    *_reduced(),
-    sa.PrimaryKeyConstraint("series_id", "start_ns", "length_ns"),
+    _machine_id(),
+    *_filled(BigInteger, "start_ns", "length_ns", "recorded_ns"),
+    *_filled(LargeBinary, "readings"),
+    sa.PrimaryKeyConstraint("machine_id", "start_ns", "length_ns"),
     sa.Index(None, "recorded_ns"),
-    sqlite_with_rowid=False,
-)
-
-# Those that are being filled: beside each other, where the others lie far apart, and each would cost a page.
-open_buckets = sa.Table(
-    "open_buckets", metadata, *_reduced(), sa.PrimaryKeyConstraint("series_id"), sqlite_with_rowid=False
 )
 
 checkpoints = sa.Table(

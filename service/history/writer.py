@@ -39,7 +39,7 @@ class Writer:
     retry_s : float
         Time between attempts while the database fails, in seconds.
     most_reports : int
-        Reports of one machine that wait meanwhile.
+        Reports of one machine that wait meanwhile, and steps whose readings do.
     bucket_ns : int
         Length of the buckets that readings are added to.
     """
@@ -226,7 +226,7 @@ class Writer:
     def _take(self, connection: Connection, claim: Claim) -> None:
         """Take the right to write a machine; StoreError if another monitor has it."""
         number = select(machines.c.machine_id).where(machines.c.site == claim.site, machines.c.name == claim.name)
-        new = {"site": claim.site, "name": claim.name, "owner": "", "steps": 0, "reports": 0, "evaluations": 0}
+        new = {"site": claim.site, "name": claim.name, "owner": "", "steps": 0, "reports": 0, "windows": 0}
         owner, file = secrets.token_hex(16), self._database.file
         with ExitStack() as undo:
             with connection.begin():

@@ -116,6 +116,8 @@ def test_what_waits_is_bounded_and_events_are_never_dropped(parts: Parts) -> Non
         assert [report.text for _, report in lab.reports()] == [
             f'{{"number": {n}}}' for n in (59, 58, 57, 56, 55, 1, 0)
         ]  # fmt: skip
+        kept = [round(each.value / 0.1) for each in lab.readings(quantity="parameter", name="k_by")]
+        assert kept == [0, 1, 55, 56, 57, 58, 59]
         restored = lab.restore()
         assert restored is not None
         assert [part for _, part in restored.parts] == [b"part 57", b"part 58", b"part 59"]

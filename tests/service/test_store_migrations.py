@@ -12,11 +12,12 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import create_engine, inspect, make_url, text
 from sqlalchemy.engine import Engine
+from structlog.testing import capture_logs
 
 from service.history import claim
 from service.history.claim import unpack
 from service.history.migrations import migrate
-from service.history.records import Checkpoint, CheckpointHead, Retention, StoreError
+from service.history.records import Checkpoint, CheckpointHead, Retention, Step, StoredReading, StoreError
 from service.history.store import Store
 from service.history.tables import REVISION, metadata
 from tests.service.postgres import KINDS, database_url
@@ -112,6 +113,85 @@ def test_buckets_of_an_older_version_get_the_readings_that_are_still_there(
     assert [(one.count, one.minimum, one.mean, one.maximum, one.mean_standard_error) for one in found] == [
         (1, 7.0, 7.0, 7.0, None), (2, 1.0, 1.5, 2.0, 0.375), (2, 3.0, 3.5, 4.0, 0.25)
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("single", [0, 100], ids=["from buckets", "from single readings"])
+def test_readings_and_buckets_of_rows_are_those_that_were_there(
+    url: str, single: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.history.trend._SINGLE", single)
+    engine = engine_for(url)
+    statements = (
+        "INSERT INTO machines VALUES (1, 'demo', 'lab', '', 9, 0, 4), (2, 'demo', 'pump', '', 9, 0, 1)",
+        "INSERT INTO series VALUES (1, 1, 'parameter', 'e', -1), (2, 2, 'parameter', 'e', -1), "
+        "(3, 1, 'parameter', 'k_by', -1)",
+        # The second bucket of a machine is being filled; of the first, one that was closed has been gone on with.
+        "INSERT INTO buckets VALUES (1, 0, 600000000000, 3, 1, 0.1, 0.1, 0.1, 0, 0.0), "
+        "(3, 0, 600000000000, 2, 1, 7.0, 7.0, 7.0, 1, 0.5)",
+        "INSERT INTO open_buckets VALUES (3, 0, 600000000000, 3, 1, 8.0, 8.0, 8.0, 0, 0.0), "
+        "(1, 600000000000, 600000000000, 5, 1, 3.0, 3.0, 3.0, 0, 0.0), "
+        "(2, 600000000000, 600000000000, 5, 1, -1.0, -1.0, -1.0, 0, 0.0)",
+        "INSERT INTO evaluations VALUES (1, 2, 100000000000, 2), (1, 3, 200000000000, 3), (1, 4, 600000000000, 5), "
+        "(2, 1, 600000000000, 5)",
+        "INSERT INTO readings VALUES (1, 2, 3, 7.0, 0.5), (1, 3, 1, 0.1, NULL), (1, 3, 3, 8.0, NULL), "
+        "(1, 4, 1, 3.0, NULL), (2, 1, 2, -1.0, NULL)",
+    )
+    with engine.begin() as connection:
+        migrate(connection, "0003")
+        for statement in statements:
+            connection.execute(text(statement))
+    engine.dispose()
+    store = Store(url, Retention())
+    store.open()
+    try:
+        lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
+        # What comes next completes the bucket, and is counted once.
+        assert lab.commit(Step(readings=(StoredReading(1_300 * 10**9, "parameter", "e", 5.0, 0.25),)))
+        found = {
+            name: [
+                (one.number, one.end_ns, one.value, one.standard_error)
+                for one in lab.readings(quantity="parameter", name=name)
+            ]
+            for name in ("e", "k_by")
+        }
+        parts = [
+            (one.name, one.count, one.minimum, one.mean, one.maximum, one.mean_standard_error)
+            for one in lab.downsampled(quantity="parameter", until_ns=1_800 * 10**9, since_ns=0, points=3)
+        ]
+        assert [one.value for one in pump.readings(quantity="parameter", name="e")] == [-1.0]
+        assert [one.mean for one in pump.downsampled(quantity="parameter")] == [-1.0]
+    finally:
+        store.close()
+    assert found == {
+        "e": [(3, 200 * 10**9, 0.1, None), (4, 600 * 10**9, 3.0, None), (5, 1_300 * 10**9, 5.0, 0.25)],
+        "k_by": [(2, 100 * 10**9, 7.0, 0.5), (3, 200 * 10**9, 8.0, None)],
+    }
+    assert parts == [
+        ("e", 1, 0.1, 0.1, 0.1, None), ("e", 1, 3.0, 3.0, 3.0, None), ("e", 1, 5.0, 5.0, 5.0, 0.25),
+        ("k_by", 2, 7.0, 7.5, 8.0, 0.5),
+    ]  # fmt: skip
+
+
+def test_a_large_history_says_how_far_it_is_brought_up_to_date(url: str) -> None:
+    many = [{"number": number, "value": number / 7} for number in range(1, 40_004)]
+    engine = engine_for(url)
+    with engine.begin() as connection, capture_logs() as lines:
+        migrate(connection, "0003")
+        connection.execute(text("INSERT INTO machines VALUES (1, 'demo', 'lab', '', 9, 0, 40003)"))
+        connection.execute(text("INSERT INTO series VALUES (1, 1, 'parameter', 'e', -1)"))
+        connection.execute(text("INSERT INTO evaluations VALUES (1, :number, :number, 1)"), many)
+        connection.execute(text("INSERT INTO readings VALUES (1, :number, 1, :value, NULL)"), many)
+        migrate(connection)
+    engine.dispose()
+    told = [(line["table"], line["rows"]) for line in lines if line["event"] == "the history is brought up to date"]
+    assert told == [("windows", 20_000), ("windows", 40_000)]
+    store = Store(url, Retention())
+    store.open()
+    try:
+        found = store.machine("demo", "lab").readings(quantity="parameter", name="e", limit=50_000)
+    finally:
+        store.close()
+    assert [(one.number, one.value) for one in found] == [(one["number"], one["value"]) for one in many]
 
 
 @pytest.mark.parametrize(

@@ -207,7 +207,7 @@ def test_everything_goes_in_its_time_but_alarms_and_audit(store: Store, clock: C
     assert store.retain(written + 14 * DAY) == Dropped(reports=1200)
     assert lab.reports() == ()
     assert store.retain(written + 90 * DAY).windows == 1200
-    n_buckets = len(lab.downsampled(quantity="parameter", points=5000))
+    n_buckets = len({bucket.start_ns for bucket in lab.downsampled(quantity="parameter", points=5000)})
     assert n_buckets > 0
     assert store.retain(written + 999 * DAY) == Dropped()
     assert store.retain(written + 1000 * DAY) == Dropped(buckets=n_buckets)
