@@ -62,7 +62,7 @@ ACCELERATIONS: tuple[str, ...] = tuple(
 
 
 class Channel(BaseModel, extra="forbid", frozen=True):
-    """One column of a stream."""
+    """One column of a stream; tilt in plane y is the paper's psi, in plane z its phi."""
 
     # Free name, unique in the stream ("XE-101").
     name: str = Field(
@@ -71,7 +71,7 @@ class Channel(BaseModel, extra="forbid", frozen=True):
         pattern=r"^[A-Za-z0-9_.:-]+$",
         description="unique name of letters, digits and _ . : -",
     )
-    # What is measured, where, and in which plane; tilt in plane y is the paper's psi, in plane z its phi.
+    # What is measured, where, and in which plane.
     quantity: Quantity
     location: Literal["bearing", "disc", "shaft"]
     direction: Literal["y", "z", "rotation"]
