@@ -17,7 +17,8 @@ from typing import Literal, Self
 from pydantic import BaseModel, Field, model_validator
 
 from models.alarm_names import ALARMS
-from models.errors import MachineFileError, checked, did_you_mean, read_toml
+from models.errors import MachineFileError
+from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
 from models.signals.keys import MachineKeys

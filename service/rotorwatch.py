@@ -270,8 +270,8 @@ def _overridden(
 def _checked(file: Path) -> str:
     """Check one file and say what it describes."""
     from models.commissioning.commissioned import install  # noqa: PLC0415  # keeps --help quick
-    from models.errors import read_toml  # noqa: PLC0415
     from models.machine import load_machine_file  # noqa: PLC0415
+    from models.mistakes import read_toml  # noqa: PLC0415
     from service.history.store import Store  # noqa: PLC0415
     from service.settings.service import load_settings  # noqa: PLC0415
 

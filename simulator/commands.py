@@ -26,7 +26,7 @@ class Commands(TyperGroup):
         try:
             return super().invoke(ctx)
         except typer.BadParameter as error:
-            from models.errors import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
+            from models.mistakes import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
 
             error.message = argument_text(error) or error.message
             raise

@@ -11,8 +11,9 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
-from models.errors import MachineFileError, checked, did_you_mean, read_toml
+from models.errors import MachineFileError
 from models.machine import Machine, load_machine
+from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.excitation import Source
 from models.physics.rotor import PARAMETERS
 from models.signals.channels import Channel, Quantity

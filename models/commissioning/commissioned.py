@@ -28,8 +28,9 @@ from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.shape import HealthyShape
 from models.diagnosis.window import WindowStatistics
-from models.errors import BundleError, mistakes
+from models.errors import BundleError
 from models.machine import Machine, MachineFile
+from models.mistakes import mistakes
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 

@@ -9,7 +9,7 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
-from models.errors import did_you_mean
+from models.mistakes import did_you_mean
 
 
 class Quantity(StrEnum):

@@ -14,7 +14,8 @@ from typing import Any, Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
-from models.errors import MachineFileError, checked, did_you_mean, read_toml
+from models.errors import MachineFileError
+from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.keys import Grant, access_control
 
 _OF_HOSTS = ("tcp", "udp", "tls", "quic", "ws")

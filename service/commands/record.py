@@ -173,8 +173,8 @@ def _settings(
     config: Path | None, machines: list[str] | None, out: Path | None, changes: dict[str, float]
 ) -> "tuple[list[MachineFile], RecordingSettings, HistorySettings]":
     """Machines, what is kept, and the history of the monitor: the command line over the settings file."""
-    from models.errors import checked  # noqa: PLC0415
     from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
+    from models.mistakes import checked  # noqa: PLC0415
     from service.settings.service import RecordingSettings, load_settings  # noqa: PLC0415
 
     settings = load_settings(config)

@@ -12,7 +12,8 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import ValidationError
 
-from models.errors import RecordingError, WireError, mistakes
+from models.errors import RecordingError, WireError
+from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import SampleBlock
 from models.signals.channels import ChannelDescriptor, Quantity

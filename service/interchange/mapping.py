@@ -9,8 +9,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-from models.errors import MachineFileError, checked, did_you_mean, read_toml
+from models.errors import MachineFileError
 from models.machine import MachineFile
+from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from service.interchange.formats import Format
 

@@ -12,8 +12,9 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
-from models.errors import MachineFileError, mistakes, read_toml
+from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
+from models.mistakes import mistakes, read_toml
 from models.signals.link import LinkSettings
 from service.history.records import Retention
 from service.settings.access import AccessSettings, check_access

@@ -25,8 +25,9 @@ from safetensors.numpy import load, save
 from models.diagnosis.networks.amortised import LAYERS, OWN, AmortisedNetwork, AmortisedNetworks, Calibration
 from models.diagnosis.networks.features import FeatureBasis
 from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy, Network, equation_by_number
-from models.errors import BundleError, did_you_mean, mistakes
+from models.errors import BundleError
 from models.machine import Machine
+from models.mistakes import did_you_mean, mistakes
 
 _SHIPPED = Path(__file__).parents[2] / "bundles"
 _Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
