@@ -1,18 +1,27 @@
-"""The sequential test on Gaussian hops: declared rate, delays, location, repair, checkpoint."""
+"""The sequential test on Gaussian hops: declared rate, delays, location, repair, thresholds, what it can find."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from models.diagnosis.verdict.calibration import MONTH_S, detectable_changes, length_to_find, month_thresholds
+from models.diagnosis.verdict.calibration import (
+    MONTH_S,
+    crossing_rate,
+    detectable_changes,
+    length_to_find,
+    month_thresholds,
+    overshoot_correction,
+    window_thresholds,
+)
+from models.diagnosis.verdict.isolation import isolate
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Verdict
 from tests.diagnosis.gaussian_hops import GaussianHops, detection_delays
-from tests.diagnosis.test_isolation import window
+from tests.diagnosis.test_isolation import covariance, window
 
 SEED = 88_300
 SETTINGS = SequentialSettings(hop_s=5.0, window_hops=12)
@@ -220,3 +229,123 @@ def test_a_restored_test_goes_on_as_if_nothing_had_happened() -> None:
     assert going.state.findings[0].name == "c_by"
     going.clear()
     assert again(going.state) == SequentialState()
+
+
+SEED_OF_CALIBRATION = 88_001
+
+
+@pytest.mark.parametrize("rate", [1e-2, 1e-3])
+def test_window_rate_is_kept_over_all_parameters(rate: float) -> None:
+    """400 000 healthy windows of six independent parameters."""
+    rng = np.random.default_rng(SEED_OF_CALIBRATION)
+    largest = np.abs(rng.standard_normal((400_000, 6))).max(axis=1)
+    counted = int((largest > window_thresholds(rate, 6).first).sum())
+    expected = 400_000 * rate
+    assert abs(counted - expected) < 4 * expected**0.5
+
+
+def moving_averages(hops: int, overlap: int, seed: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    total = np.concatenate([[0.0], np.cumsum(np.random.default_rng(seed).standard_normal(hops + overlap - 1))])
+    return np.asarray((total[overlap:] - total[:-overlap]) / overlap**0.5)
+
+
+@pytest.mark.parametrize("overlap", [2, 4, 12, 48, 192])
+@pytest.mark.parametrize("threshold", [3.0, 3.6])
+def test_new_crossings_of_a_sliding_window(overlap: int, threshold: float) -> None:
+    """Four million hops; an exceedance is new if none came in the window's length before it."""
+    hops = 4_000_000
+    above = np.flatnonzero(np.abs(moving_averages(hops, overlap, SEED_OF_CALIBRATION + overlap)) > threshold)
+    fresh = 1 + int((np.diff(above) > overlap).sum())
+    expected = 2 * crossing_rate(threshold, overlap) * hops
+    # The rate is asymptotic in the threshold; crossings of one window's noise sometimes come in two groups.
+    assert fresh == pytest.approx(expected, rel=0.12, abs=4 * expected**0.5)
+
+
+def test_windows_that_do_not_overlap_cross_with_their_tail_probability() -> None:
+    assert crossing_rate(3.0, 1) == pytest.approx(1.3499e-3, rel=1e-4)
+
+
+def test_overshoot_correction_has_its_known_limits() -> None:
+    assert overshoot_correction(1e-9) == 1.0
+    assert overshoot_correction(0.2) == pytest.approx(np.exp(-0.583 * 0.2), rel=0.01)  # Siegmund's expansion
+    assert overshoot_correction(12.0) == pytest.approx(2 / 12.0**2, rel=0.01)
+
+
+@pytest.mark.parametrize("overlap", [1, 2, 12, 768])
+def test_month_thresholds_have_the_declared_rate(overlap: int) -> None:
+    found = month_thresholds(0.5, 5.0, overlap, 6, 9)
+    hops = MONTH_S / 5.0
+    assert 2 * 6 * 9 * hops * crossing_rate(found.first, overlap) == pytest.approx(0.5)
+    assert hops * crossing_rate(found.outside, overlap) == pytest.approx(0.5)
+    assert found.further > found.first > 3.5
+
+
+def test_rates_that_make_no_sense_are_refused() -> None:
+    with pytest.raises(ValueError, match="rate is 0 for 6 parameters"):
+        window_thresholds(0, 6)
+    with pytest.raises(ValueError, match="expected positive numbers"):
+        month_thresholds(-1, 5.0, 12, 6)
+    assert month_thresholds(1e9, 5.0, 12, 6).first == 1.0  # more often than that nothing is crossed
+
+
+SEED_OF_DETECTABLE = 88_200
+
+
+def healthy(seed: int) -> Stretch:
+    cov = covariance(np.random.default_rng(seed))
+    return stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
+
+
+def power(cov: FloatArray, name: str, seed: int) -> list[float]:
+    """Share of 1200 windows in which the minimum detectable loss and gain are named."""
+    rng, thresholds, shares = np.random.default_rng(seed), window_thresholds(0.01, 6), []
+    stretch = stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
+    (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
+    for change in (found.loss, found.gain):
+        true = np.zeros(6)
+        true[PARAMETERS.index(name)] = to_scale(name, change)
+        values = rng.multivariate_normal(true, cov, size=1200)
+        shares.append(
+            float(
+                np.mean([name in isolate(stretch_of(window(value, cov), 0, 1), thresholds).changed for value in values])
+            )
+        )
+    return shares
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["c_by", "e"])
+def test_the_change_is_found_in_95_of_100_windows(name: str) -> None:
+    cov = np.diag(np.geomspace(0.001, 0.02, 6) ** 2)
+    assert power(cov, name, SEED_OF_DETECTABLE) == pytest.approx([0.95, 0.95], abs=0.025)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_correlated_parameters_are_found_more_often_never_less(seed: int) -> None:
+    cov = covariance(np.random.default_rng(SEED_OF_DETECTABLE + seed))
+    assert min(power(cov, "k_bz", SEED_OF_DETECTABLE + seed)) > 0.925
+
+
+def test_loss_and_gain_are_ratios_of_each_other() -> None:
+    for found in detectable_changes(healthy(1), month_thresholds(1.0, 5.0, 12, 6), 60.0):
+        if found.name == "e":
+            assert found.loss == -found.gain or found.loss == -1
+        else:
+            assert (1 + found.loss) * (1 + found.gain) == pytest.approx(1)
+        assert -1 <= found.loss < 0 < found.gain
+
+
+def test_length_and_change_are_inverse() -> None:
+    stretch, thresholds = healthy(2), window_thresholds(1e-3, 6)
+    found = {one.name: one for one in detectable_changes(stretch, thresholds, 60.0)}
+    for one in found.values():
+        for change in (one.loss, one.gain):
+            assert length_to_find(one, change) == pytest.approx(60.0)
+    assert length_to_find(found["e"], 0.05) == pytest.approx(4 * length_to_find(found["e"], 0.10))
+
+
+@pytest.mark.parametrize("change", [0.0, -1.0, -2.0])
+def test_changes_that_cannot_be_are_refused(change: float) -> None:
+    with pytest.raises(ValueError, match="expected above -1 and not 0"):
+        length_to_find(detectable_changes(healthy(3), window_thresholds(0.01, 6), 60.0)[0], change)

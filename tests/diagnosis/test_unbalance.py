@@ -1,4 +1,4 @@
-"""The unbalance as a vector: size and direction of the change, and the number that alarms decide on."""
+"""Unbalance as a vector, a speed that varies, and accelerometers alone: what the likelihood reads then."""
 
 from dataclasses import replace
 from functools import cache
@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 
 from models.diagnosis.likelihood.fit import LikelihoodFit
-from models.diagnosis.readings import UnbalanceVector
+from models.diagnosis.likelihood.motions import integrated
+from models.diagnosis.readings import Diagnosis, UnbalanceVector
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
-from models.machine import load_machine
+from models.machine import Machine, load_machine
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, Quantity
 from rotorwatch.records.windows import Parameter
+from simulator.scenario import Event
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
+from tests.commissioning.rotor_kit import LAB, recording, samples_of, stream, with_samples
 
 SEED = 7_700_021
 MACHINE = load_machine("lab")
@@ -106,3 +111,95 @@ def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
     assert np.sqrt(np.mean(np.square(z))) < 1.7
     assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 2.0)
     assert np.all(np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(12) * 1.1)
+
+
+SEED_OF_VARYING_SPEED = 900
+
+
+def read(seed: int, ramp: float, *events: Event) -> Diagnosis:
+    """A window of the rotor kit whose speed rises by a relative amount from start to end."""
+    rpm = LAB.operation.speed_rpm
+    rise = (
+        Event(at_s=0.0, speed_rpm=rpm * (1 - ramp / 2)),
+        Event(at_s=0.01, ramp_s=65.9, speed_rpm=rpm * (1 + ramp / 2)),
+    )
+    (window,) = recording(LAB, stream(66.0, seed, *rise, *events)).windows()
+    assert window.removed_by_hop
+    assert window.speed_range[1] > window.speed_range[0] * (1 + 0.8 * ramp)
+    return LikelihoodFit(LAB).diagnose(window)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ramp", [pytest.param(0.05, marks=pytest.mark.long), 0.15])
+def test_a_healthy_machine_reads_healthy(ramp: float) -> None:
+    diagnosis = read(SEED_OF_VARYING_SPEED, ramp)
+    assert len(diagnosis.evaluable) == 6
+    assert all(abs(reading.z or 99.0) < 4 for reading in diagnosis.evaluable)
+    assert (diagnosis.misfit_z or 0.0) < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "change"), [("e", 0.2), ("c_by", -0.2)])
+def test_a_change_is_named_alone(name: str, change: float) -> None:
+    diagnosis = read(SEED_OF_VARYING_SPEED + 1, 0.1, Event(at_s=0.0, parameter=name, relative_change=change))
+    assert isolate_window(diagnosis, 0.001).changed == (name,)
+    reading = next(one for one in diagnosis.evaluable if one.name == name)
+    assert reading.interval_95 is not None
+    assert reading.relative_change == pytest.approx(change, abs=4 * (reading.standard_error or 0.0))
+
+
+SEED_OF_INTEGRATED = 63
+
+
+def accelerometers() -> Machine:
+    """The rotor kit with accelerometers in place of its velocity sensors, and no displacement."""
+    sensors = []
+    for channel in LAB.sensors:
+        if channel.quantity is Quantity.VELOCITY:
+            fields = channel.model_dump() | {"quantity": "acceleration", "unit": "m/s2"}
+            sensors.append(Channel.model_validate(fields))
+        elif channel.quantity is Quantity.SHAFT_ANGLE:
+            sensors.append(channel)
+    return LAB.model_copy(update={"sensors": tuple(sensors)})
+
+
+def differentiated(samples: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Velocities in mm/s as accelerations in m/s² with half a per cent of white noise, by a Fourier transform."""
+    columns = [n for n, channel in enumerate(LAB.sensors) if channel.quantity is Quantity.VELOCITY]
+    spectra = np.fft.rfft(samples[:, columns] * 1e-3, axis=0)
+    w = 2 * np.pi * np.fft.rfftfreq(samples.shape[0], 1 / LAB.rate_hz)
+    w[w > 2 * np.pi * 400] = 0  # sensor noise of the velocities, which an accelerometer does not have
+    a = np.fft.irfft(1j * w[:, None] * spectra, n=samples.shape[0], axis=0)
+    a += 0.005 * a.std(axis=0) * rng.standard_normal(a.shape)
+    return np.column_stack([a, samples[:, -1]])
+
+
+@pytest.fixture(scope="module")
+def window() -> WindowStatistics:
+    blocks = stream(70.0, SEED_OF_INTEGRATED)
+    samples = differentiated(samples_of(blocks), np.random.default_rng(SEED_OF_INTEGRATED))
+    return recording(accelerometers(), with_samples(blocks, samples)).windows()[0]
+
+
+def test_accelerations_become_velocities(window: WindowStatistics) -> None:
+    found = integrated(window)
+    assert found.states == ("y1_dot", "y2_dot", "z1_dot", "z2_dot")
+    true = recording(LAB, stream(70.0, SEED_OF_INTEGRATED)).windows()[0]
+    at = [true.states.index(name) for name in found.states]
+    inside = true.frequencies_hz > 10
+    ratio = found.spectrum[inside].real.diagonal(axis1=1, axis2=2) / (true.spectrum[inside][:, at, at].real)
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.02)
+    assert found.synchronous is not None
+    assert true.synchronous is not None
+    np.testing.assert_allclose(found.synchronous, true.synchronous[at], rtol=0.02)
+    assert integrated(true) is true
+
+
+def test_the_likelihood_reads_a_healthy_machine_from_accelerometers_alone(window: WindowStatistics) -> None:
+    diagnosis = LikelihoodFit(accelerometers()).diagnose(window)
+    assert len(diagnosis.evaluable) == 6
+    for reading in diagnosis.evaluable:
+        assert reading.z is not None
+        assert abs(reading.z) < 4, reading
+        assert reading.standard_error is not None
+        assert reading.standard_error < 0.05

@@ -1,5 +1,6 @@
-"""What is wrong with a mapping or a file is named: file, field, row, column, and what was expected."""
+"""What is wrong with a mapping, a file or a command is named; acceleration is integrated right above its frequency."""
 
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,13 @@ import pytest
 from scipy.io import wavfile
 
 from models.errors import MachineFileError
-from tests.interchange.material import START, imported, signals
+from models.machine import load_machine_file
+from models.signals.block import integrated, lowest_valid_hz, settling_s
+from models.signals.channels import unit_factor
+from service.interchange.mapping import Acceleration, Column, CsvFormat, Keyphasor, Mapping, TimeBase
+from service.interchange.summary import summary_lines
+from tests.interchange.material import START, START_NS, imported, signals, stretches
+from tests.service.preloaded import ran
 
 TIME = f'[time]\ncolumn = "t"\nstart = "{START}"\n'
 CHANNELS = """
@@ -172,3 +179,162 @@ def test_an_index_outside_the_table_is_named(tmp_path: Path) -> None:
     mapping = mapping.replace('"v"', '"x", index = 1').replace('"a"', '"x", index = 2')
     with pytest.raises(MachineFileError, match=r"x has 3 columns of 1000 samples, expected index = 0 to 2 \(found 3\)"):
         imported(tmp_path, tmp_path / "run.npz", mapping)
+
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "docs" / "examples" / "fe_rotor"
+
+
+def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    return ran("service.rotorwatch", *arguments, environment={"PATH": "/usr/bin:/bin", "COLUMNS": "200"})
+
+
+def sample(path: Path) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """A file as the example's mapping expects it; its samples in um and mm/s."""
+    time = np.arange(20_000) / 2000.0
+    angle = 2 * np.pi * 1773 / 60 * time
+    motion = np.column_stack(
+        [4e-5 * np.cos(angle + k) for k in range(4)] + [5e-3 * np.sin(angle + k) for k in range(4)]
+    )
+    scale = np.abs(motion).max(axis=0) / 32000
+    q = np.rint(motion / scale).astype(np.int16)
+    pulses = np.arange(0, 10, 60 / 1773)
+    np.savez(path, q=q, scale=scale, fs=2000.0, key_pulse_s=pulses, speed_rpm=1773.0, channels=np.array(["y1"]))
+    return np.asarray(q * scale * np.r_[np.full(4, 1e6), np.full(4, 1e3)])
+
+
+def test_the_example_goes_through_import_and_export(tmp_path: Path) -> None:
+    expected = sample(tmp_path / "healthy.npz")
+    recording, machine = tmp_path / "healthy.mcap", EXAMPLE / "machine.toml"
+    found = run(
+        *("import", tmp_path / "healthy.npz", "--mapping", EXAMPLE / "mapping.toml", "--machine", machine),
+        *("--out", recording),
+    )
+    assert found.returncode == 0, found.stderr
+    assert "20000 samples in 100 blocks, 2026-01-01T00:00:00.000000Z to 2026-01-01T00:00:10.000000Z" in found.stdout
+    assert "gaps: none" in found.stdout
+    assert "keyphasor: 296 pulses, 1773 rpm on average" in found.stdout
+    (stretch,) = stretches(recording, load_machine_file(machine))
+    np.testing.assert_allclose(stretch.samples[:, :8], expected, rtol=1e-6, atol=1e-6)
+    out = tmp_path / "healthy.parquet"
+    found = run("export", recording, "--to", "parquet", "--out", out, "--to-time", "2026-01-01T00:00:02Z")
+    assert found.returncode == 0, found.stderr
+    assert f"{out}: 4000 rows, 10 columns" in found.stdout
+    assert pyarrow.parquet.read_metadata(out).num_rows == 4000
+
+
+def test_the_examples_machine_file_is_accepted() -> None:
+    found = run("check-config", EXAMPLE / "machine.toml")
+    assert found.returncode == 0, found.stderr
+    assert "9 channels at 2000 Hz" in found.stdout
+
+
+def test_a_file_that_cannot_be_imported_is_exit_code_2(tmp_path: Path) -> None:
+    (tmp_path / "run.csv").write_text("t,x\n0,1\n", encoding="utf-8")
+    found = run(
+        *("import", tmp_path / "run.csv", "--mapping", EXAMPLE / "mapping.toml"),
+        *("--machine", EXAMPLE / "machine.toml", "--out", tmp_path / "run.mcap"),
+    )
+    assert found.returncode == 2
+    assert "run.csv: no column" in found.stderr
+    assert "Traceback" not in found.stderr
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+def test_a_recording_that_is_not_there_is_exit_code_1(tmp_path: Path) -> None:
+    found = run("export", tmp_path / "none.mcap", "--to", "csv", "--out", tmp_path / "out.csv")
+    assert found.returncode == 1
+    assert "none.mcap: cannot be read" in found.stderr
+
+
+@pytest.mark.parametrize("command", ["import", "export"])
+def test_help_has_an_example(command: str) -> None:
+    assert "Example" in run(command, "--help").stdout
+
+
+def test_every_field_of_the_mapping_is_documented() -> None:
+    page = (ROOT / "docs" / "interchange.md").read_text(encoding="utf-8")
+    for model in (Mapping, CsvFormat, TimeBase, Column, Acceleration, Keyphasor):
+        for name in model.model_fields:
+            assert f"`{name}`" in page or f"[{name}" in page, f"docs/interchange.md does not mention {name}"
+
+
+HIGH_PASS_HZ = 1.5
+MAPPING = f"""
+[time]
+rate_hz = 2000.0
+start = "{START}"
+[channels]
+theta = {{ column = "a", unit = "rad" }}
+[acceleration]
+high_pass_hz = {HIGH_PASS_HZ}
+[acceleration.channels]
+y1 = {{ column = "acc", unit = "g" }}
+y1_dot = {{ column = "acc", unit = "g" }}
+"""
+
+
+@pytest.mark.parametrize("frequency_hz", [3.0, 22.0, 147.0, 600.0, 900.0])
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_sine_is_integrated_exactly_above_the_limit(frequency_hz: float, times: int) -> None:
+    rate_hz = 2000.0
+    time = np.arange(int(20 * rate_hz)) / rate_hz
+    omega = 2 * np.pi * frequency_hz
+    acceleration = np.cos(omega * time) + 0.3  # an offset, as accelerometers have
+    found = integrated(acceleration, rate_hz, times, HIGH_PASS_HZ)
+    exact = np.sin(omega * time) / omega if times == 1 else -np.cos(omega * time) / omega**2
+    edge = int(settling_s(HIGH_PASS_HZ) * rate_hz)
+    assert frequency_hz >= lowest_valid_hz(HIGH_PASS_HZ)
+    assert np.abs(found - exact)[edge:-edge].max() < 0.005 / omega**times
+
+
+def test_what_is_slow_is_not_measured_and_comes_out_as_nothing() -> None:
+    time = np.arange(80_000) / 2000.0
+    drift = np.sin(2 * np.pi * 0.1 * time) + 0.01 * time
+    found = integrated(drift, 2000.0, 2, HIGH_PASS_HZ)
+    edge = int(settling_s(HIGH_PASS_HZ) * 2000)
+    assert np.abs(found)[edge:-edge].max() < 1e-5  # the true displacement is metres
+
+
+def test_a_file_of_accelerations_becomes_velocity_and_displacement(tmp_path: Path) -> None:
+    rows = 220_000  # several windows
+    time = np.arange(rows) / 2000.0
+    one, two = 2 * np.pi * 22.0, 2 * np.pi * 140.0
+    velocity = 20e-3 * np.sin(one * time) + 5e-3 * np.sin(two * time)
+    acceleration = 20e-3 * one * np.cos(one * time) + 5e-3 * two * np.cos(two * time)
+    displacement = -20e-3 / one * np.cos(one * time) - 5e-3 / two * np.cos(two * time)
+    np.savez(
+        tmp_path / "run.npz",
+        acc=acceleration / unit_factor("acceleration", "g") + 0.02,
+        a=np.mod(one * time, 2 * np.pi),
+    )
+    done, recording = imported(tmp_path, tmp_path / "run.npz", MAPPING)
+    (found,) = stretches(recording)
+    first = round((found.start_ns - START_NS) * 2000 / 1e9)
+    assert first == round(settling_s(HIGH_PASS_HZ) * 2000)
+    kept = slice(first, rows - first)
+    assert found.samples.shape[0] == rows - 2 * first == rows - done.cut_rows
+    assert np.abs(found.samples[:, 0] - displacement[kept] * 1e6).max() < 1e-3 * 145
+    assert np.abs(found.samples[:, 1] - velocity[kept] * 1e3).max() < 1e-3 * 20
+    np.testing.assert_allclose(found.samples[:, 2], np.mod(one * time, 2 * np.pi)[kept])
+    text = "\n".join(summary_lines(done))
+    assert "high-pass at 1.5 Hz, valid from 3 Hz, not below" in text
+    assert "below 3 Hz" not in text  # the machine's band begins there
+
+
+def test_a_limit_within_the_machines_band_is_said(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", acc=np.sin(np.arange(40_000) * 0.1), a=np.zeros(40_000))
+    done, _ = imported(tmp_path, tmp_path / "run.npz", MAPPING.replace("= 1.5", "= 5.0"))
+    assert "window.band_hz = 3 Hz on, which is below 10 Hz" in "\n".join(summary_lines(done))
+
+
+def test_a_record_shorter_than_the_filter_settles_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", acc=np.sin(np.arange(10_000) * 0.1), a=np.zeros(10_000))
+    with pytest.raises(MachineFileError, match="10000 of them at the ends where filters settle"):
+        imported(tmp_path, tmp_path / "run.npz", MAPPING)
+
+
+def test_velocity_is_no_acceleration(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", acc=np.zeros(10_000), a=np.zeros(10_000))
+    with pytest.raises(MachineFileError, match="'mm/s' is a unit of velocity, not of acceleration"):
+        imported(tmp_path, tmp_path / "run.npz", MAPPING.replace('"g"', '"mm/s"', 1))

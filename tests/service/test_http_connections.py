@@ -20,7 +20,7 @@ from service.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import HttpSettings
 from tests.service.live import OPEN, endpoint, program, settings, until
-from tests.service.test_access_tls import files, trusting
+from tests.service.test_access_tokens import files, trusting
 
 HEAD = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n"
 SHELVE = (

@@ -13,15 +13,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
+from models.signals.salvage import salvaged_messages
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from service.history.records import StoredEvent, StoreError
-from service.recordings.catalogue import Catalogue, Recording, kept_reasons, name_of
+from service.recordings.catalogue import PART, Catalogue, Recording, kept_reasons, name_of
+from service.recordings.recent import recent_messages, recorded_files
 from service.recordings.recorder import MachineRecorder
 from service.recordings.retention import AlarmMark, alarm_mark, decide
 from service.runtime import Runtime, running
 from service.settings.service import RecordingSettings
-from tests.service.live import LAB, Feed, Program, endpoint, machine_file, open_session, program, settings, until
+from tests.service.live import (
+    LAB,
+    Feed,
+    Program,
+    endpoint,
+    machine_file,
+    open_session,
+    program,
+    scenario_blocks,
+    settings,
+    until,
+)
+from tests.service.replaying import recording
 from tests.service.test_store import alarm_event
 from tests.service.test_survives import PATIENT, do, log
 from tests.service.test_survives import running as monitor_running
@@ -413,3 +427,22 @@ def test_links_are_not_listed(with_secret: Catalogue) -> None:
     (good,) = with_secret.recordings()
     assert with_secret.find("s/m/good.mcap") == good
     assert len(list(read_recording(good.path))) == 3
+
+
+@pytest.mark.parametrize("when", ["before", "while"])
+def test_a_part_that_is_completed_meanwhile_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str) -> None:
+    complete = recording(tmp_path / "run.mcap", scenario_blocks(3.0))
+    expected = list(read_recording(complete, keys={LAB.keys.stream}))
+    part = complete.rename(complete.with_name(complete.name + PART))
+    files = recorded_files(tmp_path)
+    assert files == (part,)
+
+    def completed(path: Path) -> Iterator[RecordedMessage]:
+        part.rename(complete)
+        return salvaged_messages(path)
+
+    if when == "before":
+        part.rename(complete)
+    else:
+        monkeypatch.setattr("service.recordings.recent.salvaged_messages", completed)
+    assert list(recent_messages(files, LAB.keys.stream, 0)) == expected

@@ -20,7 +20,7 @@ from service.settings.webhooks import WebhookSettings
 from tests.service.guarded import Clock
 from tests.service.hooked import Got, alarm_event, hook, settings_for
 from tests.service.live import until
-from tests.service.test_access_tls import trusting
+from tests.service.test_access_tokens import trusting
 
 PLACES = ("demo/lab", "demo/pump")
 

@@ -1,9 +1,12 @@
-"""The runner, the page, and every study at its smallest size."""
+"""The runner, the page, every study at its smallest size; rates and goals; variants of the relation networks."""
 
+import csv
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -11,13 +14,35 @@ from benchmarks.studies import __main__ as command
 from benchmarks.studies.delay import bound_time_s, with_hop
 from benchmarks.studies.evaluate import evaluate
 from benchmarks.studies.pages import write_page
+from benchmarks.studies.paper import full_correlation
 from benchmarks.studies.reproduction import CONDITIONS, own_equations
-from benchmarks.studies.results import Chart, Goal, Record, Table, Value, at_least, rate
+from benchmarks.studies.results import (
+    Chart,
+    Estimate,
+    Goal,
+    Record,
+    Table,
+    Value,
+    at_least,
+    at_most,
+    holding,
+    limit_of,
+    rate,
+    resampled,
+    robust,
+    spread,
+    within,
+)
 from benchmarks.studies.study import Cell, Options, Over, Study, read, run
 from benchmarks.studies.subjects import SHIPPED, SUBJECTS, subject_named
+from benchmarks.studies.variants import VARIANTS, as_seen, linear_fit, variant_equation
 from models.commissioning.commissioned import KnowledgeLevel, knowledge_of
+from models.diagnosis.networks.equations import EQUATIONS
+from models.diagnosis.networks.relation import window_view
+from models.diagnosis.window import WindowStatistics
 from models.errors import RecordingError
 from models.machine import load_machine
+from simulator.training.draws import Draw, Purpose, simulate_window
 
 LAB = load_machine("lab")
 
@@ -160,3 +185,139 @@ def test_files_tell_what_their_level_allows() -> None:
             assert file is None or knowledge_of(file).level is level
     with pytest.raises(KeyError):
         subject_named("nobody")
+
+
+def shares(count: int, of: int) -> Estimate:
+    found = rate([True] * count + [False] * (of - count))
+    assert found is not None
+    return found
+
+
+def test_rates_have_clopper_pearson_intervals() -> None:
+    nothing, some, everything = shares(0, 100), shares(5, 100), shares(100, 100)
+    assert (nothing.low, nothing.high) == pytest.approx((0.0, 0.0362), abs=1e-4)
+    assert (some.low, some.high) == pytest.approx((0.0164, 0.1128), abs=1e-4)
+    assert (everything.low, everything.high) == pytest.approx((0.9638, 1.0), abs=1e-4)
+    assert rate([]) is None
+
+
+def test_intervals_by_resampling_are_those_of_the_normal_distribution() -> None:
+    values = np.random.default_rng(99).standard_normal(4000)
+    found = resampled(lambda x: np.asarray(np.std(x, axis=-1)), values)
+    assert found.low == pytest.approx(found.value * (1 - 1.96 / np.sqrt(8000)), rel=0.01)
+    assert found.high == pytest.approx(found.value * (1 + 1.96 / np.sqrt(8000)), rel=0.01)
+
+
+def test_a_spread_is_robust_and_needs_four_windows() -> None:
+    # Median 0.005, distances 0.025, 0.005, 0.005, 0.045 with the median 0.015.
+    found = spread([-0.02, 0.0, 0.01, 0.05, None])
+    assert found is not None
+    assert found.value == pytest.approx(1.4826 * 0.015)
+    assert spread([0.1, 0.2, 0.3]) is None
+    assert robust(np.array([1.0, 2.0, 1e9])) == pytest.approx(1.4826)
+
+
+def test_a_goal_is_missed_only_where_the_whole_interval_misses_it() -> None:
+    found = shares(80, 100)
+    assert at_least("found", found, 0.79).verdict == "met"
+    assert at_least("found", found, 0.85).verdict == "within chance"
+    assert at_least("found", found, 0.95).verdict == "missed"
+    assert at_most("found", found, 0.5).verdict == "missed"
+    assert at_most("found", None, 0.5).verdict == "–"
+    covered = {"e": shares(94, 100), "k_by": shares(999, 1000)}
+    judged = within("covered", covered, 0.93, 0.97)
+    assert judged.verdict == "missed"
+    assert "1 of 2 inside; worst k_by: 99.9 %" in judged.measured
+    assert judged.declared == "93 % to 97 %"
+    assert (
+        "2 of 2 inside; worst c_by: 97.5 %"
+        in within("found", {"k_by": shares(40, 40), "c_by": shares(39, 40)}, 0.95, 1.0).measured
+    )
+
+
+def test_of_many_figures_one_lies_outside_by_chance() -> None:
+    off, good = shares(85, 100), shares(95, 100)
+    assert within("covered", {"one": off}, 0.93, 0.97).verdict == "missed"
+    assert within("covered", {"one": off} | {str(n): good for n in range(20)}, 0.93, 0.97).verdict == "within chance"
+    assert holding("false alarms", {"lab": shares(5, 50)}, 0.01).verdict == "missed"
+
+
+def test_limits_keep_the_declared_rate() -> None:
+    """400 repetitions of 99 healthy scores and 50 further ones from a skewed distribution; seed 8."""
+    rng = np.random.default_rng(8)
+    exceeded = [np.mean(rng.lognormal(size=50) > limit_of(rng.lognormal(size=99), 0.05)) for _ in range(400)]
+    assert np.mean(exceeded) == pytest.approx(0.05, abs=0.006)
+    with pytest.raises(ValueError, match="expected at least 99"):
+        limit_of(np.ones(98), 0.01)
+
+
+def test_a_table_has_a_row_for_every_group_and_is_written_with_intervals(tmp_path: Path) -> None:
+    records = [{"method": by, "named": n < 3, "error": float(n)} for by in ("likelihood", "network") for n in range(4)]
+    table = Table(
+        "groups",
+        ("method",),
+        {"named": lambda rows: rate(row["named"] for row in rows), "largest": lambda rows: rows[-1]["error"]},
+        lambda rows: (row for row in rows if row["error"]),
+    )
+    first, second = table.of(records)
+    assert (first["method"], first["named"], second["largest"]) == ("likelihood", shares(2, 3), 3.0)
+    with table.write(records, tmp_path).open(encoding="utf-8") as written:
+        rows = list(csv.DictReader(written))
+    assert [row["named windows"] for row in rows] == ["3", "3"]
+    assert float(rows[0]["named low"]) == pytest.approx(shares(2, 3).low, rel=1e-4)
+
+
+SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
+PRESENT = next(variant for variant in VARIANTS if variant.label.endswith("(the present one)"))
+
+
+@pytest.fixture(scope="module")
+def window() -> WindowStatistics:
+    return simulate_window(Draw(SHORT, 41, Purpose.EVALUATION), 0)
+
+
+@pytest.mark.parametrize("number", ["28", "29", "31"])
+def test_the_variant_with_everything_on_is_the_equation_of_the_table(window: WindowStatistics, number: str) -> None:
+    equation = next(one for one in EQUATIONS if one.number == number)
+    rows = variant_equation(PRESENT, number).rows(window_view(window, SHORT), SHORT)
+    expected = equation.rows(window_view(window, SHORT), SHORT)
+    for name in ("inputs", "target", "signatures"):
+        np.testing.assert_array_equal(getattr(rows, name), getattr(expected, name))
+
+
+def test_y1_alone_without_tilt_is_the_printed_equation_28(window: WindowStatistics) -> None:
+    variant = replace(PRESENT, has=PRESENT.has - {"references", "tilt"})
+    view = window_view(window, SHORT)
+    rows = variant_equation(variant, "28").rows(view, SHORT)
+    R, at = view.correlation, view.states.index
+    printed = np.stack([R[:, at("y1"), at(name)] for name in ("y1", "y2", "y1_dot")], axis=1)
+    np.testing.assert_array_equal(rows.inputs, printed)
+    np.testing.assert_array_equal(rows.target, R[:, at("y1_dot"), at("y1_dot")])
+    k_over_m = LAB.rotor.k_by_N_per_m / LAB.rotor.m1_kg
+    np.testing.assert_allclose(rows.signatures[:, 0], k_over_m * printed[:, 0])
+
+
+def test_a_unit_takes_the_place_of_the_norm(window: WindowStatistics) -> None:
+    view = window_view(window, SHORT)
+    equation = variant_equation(PRESENT, "28")
+    rows = equation.rows(view, SHORT)
+    in_unit = replace(equation, unit=2 * rows.norm).rows(view, SHORT)  # type: ignore[call-arg]  # 28 has a unit
+    assert in_unit.norm == 1
+    np.testing.assert_allclose(in_unit.target, rows.target / (2 * rows.norm))
+
+
+def test_the_synchronous_part_is_put_back_as_the_paper_has_it(window: WindowStatistics) -> None:
+    seen = as_seen(replace(PRESENT, has=PRESENT.has - {"synchronous"}), window)
+    i, j = window.states.index("y1"), window.states.index("z2")
+    np.testing.assert_allclose(seen.correlation[:, i, j], full_correlation(window, "y1", "z2"))
+    assert as_seen(PRESENT, window) is window
+
+
+def test_the_linear_fit_leaves_nothing_that_its_inputs_explain(window: WindowStatistics) -> None:
+    equation = variant_equation(PRESENT, "31")
+    rows = equation.rows(window_view(window, SHORT), SHORT)
+    fit = linear_fit(equation, [window], SHORT)
+    residual = rows.target / rows.norm - fit(rows.inputs / rows.norm)
+    projected = (rows.inputs / np.linalg.norm(rows.inputs, axis=0)).T @ residual
+    assert np.abs(projected).max() < 1e-8
+    assert 0 < np.mean(residual**2) < 0.2
