@@ -19,7 +19,7 @@ _log = structlog.get_logger("rotorwatch", part="history")
 
 
 def upgrade() -> None:
-    """Pack window by window, which takes about a minute for each million windows of eleven readings."""
+    """Pack window by window, which takes a minute or two for each million windows of eleven readings."""
     op.execute("ALTER TABLE machines RENAME COLUMN evaluations TO windows")
     op.add_column("machines", sa.Column("bucketed", sa.BigInteger(), nullable=False, server_default=sa.text("0")))
     _convert(
