@@ -1,11 +1,20 @@
-"""The choice among sets of parameters, on Gaussian windows with random covariances."""
+"""The choice among sets of parameters, two diagnosticians on one window, and what a reading says of itself."""
+
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
-from models.diagnosis.readings import Diagnosis, no_reading, parameter_reading
+import models
+import service
+import simulator
+from models.diagnosis.readings import Z95, Diagnosis, no_reading, parameter_reading, possible_reading
+from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.isolation import Isolation, isolate_window, outside_confidence
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
+from models.errors import EstimationError
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
@@ -153,3 +162,70 @@ def test_stretches_add_by_inverse_variance() -> None:
     assert together.misfit_z == pytest.approx(3.0)
     assert (together.start_ns, together.end_ns) == (0, 4)
     np.testing.assert_allclose(together.blurred(0.01).estimate()[1], cov / 4 + 1e-4 * np.eye(6), rtol=1e-6)
+
+
+SEED_OF_AGREEMENT = 88_400
+
+
+def diagnosis(by: str, **changes: tuple[float, float]) -> Diagnosis:
+    return Diagnosis(by, tuple(parameter_reading(name, by, *value) for name, value in changes.items()))
+
+
+def test_agreement_disagreement_and_only_one() -> None:
+    first = diagnosis("likelihood", k_by=(-0.25, 0.01), c_by=(0.01, 0.01), EI=(0.0, 0.002))
+    second = diagnosis("network", k_by=(-0.24, 0.02), c_by=(0.30, 0.02), e=(0.1, 0.02))
+    found = {one.name: one for one in agreements(first, second)}
+    assert list(found) == ["k_by", "c_by", "e", "EI"]
+    assert found["k_by"].verdict == "agree"
+    assert found["k_by"].between == ("likelihood", "network")
+    assert found["k_by"].difference_z == pytest.approx(0.01 / 5**0.5 / 0.01)
+    assert found["c_by"].verdict == "disagree"
+    assert found["c_by"].difference_z == pytest.approx(0.29 / 5**0.5 / 0.01)
+    assert found["e"].verdict == found["EI"].verdict == "only-one"
+    assert found["e"].difference_z is None
+
+
+def test_nothing_to_compare() -> None:
+    assert agreements(Diagnosis("likelihood"), Diagnosis("network")) == ()
+
+
+@pytest.mark.slow
+def test_two_who_are_right_disagree_once_in_a_thousand_windows() -> None:
+    rng = np.random.default_rng(SEED_OF_AGREEMENT)
+    windows, apart = 20_000, 0
+    for _ in range(windows):
+        one, other = rng.normal(0, [[0.01], [0.03]], (2, 6))
+        opinions = (
+            diagnosis(by, **{name: (float(value), error) for name, value in zip(PARAMETERS, values, strict=True)})
+            for by, values, error in (("likelihood", one, 0.01), ("network", other, 0.03))
+        )
+        apart += any(one.verdict == "disagree" for one in agreements(*opinions))
+    assert 20 - 4 * 20**0.5 < apart < 20 + 4 * 20**0.5
+
+
+@pytest.mark.parametrize("change", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_none_is_no_reading(change: float) -> None:
+    reading = possible_reading("k_by", "relation", change, 0.1)
+    assert (reading.relative_change, reading.standard_error, reading.interval_95) == (None, None, None)
+    assert reading.reason
+    with pytest.raises(EstimationError, match="k_by"):
+        parameter_reading("k_by", "likelihood", change, 0.1)
+
+
+def test_a_reading_without_an_error_has_no_interval() -> None:
+    reading = parameter_reading("e", "likelihood", 0.1, np.inf)
+    assert (reading.relative_change, reading.standard_error, reading.interval_95, reading.z) == (0.1, None, None, None)
+    sharp = parameter_reading("e", "likelihood", 0.1, 0.0)
+    assert (sharp.interval_95, sharp.z) == ((0.1, 0.1), None)
+
+
+def test_ninety_five_per_cent_is_one_number_everywhere() -> None:
+    assert pytest.approx(norm.ppf(0.975), abs=1e-6) == Z95
+    folders = [Path(package.__path__[0]) for package in (models, service, simulator)]
+    written = [
+        file.name
+        for folder in folders
+        for file in folder.rglob("*.py")
+        if re.search(r"(?<![\w, .])1\.96\d* ?\*|= ?1\.96|\b1\.9599", file.read_text(encoding="utf-8"))
+    ]
+    assert written == ["readings.py"]

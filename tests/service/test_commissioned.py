@@ -12,7 +12,6 @@ from models.errors import BundleError
 from models.machine import AlarmSettings, MachineFile
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState, Report
-from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import (
@@ -25,6 +24,7 @@ from tests.commissioning.rotor_kit import (
     stream,
     with_samples,
 )
+from tests.service.test_monitor import feed
 
 HEALTHY_S, SEED = 250.0, 71
 MACHINE = NOTHING.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0)})
@@ -37,23 +37,12 @@ def installed() -> Installed:
     return Installed(MACHINE, None, made.commissioned)
 
 
-def feed(blocks: Sequence[SampleBlock], what: Installed) -> tuple[list[Report], list[AlarmEvent]]:
-    monitor = MachineMonitor(what)
-    windows: list[Report] = []
-    events: list[AlarmEvent] = []
-    for block in blocks:
-        outcome = monitor.step(block)
-        windows += outcome.windows
-        events += outcome.events
-    return windows, events
-
-
 def full(windows: Sequence[Report]) -> list[Report]:
     return [window for window in windows if window.filled == 1.0]
 
 
 def test_the_healthy_machine_stays_healthy() -> None:
-    windows, events = feed(stream(100.0, SEED + 1), installed())
+    windows, events = feed(MachineMonitor(installed()), stream(100.0, SEED + 1))
     assert len(full(windows)) > 5
     assert {window.state for window in full(windows)} == {HealthState.HEALTHY}
     assert not events
@@ -67,7 +56,7 @@ def test_the_healthy_machine_stays_healthy() -> None:
 @pytest.mark.parametrize(("name", "change"), [("k_by", -0.2), ("c_bz", -0.4), ("e", 0.5)])
 def test_a_change_is_named_alone(name: str, change: float) -> None:
     blocks = stream(75.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
-    windows, events = feed(blocks, installed())
+    windows, events = feed(MachineMonitor(installed()), blocks)
     verdict = full(windows)[-1].verdict
     assert verdict is not None
     assert [finding.name for finding in verdict.changed] == [name]
@@ -80,7 +69,7 @@ def test_a_change_is_named_alone(name: str, change: float) -> None:
 
 def test_another_speed_is_not_evaluable_here_and_raises_nothing() -> None:
     windows, events = feed(
-        stream(75.0, SEED + 3, Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm)), installed()
+        MachineMonitor(installed()), stream(75.0, SEED + 3, Event(at_s=0.0, speed_rpm=1.15 * LAB.operation.speed_rpm))
     )
     assert {window.state for window in full(windows)} == {HealthState.NOT_EVALUABLE}
     assert all("not evaluable here: speed is 1518 rpm" in window.reason for window in full(windows))
@@ -113,7 +102,7 @@ def _faulty(kind: str) -> list[SampleBlock]:
 
 @pytest.mark.parametrize("kind", ["gain drift", "offset", "stuck", "clipped", "swapped", "delayed"])
 def test_a_sensor_at_fault_is_told_from_the_machine(kind: str) -> None:
-    windows, events = feed(_faulty(kind), installed())
+    windows, events = feed(MachineMonitor(installed()), _faulty(kind))
     last = full(windows)[-1]
     assert last.state is HealthState.DATA_HEALTH
     assert last.sensors
@@ -133,12 +122,12 @@ def test_with_too_few_sensors_only_changed_or_not_changed_is_said() -> None:
     made = commissioned(machine, recording(machine, seen(stream(HEALTHY_S, SEED))))
     assert made.commissioned is not None
     few = Installed(machine, None, made.commissioned)
-    windows, events = feed(seen(stream(70.0, SEED + 1)), few)
+    windows, events = feed(MachineMonitor(few), seen(stream(70.0, SEED + 1)))
     assert {window.state for window in full(windows)} == {HealthState.UNCHANGED}
     assert not events
     assert all("no equation can be evaluated" in window.reason for window in full(windows))
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.4)
-    windows, events = feed(seen(stream(70.0, SEED + 5, softer)), few)
+    windows, events = feed(MachineMonitor(few), seen(stream(70.0, SEED + 5, softer)))
     assert {event.alarm.name for event in events} == {"shape"}
     assert full(windows)[-1].state is HealthState.ALERT
     assert all(reading.relative_change is None for reading in full(windows)[-1].parameters)
@@ -164,7 +153,7 @@ def test_a_swap_that_no_pair_of_sensors_shows_is_not_called_healthy() -> None:
     samples = samples_of(blocks)
     bearing, disc = names.index("y1"), names.index("y2")
     samples[:, [bearing, disc]] = samples[:, [disc, bearing]]
-    windows, events = feed(with_samples(blocks, samples), Installed(machine, None, made.commissioned))
+    windows, events = feed(MachineMonitor(Installed(machine, None, made.commissioned)), with_samples(blocks, samples))
     assert HealthState.HEALTHY not in {window.state for window in full(windows)}
     assert "model" in {event.alarm.name for event in events}
     assert all(event.alarm.low_confidence for event in events if event.alarm.name != "model")

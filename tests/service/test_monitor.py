@@ -1,5 +1,6 @@
 """The data path of one machine, fed by the simulator's blocks without any transport."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -33,7 +34,8 @@ def monitor() -> MachineMonitor:
     return MachineMonitor(install(machine, "lab"))
 
 
-def feed(target: MachineMonitor, stream: list[SampleBlock]) -> tuple[list[Report], list[AlarmEvent]]:
+def feed(target: MachineMonitor, stream: Sequence[SampleBlock]) -> tuple[list[Report], list[AlarmEvent]]:
+    """Windows and events of all blocks."""
     windows: list[Report] = []
     events: list[AlarmEvent] = []
     for block in stream:
