@@ -22,7 +22,6 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle, load_bundle
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
-from models.diagnosis.networks.training import train_network
 from models.diagnosis.readings import Diagnostician
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -109,6 +108,8 @@ def _train(task: tuple[Variant, str, Sequence[WindowStatistics], Machine, int]) 
         return _Trained(
             variant, machine, EquationNetwork(equation, v.linear_fit(equation, windows, machine), None), None
         )
+    from models.diagnosis.networks.training import train_network  # noqa: PLC0415  # with torch, which takes seconds
+
     return _Trained(variant, machine, train_network(equation, windows, machine, seed), None)
 
 
