@@ -1,5 +1,6 @@
 """All alarms a machine can have: one row per alarm."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -11,6 +12,7 @@ from rotorwatch.records.sensor_faults import FaultKind
 MODEL = "model"  # the alarm that says: outside the model
 SHAPE = "shape"  # the alarm that says: where no equation can be evaluated, a channel's vibration is not as it was
 STREAM_LOST = "stream-lost"  # the alarm that says: no data come any more
+LEVEL = "level:"  # begins the name of the alarm on a channel's vibration levels; the channel's name follows
 # The alarms on the monitor itself: a defect, or a history that refuses; and a computer that cannot keep up.
 FAULT, OVERLOADED = "monitor-fault", "monitor-overloaded"
 DATA = "data-"  # what the names of all alarms of data health begin with
@@ -68,6 +70,14 @@ ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
 """Every alarm, by its name."""
 
 
+def is_alarm(name: str) -> bool:
+    """Whether there is such an alarm; of a machine that has the channel, if it is on a channel's levels."""
+    return name in ALARMS or re.fullmatch(f"{LEVEL}[A-Za-z0-9_.:-]{{1,64}}", name) is not None
+
+
 def alarm_kind(name: str) -> AlarmKind:
     """What is to be known of an alarm; one without a row is told by its name rather than not at all."""
+    if name.startswith(LEVEL):
+        channel = name.removeprefix(LEVEL)
+        return AlarmKind(f"vibration level, {channel}", "machine", f"the levels of {channel} are within their limits")
     return ALARMS.get(name) or AlarmKind(name, "machine", f"{name}: nothing of it is seen any more")

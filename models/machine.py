@@ -16,8 +16,9 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, Field, model_validator
 
-from models.alarm_names import ALARMS
+from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.errors import MachineFileError
+from models.levels.settings import LevelSettings
 from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor
@@ -142,10 +143,11 @@ class AlarmLimits(BaseModel, extra="forbid", frozen=True):
 
 
 def _known_alarms(field: str, names: Iterable[str]) -> None:
-    unknown = sorted(set(names) - set(ALARMS))
+    unknown = sorted(name for name in set(names) if not is_alarm(name))
     if unknown:
         hint = did_you_mean(unknown[0], ALARMS)
-        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {', '.join(ALARMS)}{hint}")
+        known = f"{', '.join(ALARMS)} and {LEVEL}CHANNEL"
+        raise ValueError(f"{field}: {', '.join(unknown)} is no alarm; there are {known}{hint}")
 
 
 class SuppressRule(BaseModel, extra="forbid", frozen=True):
@@ -239,6 +241,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     window: WindowSettings = WindowSettings()
     ingest: IngestSettings = IngestSettings()
     alarms: AlarmSettings = AlarmSettings()
+    levels: LevelSettings = LevelSettings()
 
     @model_validator(mode="before")
     @classmethod
@@ -280,6 +283,11 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 f"window.band_hz ends at {self.window.band_hz[1]} Hz, above half of rate_hz {self.rate_hz}"
             )
         _ = self.descriptor  # refuses double channels
+        names = [channel.name for channel in self.sensors if channel.quantity != "shaft_angle"]
+        for limit in self.levels.limits:
+            if limit.channel not in names:
+                hint = did_you_mean(limit.channel, names)
+                raise ValueError(f"levels.limits: no channel {limit.channel!r}; there are {', '.join(names)}{hint}")
         return self
 
     @property

@@ -9,6 +9,7 @@ import typer
 from models.errors import RotorwatchError
 from service.commands import access as access_commands
 from service.commands import history as history_commands
+from service.commands import installation as installation_commands
 from service.commands import interchange as interchange_commands
 from service.commands import plot as plot_commands
 from service.commands import record as record_commands
@@ -289,6 +290,7 @@ def _checked(file: Path) -> str:
 
 
 # After the commands of this module, which are the first in the list.
+installation_commands.register(app)
 watching_commands.register(app)
 access_commands.register(app)
 webhook_commands.register(app)

@@ -28,6 +28,7 @@ from models.diagnosis.sensors.reference import learn_sensor_reference
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.errors import EstimationError
+from models.levels.reference import learn_levels
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
 
@@ -234,7 +235,9 @@ def commission(
     checks = [check_data(machine, recordings)]
     pieces = [] if checks[0].verdict == "refused" else pieces_of(recordings)
     learned = Learned(())
-    if pieces:
+    if pieces and not recordings[0].plan.states:
+        checks.append(_ONLY_LEVELS)
+    elif pieces:
         by_recording = {
             one.name: [piece.window for piece in pieces if piece.recording == one.name] for one in recordings
         }
@@ -252,7 +255,8 @@ def commission(
     refused = any(check.verdict == "refused" for check in checks)
     windows = [piece.window for piece in pieces]
     commissioned = None
-    if not refused and (learned.machine is not None or learned.baselines or learned.shape is not None):
+    if pieces and not refused:
+        channels = [machine.sensors[column].name for column in recordings[0].plan.columns]
         commissioned = Commissioned(
             site=machine.site,
             machine=machine.name,
@@ -267,10 +271,19 @@ def commission(
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
+            levels=learn_levels("commissioned", channels, [piece.levels for piece in pieces]),
         )
     return Commissioning(
         _report(machine, recordings, checks, learned, commissioned, pieces, wished), commissioned, learned.machine
     )
+
+
+_ONLY_LEVELS = Check(
+    name="can be learned",
+    verdict="limited",
+    text="no channel is at a bearing or disc, in y or z: vibration levels are learned, and nothing is diagnosed",
+    advice="name location and direction of the sensors as the model does, where they are at such places",
+)
 
 
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:

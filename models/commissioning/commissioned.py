@@ -29,6 +29,7 @@ from models.diagnosis.sensors.reference import SensorReference
 from models.diagnosis.shape import HealthyShape
 from models.diagnosis.window import WindowStatistics
 from models.errors import BundleError
+from models.levels.reference import LevelReference
 from models.machine import Machine, MachineFile
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETERS
@@ -216,13 +217,14 @@ class Commissioned(BaseModel, extra="forbid", frozen=True):
     )
     shape: HealthyShape | None = Field(default=None, description="where no equation can be evaluated, or beside it")
     sensors: SensorReference | None = None
+    levels: LevelReference | None = Field(default=None, description="vibration levels of the healthy machine")
 
     @model_validator(mode="after")
     def _of_its_level(self) -> Self:
         if self.level is KnowledgeLevel.PARTIAL and self.identified is None:
             raise ValueError("level is partial, but there is no identified rotor")
-        if self.level is KnowledgeLevel.NONE and not self.baselines and self.shape is None:
-            raise ValueError("level is none, but there is neither a baseline nor a healthy shape")
+        if self.level is KnowledgeLevel.NONE and not self.baselines and self.shape is None and self.levels is None:
+            raise ValueError("level is none, but there is neither a baseline, nor a healthy shape, nor levels")
         return self
 
     @property
@@ -298,6 +300,11 @@ class Installed:
         return self.machine if isinstance(self.machine, Machine) else None
 
     @property
+    def watching(self) -> bool:
+        """Whether nothing but levels can be watched: the machine is neither known nor commissioned."""
+        return self.commissioned is None and not isinstance(self.machine, Machine)
+
+    @property
     def identity(self) -> str | None:
         """Changes with anything that was trained or commissioned; None where there is neither."""
         parts = [part.identity for part in (self.bundle, self.commissioned) if part is not None]
@@ -307,7 +314,7 @@ class Installed:
 
 
 def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
-    """Load what a machine is monitored with.
+    """Load what a machine is monitored with; of one that is neither known nor commissioned, levels are watched.
 
     Parameters
     ----------
@@ -317,23 +324,20 @@ def install(machine: MachineFile, bundle: str | Path | None) -> Installed:
     Raises
     ------
     BundleError
-        If it is damaged or of another machine, or if the machine's parameters are not known and it was not
-        commissioned.
+        If it is damaged or of another machine.
     """
-    place = f"{machine.site}/{machine.name}"
     directory = None if bundle is None else Path(bundle)
     if directory is not None and (directory / FILE).is_file():
         commissioned = load_commissioned(directory, machine)
         known = commissioned.completed(machine)
         networks = load_bundle(directory, known) if known is not None and (directory / _MANIFEST).is_file() else None
         return Installed(machine, networks, commissioned)
+    if bundle is None:
+        return Installed(machine)
     if not isinstance(machine, Machine):
         raise BundleError(
-            f"{place}: its machine file does not give all parameters of the rotor, so it must be commissioned from "
-            f"healthy recordings first (rotortrain commission); {_found(directory)}"
+            f"{machine.site}/{machine.name}: {directory} is not a commissioned bundle, and its machine file does not "
+            "give all parameters of the rotor, which a trained one needs; commission it from healthy recordings "
+            "(rotortrain commission), or name no bundle: then its vibration levels are watched"
         )
-    return Installed(machine, None if bundle is None else load_bundle(bundle, machine))
-
-
-def _found(directory: Path | None) -> str:
-    return "no bundle is named for it" if directory is None else f"{directory} is not a commissioned bundle"
+    return Installed(machine, load_bundle(bundle, machine))

@@ -72,7 +72,7 @@ def healthy_from_blocks(
     until_s : float, optional
         Use only data from before this time after the first sample.
     """
-    plan = plan_for(machine)
+    plan = plan_for(machine, levels=True)
     gate, window = Gate(machine), SlidingWindow(replace(plan, hops=1))
     stretches: list[list[HopMoments]] = [[]]
     refused: Counter[str] = Counter()

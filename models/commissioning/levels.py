@@ -36,8 +36,9 @@ from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.shape import HealthyShape, learn_shape
 from models.diagnosis.verdict.stretch import determined, with_shared_error
-from models.diagnosis.window import WindowStatistics, window_statistics
+from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
 from models.errors import EstimationError
+from models.levels.measures import WindowLevels
 from models.machine import Machine, MachineFile
 from models.signals.channels import ACCELERATIONS
 
@@ -68,6 +69,7 @@ class Piece:
     recording: str
     late: bool
     window: WindowStatistics
+    levels: WindowLevels
 
 
 def pieces_of(recordings: Sequence[HealthyRecording]) -> list[Piece]:
@@ -80,9 +82,10 @@ def pieces_of(recordings: Sequence[HealthyRecording]) -> list[Piece]:
             if len(stretch) < _SHORTEST_HOPS:
                 continue
             cuts = np.linspace(0, len(stretch), count + 1).round().astype(int)
-            windows = [window_statistics(plan, stretch[a:b]) for a, b in pairwise(cuts.tolist())]
+            parts = [stretch[a:b] for a, b in pairwise(cuts.tolist())]
             found += [
-                Piece(recording.name, 2 * number >= len(windows), window) for number, window in enumerate(windows)
+                Piece(recording.name, 2 * number >= count, window_statistics(plan, part), levels_of(plan, part))
+                for number, part in enumerate(parts)
             ]
     return found
 

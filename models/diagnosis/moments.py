@@ -24,6 +24,7 @@ from scipy.fft import next_fast_len
 from models.checkpoint import checked, prefixed, unprefixed
 from models.diagnosis.rotation import RotationLine, followed_speeds, rotation_line
 from models.diagnosis.waveform import MotionPair, Waveform, motion_pairs, pair_powers, waveform_of
+from models.levels.measures import HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
@@ -40,8 +41,10 @@ class Plan:
     # Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
     # statistics' columns.
     states: tuple[str, ...]
-    columns: npt.NDArray[np.intp]  # column of the stream for each of `states`
-    scales: FloatArray  # factor to SI for each of `states`
+    # Column of the stream, and factor to SI, for each of `states` and then for channels at other places, of which only
+    # levels are taken.
+    columns: npt.NDArray[np.intp]
+    scales: FloatArray
     # Column of the shaft angle; without it the regressors are the mean and, where `speed_rad_s` is given, the most
     # likely line near it.
     angle_column: int | None
@@ -56,6 +59,17 @@ class Plan:
     # Speed to look for where there is no shaft angle; None: the rotation is not looked for.
     speed_rad_s: float | None = None
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
+    levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
+
+    @property
+    def others(self) -> slice:
+        """Columns of SI samples that are no states."""
+        return slice(len(self.states), self.columns.size)
+
+    @property
+    def width(self) -> int:
+        """Columns of SI samples."""
+        return self.columns.size + (self.angle_column is not None)
 
     @property
     def lags_s(self) -> FloatArray:
@@ -73,25 +87,35 @@ class Plan:
         return motion_pairs(self.states)
 
     def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
-        """Measured states in SI units and, last, the shaft angle if there is one; shape (n_samples, n)."""
-        states = samples[:, self.columns].astype(np.float64) * self.scales
+        """Measured states and other channels in SI units and, last, the shaft angle if there is one.
+
+        Returns
+        -------
+        ndarray, shape (n_samples, width)
+        """
+        vibration = samples[:, self.columns].astype(np.float64) * self.scales
         if self.angle_column is None:
-            return states
-        return np.column_stack([states, samples[:, self.angle_column].astype(np.float64)])
+            return vibration
+        return np.column_stack([vibration, samples[:, self.angle_column].astype(np.float64)])
 
 
-def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
+def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False) -> Plan:
     """Derive the plan of a machine.
 
     Parameters
     ----------
     lagged : bool
         Whether correlations are wanted at all lags, as the networks need them, or at lag zero alone.
+    levels : bool
+        Whether levels are wanted.
     """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
     states = tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in order)
-    columns = np.array([order[name] for name in states], dtype=np.intp)
+    others = tuple(name for name in order if name not in states and name != "theta")
+    columns = np.array([order[name] for name in (*states, *others)], dtype=np.intp)
+    channels = [machine.sensors[column] for column in columns]
+    speed_rpm = None if machine.operation is None else machine.operation.speed_rpm
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
     lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
@@ -101,7 +125,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
         rate_hz=rate_hz,
         states=states,
         columns=columns,
-        scales=np.array([machine.sensors[column].to_si for column in columns]),
+        scales=np.array([channel.to_si for channel in channels]),
         angle_column=order.get("theta"),
         hop=round(window.hop_s * rate_hz),
         preamble=max(longest, segment // 2),
@@ -112,6 +136,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True) -> Plan:
         max_span_ns=round(window.max_span_s * 1e9),
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
+        levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm)) if levels else None,
     )
 
 
@@ -135,6 +160,7 @@ class HopMoments:
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, their mean taken out
     # (`models.diagnosis.waveform.pair_powers`)
     pair_powers: ComplexArray
+    levels: HopLevels | None = None
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""
@@ -147,6 +173,7 @@ class HopMoments:
             "line": np.array([] if line is None else [line.speed_rad_s, line.sweep_rad_s2, line.strength], np.float64),
             "pair_powers": self.pair_powers,
             **prefixed("waveform", self.waveform.checkpoint()),
+            **({} if self.levels is None else prefixed("levels", self.levels.checkpoint())),
         }
 
     @classmethod
@@ -169,6 +196,7 @@ class HopMoments:
             line=RotationLine(*line) if line else None,
             waveform=Waveform.restored(unprefixed("waveform", arrays)),
             pair_powers=checked(arrays, "pair_powers", np.complex128, (None, None, 3)),
+            levels=HopLevels.restored(levels) if (levels := unprefixed("levels", arrays)) else None,
         )
 
 
@@ -191,18 +219,24 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     regressors = [x, np.ones((samples.shape[0], 1))]
     theta = None
     if plan.angle_column is not None:
-        theta = samples[:, n_states]
+        theta = samples[:, -1]
         steps = np.diff(theta[plan.preamble - 1 :])
         turned_rad = float(np.sum((steps + np.pi) % (2 * np.pi) - np.pi))
     elif plan.speed_rad_s is not None:
-        line = rotation_line(x, plan.rate_hz, plan.speed_rad_s, plan.speed_tolerance)
+        every = x if n_states == plan.columns.size else np.hstack([x, samples[:, n_states : plan.columns.size]])
+        line = rotation_line(every, plan.rate_hz, plan.speed_rad_s, plan.speed_tolerance)
         t_s = (np.arange(samples.shape[0]) - samples.shape[0] / 2) / plan.rate_hz
         theta = np.zeros_like(t_s) if line is None else line.angle(t_s)
     if theta is not None:
         regressors += [np.cos(theta)[:, None], np.sin(theta)[:, None]]
     a = np.hstack(regressors)
     segments = _segment_spectra(a, plan)
-    waveform = waveform_of(samples[plan.preamble :])
+    own = samples[plan.preamble :]
+    waveform = waveform_of(own if n_states == plan.columns.size else np.delete(own, plan.others, axis=1))
+    levels = None
+    if plan.levels is not None:
+        turned = None if theta is None or (line is None and plan.angle_column is None) else theta[plan.preamble :]
+        levels = hop_levels(plan.levels, own[:, : plan.columns.size], turned)
     # The mean leaks from zero frequency into the lowest bins; the rotation obeys v = jωx and stays.
     level_left = (waveform.mean[:n_states] - level) * segments[:, :, n_states, None]
     return HopMoments(
@@ -214,6 +248,7 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         line=line,
         waveform=waveform,
         pair_powers=pair_powers(segments[:, :, :n_states] - level_left, plan.frequencies_hz, plan.pairs),
+        levels=levels,
     )
 
 

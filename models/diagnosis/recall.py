@@ -121,7 +121,6 @@ class Recall:
             blocks.append((start_ns, len(samples[-1])))
             rows += len(samples[-1])
         if not samples:
-            width = len(self._plan.states) + (self._plan.angle_column is not None)
-            return None if piece.rows else (np.empty((0, width)), ())
+            return None if piece.rows else (np.empty((0, self._plan.width)), ())
         found = np.concatenate(samples)[piece.row : piece.row + piece.rows]
         return (found, tuple(blocks)) if digest_of(found) == piece.digest else None

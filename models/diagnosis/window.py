@@ -28,6 +28,7 @@ from models.diagnosis.moments import (
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
 from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
 from models.errors import CheckpointError
+from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 
 
@@ -162,6 +163,25 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         duration_s=len(hops) * plan.hop / plan.rate_hz,
         waveforms=tuple(hop.waveform for hop in hops),
         pair_powers=tuple(hop.pair_powers for hop in hops),
+    )
+
+
+def levels_of(plan: Plan, hops: tuple[HopMoments, ...]) -> WindowLevels:
+    """Vibration levels of the window that hops make.
+
+    Raises
+    ------
+    ValueError
+        If the plan holds none.
+    """
+    if plan.levels is None:
+        raise ValueError("no levels are planned")
+    rotation = rotation_of(plan, hops)
+    return window_levels(
+        plan.levels,
+        [hop.levels for hop in hops if hop.levels is not None],
+        rotation.hop_speed_rad_s,
+        phase_reference=rotation.source == "phase reference",
     )
 
 
@@ -322,7 +342,7 @@ class SlidingWindow:
         """
         if self._recall is not None:
             return dict(self._recall.arrays)
-        pending = np.concatenate(self._pending) if self._pending else np.empty((0, self._columns))
+        pending = np.concatenate(self._pending) if self._pending else np.empty((0, self.plan.width))
         block_ns = self._blocks[0][0] if self._blocks else 0
         start_ns = self._pending_start_ns if pending.size else 0  # that of what a gap has taken away is of no use
         last = Piece(start_ns, block_ns, self._row, pending.shape[0], digest_of(pending))
@@ -349,12 +369,12 @@ class SlidingWindow:
         if level.size not in (0, len(self.plan.states)):
             raise CheckpointError(f"level has {level.size} values, expected {len(self.plan.states)} or none")
         recall = Recall(self.plan, level, arrays)
-        if recall.pieces and not level.size:
+        if recall.pieces and level.size != len(self.plan.states):
             raise CheckpointError(
                 f"level has no values, expected {len(self.plan.states)} for {len(recall.pieces)} hops"
             )
         if "pending" in arrays:
-            pending = checked(arrays, "pending", np.float64, (recall.last.rows, self._columns))
+            pending = checked(arrays, "pending", np.float64, (recall.last.rows, self.plan.width))
             blocks = checked(arrays, "pending_blocks", np.int64, (None, 2))
             ring = [HopMoments.restored(unprefixed(f"hop_{number}", arrays)) for number in range(len(recall.pieces))]
             for hop in ring:
@@ -367,11 +387,6 @@ class SlidingWindow:
             self._recall = recall
         self._level = level if level.size else None
 
-    @property
-    def _columns(self) -> int:
-        """Columns of the samples: states and, if there is one, the shaft angle."""
-        return len(self.plan.states) + (self.plan.angle_column is not None)
-
     def _check_fits(self, hop: HopMoments) -> None:
         """Raise CheckpointError for a hop of other channels, lags or frequencies."""
         plan = self.plan
@@ -383,6 +398,10 @@ class SlidingWindow:
                 f"the hop of start_ns {hop.start_ns} has moments of shape {hop.products.shape} and "
                 f"{hop.segments.shape}, expected {products} and {segments}: it is that of other channels or settings"
             )
+
+    def levels(self) -> WindowLevels | None:
+        """Levels of the hops that are there, however few; None without any."""
+        return levels_of(self.plan, tuple(self._hops)) if self._hops else None
 
     def statistics(self, hops: int | None = None) -> WindowStatistics | None:
         """Statistics of the window, or of its latest hops, or None while there are not so many.

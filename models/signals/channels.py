@@ -55,6 +55,9 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
     (Quantity.SHAFT_ANGLE, "shaft", "rotation"): "theta",
 }
 
+_LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
+_PLACE = r"^[A-Za-z0-9][A-Za-z0-9 _.:/+-]*$"
+
 ACCELERATIONS: tuple[str, ...] = tuple(
     name for (quantity, _, _), name in _STATE_NAMES.items() if quantity is Quantity.ACCELERATION
 )
@@ -73,8 +76,8 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     )
     # What is measured, where, and in which plane.
     quantity: Quantity
-    location: Literal["bearing", "disc", "shaft"]
-    direction: Literal["y", "z", "rotation"]
+    location: str = Field(min_length=1, max_length=32, pattern=_PLACE)
+    direction: str = Field(min_length=1, max_length=32, pattern=_PLACE)
     # One of `UNIT_TO_SI` for the quantity.
     unit: str = Field(
         description="; ".join(f"{', '.join(units)} for {quantity}" for quantity, units in UNIT_TO_SI.items())
@@ -94,10 +97,14 @@ class Channel(BaseModel, extra="forbid", frozen=True):
                 f"channel {self.name}: unit {self.unit!r} is not one of {', '.join(units)} for {self.quantity}"
                 f"{did_you_mean(self.unit, units)}"
             )
-        if (self.quantity, self.location, self.direction) not in _STATE_NAMES:
+        if (self.quantity, self.location, self.direction) in _STATE_NAMES:
+            return self
+        hint = did_you_mean(self.location, _LOCATIONS) or did_you_mean(self.direction, _DIRECTIONS)
+        if self.quantity is Quantity.SHAFT_ANGLE or self.location in _LOCATIONS or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
-                "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z"
+                "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z; "
+                f"at places with other names (DE, NDE, casing, …) only levels are watched{hint}"
             )
         return self
 
@@ -113,12 +120,14 @@ _STATE = re.compile(r"(?<![\w-])(?:[yz][12](?:_d?dot)?|(?:psi|phi)(?:_dot)?|thet
 def state_name(channel: Channel) -> str:
     """Name of the state variable that a channel measures (``y1`` … ``phi_dot``, ``theta``).
 
+    One that is at none of the model's places is known by its own name, after an ``@``.
+
     Examples
     --------
     >>> state_name(Channel(name="XE-1", quantity="velocity", location="bearing", direction="y", unit="mm/s"))
     'y1_dot'
     """
-    return _STATE_NAMES[channel.quantity, channel.location, channel.direction]
+    return _STATE_NAMES.get((channel.quantity, channel.location, channel.direction), f"@{channel.name}")
 
 
 def with_channel_names(text: str, channels: Iterable[Channel]) -> str:

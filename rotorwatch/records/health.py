@@ -10,6 +10,7 @@ from pydantic import BaseModel, Field
 
 from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Reason, Site
+from rotorwatch.records.levels import ChannelLevels
 from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
 
 __all__ = ["MEASURES", "Health", "HealthState", "Measure", "Quality", "Report", "State", "StreamStatus"]
@@ -27,6 +28,7 @@ class HealthState(StrEnum):
     UNCHANGED = "unchanged"
     NO_DATA = "no-data"
     NOT_EVALUABLE = "not-evaluable"
+    WATCHING = "watching"
 
     @property
     def alarmed(self) -> bool:
@@ -91,6 +93,7 @@ class Report(BaseModel):
     shapes: tuple[Shape, ...] = Field(
         default=(), description="where no equation can be evaluated: whether each channel is as it was", examples=[()]
     )
+    levels: tuple[ChannelLevels, ...] = Field(default=(), description="vibration levels, channel by channel")
     reason: Reason = ""
     bundle: BundleIdentity
     machine_hash: MachineHash
@@ -171,7 +174,8 @@ class Health(BaseModel):
     state: HealthState = Field(
         description="warming, healthy, unchanged (no equation can be evaluated, but every channel is as it was), "
         "alert, danger, outside-model, data-health (a sensor is at fault), no-data (silence, and no alarm on the "
-        "machine is raised; see `stream.silent`) or not-evaluable",
+        "machine is raised; see `stream.silent`), not-evaluable or watching (only vibration levels are watched: the "
+        "machine is neither known nor commissioned)",
         examples=["alert"],
     )
     reason: str = Field(

@@ -51,7 +51,7 @@ class ReadingBucket(BaseModel):
 
     model_config = JSON
 
-    name: str = Field(description="which parameter or equation", examples=["k_by"])
+    name: str = Field(description="which parameter, equation or level", examples=["k_by"])
     start_ns: int = Field(description="windows that end from here on", examples=[EXAMPLE_NS - 60_000_000_000])
     length_ns: int = Field(description="for so long", examples=[60_000_000_000])
     count: int = Field(description="how many readings", examples=[12])
@@ -69,7 +69,8 @@ class ReadingList(BaseModel):
     model_config = JSON
 
     quantity: str = Field(
-        description="parameter (relative change), equation (mean squared difference) or a measure of the window: "
+        description="parameter (relative change), equation (mean squared difference), level (of a channel, in the unit "
+        "that reports say) or a measure of the window: "
         + ", ".join(f"{name} ({Report.model_fields[field].description})" for name, (field, _) in MEASURES.items()),
         examples=["parameter"],
     )

@@ -33,8 +33,11 @@ class Channel(BaseModel):
     quantity: str = Field(
         description="displacement, velocity, acceleration, tilt, tilt_rate or shaft_angle", examples=["displacement"]
     )
-    location: str = Field(description="bearing, disc or shaft", examples=["bearing"])
-    direction: str = Field(description="y, z or rotation", examples=["y"])
+    location: str = Field(
+        description="bearing, disc or shaft; or a place with another name, of which only levels are watched",
+        examples=["bearing"],
+    )
+    direction: str = Field(description="y, z or rotation; or another one", examples=["y"])
     unit: str = Field(description="unit of the samples", examples=["um"])
 
 

@@ -1,12 +1,13 @@
 """What the HTTP API needs to know about the service and its machines, and the arguments its routes share."""
 
+import re
 from collections.abc import Sequence
 from typing import Annotated, Protocol
 
 from fastapi import HTTPException, Path, Query
 from pydantic import AfterValidator
 
-from models.alarm_names import ALARMS
+from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.machine import MachineFile
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
@@ -47,12 +48,17 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
 def _known_alarm(name: str) -> str:
-    if name not in ALARMS:
-        raise ValueError(f"no alarm {name[:64]!r}; there are: {', '.join(ALARMS)}")
+    if not is_alarm(name):
+        raise ValueError(f"no alarm {name[:64]!r}; there are: {', '.join(ALARMS)} and {LEVEL}CHANNEL for each channel")
     return name
 
 
-AlarmName = Annotated[str, AfterValidator(_known_alarm), Query(json_schema_extra={"enum": list(ALARMS)})]
+_NAMES = "|".join(map(re.escape, ALARMS))
+AlarmName = Annotated[
+    str,
+    AfterValidator(_known_alarm),
+    Query(json_schema_extra={"pattern": f"^({_NAMES}|{LEVEL}[A-Za-z0-9_.:-]{{1,64}})$"}, examples=["k_by"]),
+]
 
 
 class MachineView(Protocol):

@@ -144,11 +144,14 @@ def trend(
             "shown; without any, those of the shipped machine with the recorded site and name.",
         ),
     ] = None,
+    levels: Annotated[
+        bool, typer.Option("--levels", help="Vibration levels and their limits, also where parameters were read.")
+    ] = False,
 ) -> "Paint":
-    """Every parameter's change with its 95 % interval over time; state, alarms and speed."""
+    """Every parameter's change with its 95 % interval over time, or vibration levels; state, alarms and speed."""
     from service.analysis.plots.request import trend as read  # noqa: PLC0415
 
-    return read(picture.recorded(reports=True), machine)
+    return read(picture.recorded(reports=True), machine, levels=levels)
 
 
 @_kind

@@ -26,12 +26,12 @@ from models.diagnosis.verdict.calibration import agreements, month_thresholds
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
-from models.errors import BundleError, CheckpointError, EstimationError, UnexplainedError
+from models.errors import CheckpointError, EstimationError, UnexplainedError
 from models.machine import Machine, MachineFile
 from models.physics.rotor import PARAMETERS
 from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
-from rotorwatch.records.windows import Equation, Opinion, Shape
+from rotorwatch.records.windows import Equation, Opinion, Parameter, Shape
 
 __all__ = ["Evaluation", "WindowEvaluator", "evaluator_for"]
 
@@ -80,6 +80,18 @@ class Evaluation:
         if "not changed" in states and "changed" not in states:
             return HealthState.UNCHANGED
         return HealthState.NOT_EVALUABLE
+
+    @property
+    def readings(self) -> tuple[Parameter, ...]:
+        """What the deciding diagnostician reads of the window; nothing that it cannot explain."""
+        deciding, vector = self.deciding, self.deciding.unbalance
+        if deciding.unexplained:
+            return tuple(no_reading(one.name, one.by, deciding.unexplained) for one in deciding.parameters)
+        foreign = "" if vector is None else vector.foreign
+        return tuple(
+            no_reading(one.name, one.by, foreign) if foreign and one.vector is not None else one
+            for one in deciding.parameters
+        )
 
     @property
     def why_nothing(self) -> str:
@@ -148,8 +160,41 @@ def evaluator_for(installed: Installed) -> WindowEvaluator:
         identified = None if commissioned is None else commissioned.identified
         return KnownMachineEvaluator(known, installed.bundle, identified)
     if commissioned is None:
-        raise BundleError(f"{installed.machine.site}/{installed.machine.name}: neither known nor commissioned")
+        return NoEvaluator()
     return BaselineEvaluator(installed.machine, commissioned)
+
+
+class NoEvaluator:
+    """Of a machine of which nothing is known: its levels are watched, and nothing is diagnosed."""
+
+    @property
+    def by(self) -> str:
+        """Nobody."""
+        return "nobody"
+
+    @property
+    def takes_short(self) -> bool:
+        """There is nothing to evaluate."""
+        return False
+
+    @property
+    def needs_lags(self) -> bool:
+        """There is nothing to evaluate."""
+        return False
+
+    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+        """Say that there is nothing to evaluate, see `WindowEvaluator`."""
+        _ = window, short
+        raise EstimationError("only vibration levels are watched: the machine is neither known nor commissioned")
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Nothing."""
+        return {}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
+        if arrays:
+            raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
 
 
 class KnownMachineEvaluator:

@@ -21,8 +21,8 @@ from models.arrivals import Arrivals, Arrived, Senders
 from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.commissioning.commissioned import Installed
 from models.diagnosis.moments import plan_for
-from models.diagnosis.readings import no_reading
 from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.verdict.calibration import detectable_changes
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest
 from models.diagnosis.verdict.stretch import stretch_of
@@ -38,6 +38,7 @@ from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
 from service.monitor.alarms.operation import OperatorAction
 from service.monitor.evaluation import evaluator_for
+from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
 
@@ -50,15 +51,8 @@ _NEWEST_SAMPLES = 20_000
 class MachineMonitor:
     """Monitors one machine.
 
-    Parameters
-    ----------
-    installed : Installed
-        The machine file, and what was trained and commissioned for the machine.
-
     Attributes
     ----------
-    identity : Identity
-        Who speaks in the reports.
     used : bool
         Whether the latest message was itself used at once, and not one that waited for it.
     """
@@ -68,7 +62,9 @@ class MachineMonitor:
         self.identity = identity_of(installed)
         self._evaluator = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
-        self._plan = plan_for(machine, lagged=self._evaluator.needs_lags)
+        self._watching = installed.watching
+        self._plan = plan = plan_for(machine, lagged=self._evaluator.needs_lags, levels=True)
+        self._levels = LevelWatch(plan, machine, installed)
         self._senders = Senders()
         self._arrivals = Arrivals(machine.ingest.reorder_blocks)
         self._due: deque[Arrived] = deque()
@@ -251,15 +247,7 @@ class MachineMonitor:
         return self._window.feed(self._plan.to_si(block.samples), block.start_ns)
 
     def fault(self, what: str, time_ns: int) -> tuple[AlarmEvent, ...]:
-        """Raise the alarm on the monitor itself; it clears once windows are evaluated again.
-
-        Parameters
-        ----------
-        what : str
-            What is wrong.
-        time_ns : int
-            Data time that has been reached.
-        """
+        """Raise the alarm on the monitor itself, at a data time; it clears once windows are evaluated again."""
         self._data_path.fault(what, time_ns)
         return self._alarms.take()
 
@@ -319,6 +307,7 @@ class MachineMonitor:
             **prefixed("window", self._window.checkpoint(whole=whole)),
             **prefixed("test", self._test.state.checkpoint()),
             **prefixed("evaluator", self._evaluator.checkpoint()),
+            **prefixed("levels", self._levels.first.checkpoint()),
             "calm": np.array([self._calm.value]),
             "end_ns": np.array([] if self._end_ns is None else [self._end_ns], dtype=np.int64),
         }
@@ -343,6 +332,7 @@ class MachineMonitor:
         self._gate.restore(unprefixed("gate", arrays))
         self._window.restore(unprefixed("window", arrays))
         self._evaluator.restore(unprefixed("evaluator", arrays))
+        self._levels.first.restore(unprefixed("levels", arrays))
         self._test.state = test
         self._end_ns, self._calm = end_ns, HealthState(*calm)
         self._arrivals.resume(self._gate.courses)
@@ -417,14 +407,17 @@ class MachineMonitor:
     def _evaluated(self, end_ns: int) -> Report:
         self._data_path.hop(end_ns)
         self._data_path.conflict(self._senders.conflict, end_ns)
+        self._levels.take(self._window)
         statistics = self._statistics = self._window.statistics()
         if statistics is None:
+            self._levels.tell(self._alarms, end_ns)
             return Report(**self._window_now(end_ns, end_ns, self._state(HealthState.WARMING)))
         speed_rad_s = statistics.speed_rad_s
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
         self._data_path.sensors(findings, statistics)
         if findings:
+            self._levels.tell(self._alarms, end_ns, faulty=implicated(findings))
             state = self._state(HealthState.DATA_HEALTH)
             return Report(
                 **self._window_now(statistics.start_ns, end_ns, state),
@@ -436,7 +429,8 @@ class MachineMonitor:
         try:
             evaluation = self._evaluator.evaluate(statistics, present)
         except EstimationError as error:
-            state = self._state(HealthState.NOT_EVALUABLE)
+            self._levels.tell(self._alarms, end_ns)
+            state = self._state(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE)
             return Report(**self._window_now(statistics.start_ns, end_ns, state), reason=str(error))
         evaluation = evaluation.named(self.machine.sensors)
         looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
@@ -445,14 +439,8 @@ class MachineMonitor:
         verdict = self._test.update(looks)
         changed = [shape.text for shape in evaluation.shapes if shape.verdict == "changed"]
         self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
-        vector, parameters = evaluation.deciding.unbalance, evaluation.deciding.parameters
-        if vector is not None and vector.foreign:
-            parameters = tuple(
-                no_reading(one.name, one.by, vector.foreign) if one.vector is not None else one for one in parameters
-            )
+        self._levels.tell(self._alarms, end_ns, explained=bool(verdict.changed))
         unexplained = evaluation.deciding.unexplained
-        if unexplained:
-            parameters = tuple(no_reading(one.name, one.by, unexplained) for one in parameters)
         # Where the window straddles a change, what is explained is in the verdict's current readings.
         reason = "" if verdict.current else unexplained
         if not unexplained and not evaluation.deciding.evaluable:
@@ -461,11 +449,14 @@ class MachineMonitor:
             evidence = Evidence(start_ns=statistics.start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
         outside = verdict.outside_model
-        state = self._state(evaluation.calm(outside=outside))
+        calm = evaluation.calm(outside=outside)
+        if not self._plan.states and self._levels.reference is not None:
+            calm, reason = HealthState.UNCHANGED, ""
+        state = self._state(calm)
         return Report(
             **self._window_now(statistics.start_ns, end_ns, state),
             speed_rad_s=evaluation.speed_rad_s,
-            parameters=parameters,
+            parameters=evaluation.readings,
             equations=evaluation.equations,
             opinions=evaluation.opinions,
             misfit_z=evaluation.deciding.misfit_z,
@@ -482,8 +473,14 @@ class MachineMonitor:
 
     def _window_now(self, start_ns: int, end_ns: int, state: HealthState) -> WindowHeading:
         """First fields of a report."""
-        filled = self._window.filled
-        return {**self.identity, "start_ns": start_ns, "end_ns": end_ns, "state": state, "filled": filled}
+        return {
+            **self.identity,
+            "start_ns": start_ns,
+            "end_ns": end_ns,
+            "state": state,
+            "filled": self._window.filled,
+            "levels": self._levels.latest,
+        }
 
     def _state(self, otherwise: HealthState) -> HealthState:
         """A raised alarm outranks warming and not-evaluable: missing data clears nothing."""

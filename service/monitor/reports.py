@@ -9,6 +9,7 @@ from models.commissioning.commissioned import Installed
 from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.health import HealthState, Quality, Report
+from rotorwatch.records.levels import ChannelLevels
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 
 __all__ = [
@@ -40,6 +41,7 @@ class WindowHeading(Identity):
     end_ns: int
     state: HealthState
     filled: float
+    levels: tuple[ChannelLevels, ...]
 
 
 def identity_of(installed: Installed) -> Identity:

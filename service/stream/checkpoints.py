@@ -49,6 +49,11 @@ def stored_readings(windows: Iterable[Report]) -> tuple[StoredReading, ...]:
         ]
         points += [("parameter", one.name, one.relative_change, one.standard_error) for one in window.parameters]
         points += [("equation", one.equation, one.msd, None) for one in window.equations]
+        points += [
+            ("level", f"{one.channel}:{name}", value, None)
+            for one in window.levels
+            for name, value in one.values().items()
+        ]
         found += [
             StoredReading(window.end_ns, quantity, name, value, finite(error))
             for quantity, name, value, error in points

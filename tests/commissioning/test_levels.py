@@ -96,16 +96,17 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
     fewer = NOTHING.model_copy(update={"sensors": NOTHING.sensors[1:]})
     with pytest.raises(BundleError, match=r"sensors in the machine file of demo/lab differ.*commission"):
         load_commissioned(tmp_path, fewer)
-    with pytest.raises(BundleError, match="must be commissioned from healthy recordings first"):
-        install(NOTHING, None)
+    with pytest.raises(BundleError, match=r"is not a commissioned bundle.*or name no bundle"):
+        install(NOTHING, tmp_path / "nowhere")
+    assert install(NOTHING, None).watching
     fields = json.loads(made.model_dump_json())
     fields["baselines"][0]["baseline"]["covariance"][0][0] = "NaN"
     path.write_text(json.dumps(fields))
     with pytest.raises(BundleError, match=r"baselines\.0\.baseline\.covariance"):
         load_commissioned(tmp_path, NOTHING)
-    del fields["baselines"], fields["shape"]
+    del fields["baselines"], fields["shape"], fields["levels"]
     path.write_text(json.dumps(fields))
-    with pytest.raises(BundleError, match="neither a baseline nor a healthy shape"):
+    with pytest.raises(BundleError, match="neither a baseline, nor a healthy shape, nor levels"):
         load_commissioned(tmp_path, NOTHING)
 
 

@@ -441,6 +441,6 @@ def test_a_gap_and_a_silence_name_the_time_without_data() -> None:
 
 
 def test_a_reading_that_is_no_number_is_left_out_and_holds_nothing_up() -> None:
-    said = {"speed_rad_s": float("nan"), "misfit_z": 2.0, "parameters": (), "equations": ()}
+    said = {"speed_rad_s": float("nan"), "misfit_z": 2.0, "parameters": (), "equations": (), "levels": ()}
     window = Report.model_validate(example(Report) | said)
     assert [one.quantity for one in stored_readings([window])] == ["misfit"]

@@ -15,6 +15,7 @@ from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
 from service.analysis.plots.correlation import correlations_of, latest_window
 from service.analysis.plots.excerpts import RecordedStream
@@ -367,5 +368,15 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
 
 def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
     source = RecordingSource([faulty])
-    with pytest.raises(RotorwatchError, match=r"no parameter was read .*: 5 reports, while the window was filling"):
-        read_trend(source, LAB.keys, None, source.start_ns, START_NS + 30 * S)
+    filling = read_trend(source, LAB.keys, None, source.start_ns, START_NS + 30 * S)
+    assert (filling.parameters, len(filling.levels)) == ((), 8)
+    bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
+    with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):
+        trend_of(bare, (), None, "as recorded")
+
+
+def test_levels_are_shown_instead_of_parameters_where_they_are_asked_for(faulty: Path) -> None:
+    source = RecordingSource([faulty])
+    found = read_trend(source, LAB.keys, None, source.start_ns, source.end_ns + 1, levels=True)
+    assert (found.parameters, found.levels[0].title) == ((), "y1   um pp")
+    assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in found.levels)

@@ -91,7 +91,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffi
         (("spectrum", "--to-hz", "1"), "--to-hz is 1, expected at least four lines"),
         (("orbit", "--channel", "y1"), "No such option: --channel"),
         (("trend", "--at", "5"), "No such option: --at"),
-        (("trend", "--to", "30"), "no parameter was read in this stretch of time"),
+        (("trend", "--to", "0.1"), "neither parameter nor level was read in this stretch of time"),
         (("correlation", "--at", "30"), "a window is 60 s, usable data are 30 s"),
         (("correlation", "--machine", "lab"), "name a bundle that has networks, as --machine FILE@BUNDLE"),
         (("correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),

@@ -115,9 +115,9 @@ def recorded(
     return Recorded(source, keys, from_ns, to_ns)
 
 
-def trend(data: Recorded, machine: str | None) -> Paint:
-    """Parameters over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
-    found = read_trend(data.source, data.keys, machine, data.from_ns, data.to_ns)
+def trend(data: Recorded, machine: str | None, *, levels: bool) -> Paint:
+    """Parameters or levels over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
+    found = read_trend(data.source, data.keys, machine, data.from_ns, data.to_ns, levels=levels)
     return lambda look: paint_trend(found, look)
 
 

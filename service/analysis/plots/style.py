@@ -47,6 +47,7 @@ STATE_COLOURS = {
     "outside-model": "#CC79A7",
     "not-evaluable": "#999999",
     "unchanged": "#56B4E9",
+    "watching": "#0072B2",
     "data-health": "#882255",
     "warming": "#dddddd",
     "no-data": "#000000",

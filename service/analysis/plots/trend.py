@@ -1,7 +1,7 @@
 """Trends: what the monitor read of every parameter over time, and what it said."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,9 @@ from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["SHOWN", "ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of"]
+__all__ = [
+    "SHOWN", "LevelTrend", "ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of",
+]  # fmt: skip
 
 
 SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
@@ -43,6 +45,24 @@ class ParameterTrend:
     change: FloatArray
     low: FloatArray
     high: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class LevelTrend:
+    """Overall level of one channel, window by window; nan where there was none.
+
+    Attributes
+    ----------
+    title : str
+        Channel, what of it, and unit.
+    level, alert, danger : ndarray, shape (n_reports,)
+        In that unit; the limits that held, nan without.
+    """
+
+    title: str
+    level: FloatArray
+    alert: FloatArray
+    danger: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +88,7 @@ class Trend:
     states: tuple[HealthState, ...]
     measures: Mapping[str, FloatArray]
     parameters: tuple[ParameterTrend, ...]
+    levels: tuple[LevelTrend, ...]
     alarms: tuple[AlarmEventData, ...]
     limits: AlarmSettings | None
     origin: str
@@ -97,7 +118,9 @@ def trend_machine(source: RecordingSource, wanted: str | None) -> MachineKeys:
     )
 
 
-def read_trend(source: RecordingSource, keys: MachineKeys, machine: str | None, from_ns: int, to_ns: int) -> Trend:
+def read_trend(
+    source: RecordingSource, keys: MachineKeys, machine: str | None, from_ns: int, to_ns: int, *, levels: bool = False
+) -> Trend:
     """The recorded reports; or, without any or with another machine file, those of an offline replay.
 
     Parameters
@@ -108,24 +131,26 @@ def read_trend(source: RecordingSource, keys: MachineKeys, machine: str | None, 
         ``FILE`` or ``FILE@BUNDLE``, to be evaluated anew with it.
     from_ns, to_ns : int
         Only data from `from_ns` up to, and without, `to_ns`.
+    levels : bool
+        Vibration levels, also where parameters were read.
 
     Raises
     ------
     RotorwatchError
-        If there are no reports and none can be computed, or no parameter was read in any.
+        If there are no reports and none can be computed, or nothing was read in any.
     """
     if machine is None and keys.report in source.keys:
         reports = list(_recorded_reports(source, keys, from_ns, to_ns))
         if reports:
             events = recorded_alarms(source, keys, from_ns, to_ns)
-            return trend_of(reports, events, _limits(keys, reports[-1]), "as recorded")
+            return trend_of(reports, events, _limits(keys, reports[-1]), "as recorded", levels=levels)
     if keys.stream not in source.keys:
         place = ", ".join(path.name for path in source.paths)
         raise RotorwatchError(
             f"{place}: no reports of {keys.site}/{keys.machine} in this stretch of time, and no sample blocks to "
             "compute them from"
         )
-    return _computed(source, keys, choose_machine(keys, machine), from_ns, to_ns)
+    return _computed(source, keys, choose_machine(keys, machine), from_ns, to_ns, levels)
 
 
 def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> tuple[AlarmEventData, ...]:
@@ -142,7 +167,12 @@ def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to
 
 
 def trend_of(
-    reports: list[Report], alarms: tuple[AlarmEventData, ...], limits: AlarmSettings | None, origin: str
+    reports: list[Report],
+    alarms: tuple[AlarmEventData, ...],
+    limits: AlarmSettings | None,
+    origin: str,
+    *,
+    levels: bool = False,
 ) -> Trend:
     """Reports as series, in the order in which they were recorded.
 
@@ -152,7 +182,7 @@ def trend_of(
     Raises
     ------
     RotorwatchError
-        If no parameter was read in any report.
+        If nothing was read in any report.
     """
     ordered: list[Report] = []
     for report in {report.model_dump_json(): report for report in reports}.values():  # repetitions left out
@@ -166,10 +196,12 @@ def trend_of(
         for reading in shown:
             if reading.relative_change is not None and reading.interval_95 is not None and reading.name in series:
                 series[reading.name][:, number] = reading.relative_change, *reading.interval_95
-    if not ordered or all(np.isnan(values).all() for values in series.values()):
+    read = {} if levels else {name: values for name, values in series.items() if not np.isnan(values).all()}
+    level_trends = () if read else tuple(_level_trends(ordered))
+    if not read and not level_trends:
         reasons = dict.fromkeys(report.reason for report in ordered if report.reason)
         why = "; ".join(reasons) or f"{len(ordered)} reports, while the window was filling"
-        raise RotorwatchError(f"no parameter was read in this stretch of time: {why}")
+        raise RotorwatchError(f"neither parameter nor level was read in this stretch of time: {why}")
     return Trend(
         name=f"{ordered[-1].site}/{ordered[-1].machine}",
         end_ns=np.array([report.end_ns for report in ordered], dtype=np.int64),
@@ -178,15 +210,31 @@ def trend_of(
             name: np.array([getattr(report, field) for report in ordered], dtype=np.float64)  # None becomes nan
             for name, (field, _) in MEASURES.items()
         },
-        parameters=tuple(
-            ParameterTrend(name, PARAMETER_TEXT[name], *values)
-            for name, values in series.items()
-            if not np.isnan(values).all()
-        ),
+        parameters=tuple(ParameterTrend(name, PARAMETER_TEXT[name], *values) for name, values in read.items()),
+        levels=level_trends,
         alarms=alarms,
         limits=limits,
         origin=origin,
     )
+
+
+def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
+    """Velocity of accelerometers where there is a limit for it; otherwise the overall level of each channel."""
+    by_report = [{one.channel: one for one in report.levels} for report in reports]
+    for channel in dict.fromkeys(name for levels in by_report for name in levels):
+        there = [levels.get(channel) for levels in by_report]
+        known = [one for one in there if one is not None]
+        as_velocity = any(one.velocity is not None and one.limit("velocity") is not None for one in known)
+        measure = "velocity" if as_velocity else "overall"
+        detection = "pp" if known[-1].detection == "peak to peak" else "rms"
+        unit = "velocity, mm/s rms" if as_velocity else f"{known[-1].unit} {detection}"
+        limits = [None if one is None else one.limit(measure) for one in there]
+        yield LevelTrend(
+            f"{channel}   {unit}",
+            np.array([None if one is None else getattr(one, measure) for one in there], dtype=np.float64),
+            np.array([None if one is None else one.alert for one in limits], dtype=np.float64),
+            np.array([None if one is None else one.danger for one in limits], dtype=np.float64),
+        )
 
 
 def _recorded_reports(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> Iterator[Report]:
@@ -212,7 +260,9 @@ def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
     return machine.alarms if machine_hash(machine) == report.machine_hash else None
 
 
-def _computed(source: RecordingSource, keys: MachineKeys, installed: Installed, from_ns: int, to_ns: int) -> Trend:
+def _computed(
+    source: RecordingSource, keys: MachineKeys, installed: Installed, from_ns: int, to_ns: int, levels: bool
+) -> Trend:
     """Reports of an offline replay, the same to the last bit as those of ``rotorwatch replay``."""
     machine = installed.machine
     reports: list[Report] = []
@@ -230,4 +280,4 @@ def _computed(source: RecordingSource, keys: MachineKeys, installed: Installed, 
     if summary.blocks == 0:
         raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")
     origin = f"computed with machine file {summary.machine_hash}"
-    return trend_of(reports, tuple(alarms), machine.alarms, origin)
+    return trend_of(reports, tuple(alarms), machine.alarms, origin, levels=levels)

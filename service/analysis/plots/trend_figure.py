@@ -27,7 +27,7 @@ from service.analysis.plots.style import (
     stretch_text,
     time_axis,
 )
-from service.analysis.plots.trend import ParameterTrend, Trend
+from service.analysis.plots.trend import LevelTrend, ParameterTrend, Trend
 
 __all__ = ["paint_trend"]
 
@@ -39,19 +39,23 @@ _LEAST_PERCENT = 5.0
 def paint_trend(trend: Trend, look: Look) -> Figure:
     """Small multiples over one time axis."""
     count = len(trend.parameters)
-    figure = Figure(figsize=look.size_in or (9.5, 1.9 + 1.15 * (count + 0.8 * len(MEASURES))), layout="constrained")
+    measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]
+    small = len(trend.levels) + len(measures)
+    figure = Figure(figsize=look.size_in or (9.5, 1.9 + 1.15 * (count + 0.8 * small)), layout="constrained")
     panels = figure.subplots(
-        1 + count + len(MEASURES),
+        1 + count + small,
         1,
         sharex=True,
         squeeze=False,
-        gridspec_kw={"height_ratios": [0.16, *[1.0] * count, *[0.75] * len(MEASURES)]},
+        gridspec_kw={"height_ratios": [0.16, *[1.0] * count, *[0.75] * small]},
     )[:, 0]
     step_ns = int(np.median(np.diff(trend.end_ns))) if trend.end_ns.size > 1 else 10**9
     _states(panels[0], trend, step_ns)
     for axes, parameter in zip(panels[1:], trend.parameters, strict=False):
         _parameter(axes, parameter, trend, step_ns)
-    for axes, name in zip(panels[1 + count :], MEASURES, strict=True):
+    for axes, level in zip(panels[1 + count :], trend.levels, strict=False):
+        _level(axes, level, trend, step_ns)
+    for axes, name in zip(panels[1 + count + len(trend.levels) :], measures, strict=True):
         _measure(axes, name, trend, step_ns)
     for axes in panels[1:]:
         alarm_lines(axes, trend.alarms)
@@ -65,7 +69,7 @@ def paint_trend(trend: Trend, look: Look) -> Figure:
     heading(
         figure,
         look,
-        f"{trend.name}: changes from nominal",
+        f"{trend.name}: changes from nominal" if trend.parameters else f"{trend.name}: vibration levels",
         (
             stretch_text(int(trend.end_ns[0]), int(trend.end_ns[-1])),
             f"{np.median(speeds):.0f} rpm" if speeds.size else "",
@@ -76,10 +80,13 @@ def paint_trend(trend: Trend, look: Look) -> Figure:
 
 
 def _legend(trend: Trend) -> list[Patch | Line2D]:
-    handles: list[Patch | Line2D] = [Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval")]
-    if trend.limits is not None:
-        limits = trend.limits
-        near = any(_danger_near(parameter, limits) for parameter in trend.parameters)
+    handles: list[Patch | Line2D] = []
+    if trend.parameters:
+        handles.append(Patch(color=COLOURS[0], alpha=0.28, linewidth=0, label="95 % interval"))
+    limits = trend.limits
+    near = any(np.isfinite(level.danger).any() for level in trend.levels)
+    if limits is not None or near:
+        near |= limits is not None and any(_danger_near(parameter, limits) for parameter in trend.parameters)
         for severity in ("alert", "danger") if near else ("alert",):
             colour = SEVERITY_COLOURS[severity]
             handles.append(Line2D([], [], color=colour, linewidth=0.9, linestyle=_DASHES, label=f"{severity} limit"))
@@ -169,6 +176,18 @@ def _limits(axes: Axes, parameter: ParameterTrend, alarms: AlarmSettings | None)
         for sign in (-1, 1):
             axes.axhline(sign * value, color=SEVERITY_COLOURS[severity], linewidth=0.9, linestyle=_DASHES)
     return drawn[-1][0]
+
+
+def _level(axes: Axes, level: LevelTrend, trend: Trend, step_ns: int) -> None:
+    """A level and the limits that held, those far above it left out of the picture."""
+    time, values, alert, danger = _with_gaps(trend.end_ns, step_ns, level.level, level.alert, level.danger)
+    axes.plot(time, values, color=COLOURS[0], linewidth=1.2)
+    for limit, severity in ((alert, "alert"), (danger, "danger")):
+        axes.plot(time, limit, color=SEVERITY_COLOURS[severity], linewidth=0.9, linestyle=_DASHES)
+    axes.set_title(level.title)
+    known = values[np.isfinite(values)]
+    if known.size:
+        axes.set_ylim(0, 1.6 * float(known.max()) or 1.0)
 
 
 def _measure(axes: Axes, name: str, trend: Trend, step_ns: int) -> None:

@@ -29,7 +29,7 @@ from service.api.views import (
 __all__ = ["add_history_routes"]
 
 _LARGEST = 2**63 - 1
-_QUANTITIES = ("parameter", "equation", *MEASURES)
+_QUANTITIES = ("parameter", "equation", "level", *MEASURES)
 
 _After = Annotated[
     int | None,
@@ -49,13 +49,13 @@ _Quantity = Annotated[
     AfterValidator(_known_quantity),
     Query(description="what the windows are read for", json_schema_extra={"enum": list(_QUANTITIES)}),
 ]
-_ReadingName = Annotated[str, Query(pattern="^[A-Za-z0-9_.-]{1,64}$")]
+_ReadingName = Annotated[str, Query(pattern="^[A-Za-z0-9_.:-]{1,80}$")]
 _Names = Annotated[
     list[_ReadingName],
     Query(
         max_length=64,
-        description="which parameter or equation; may be given several times with `points`, where all is the default. "
-        "Not needed for the measures of a window",
+        description="which parameter, equation or level (CHANNEL:MEASURE); may be given several times with `points`, "
+        "where all is the default. Not needed for the measures of a window",
     ),
 ]
 _Points = Annotated[

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 from fastapi import Body, FastAPI, Header, HTTPException, Path, Query, Request, Response
 
-from models.alarm_names import ALARMS
+from models.alarm_names import ALARMS, LEVEL
 from models.errors import RotorwatchError
 from rotorwatch.records.alarms import Alarm, AlarmState, AlarmStates
 from rotorwatch.records.example import example
@@ -196,8 +196,9 @@ def _present(view: MachineView, name: str) -> Alarm:
     HTTPException
         404 if there is no such alarm.
     """
-    if name not in ALARMS:
-        raise HTTPException(404, f"no alarm {name[:64]}; there are: {', '.join(ALARMS)}")
+    levels = [f"{LEVEL}{channel.name}" for channel in view.machine.sensors if channel.quantity != "shaft_angle"]
+    if name not in ALARMS and name not in levels:
+        raise HTTPException(404, f"no alarm {name[:80]}; there are: {', '.join((*ALARMS, *levels))}")
     for one in view.alarms(include_normal=True).alarms:
         if one.name == name:
             return one

@@ -15,7 +15,7 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #1c2530 }
 h2 { margin: 2rem 0 .3rem } h2 span { font-size: 1rem; padding: .1rem .6rem; border-radius: 1rem; color: #fff }
 .healthy { background: #23804b } .warming, .not-evaluable { background: #66727f } .alert { background: #b26a00 }
-.unchanged { background: #3d7f6a } .data-health { background: #7a3e9d }
+.unchanged, .watching { background: #3d7f6a } .data-health { background: #7a3e9d }
 .danger { background: #b3261e } .outside-model { background: #8a5a00 } .no-data { background: #7a3e9d }
 td span { padding: 0 .5rem; border-radius: .7rem; color: #fff; font-weight: normal }
 table { border-collapse: collapse; margin: .6rem 0 }

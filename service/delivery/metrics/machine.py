@@ -99,6 +99,15 @@ def _alarms(machine: Observed) -> _Values:
     )
 
 
+def _levels(machine: Observed) -> _Values:
+    report = machine.health.report
+    return (
+        ((one.channel, name, "mm/s" if name == "velocity" else one.unit), value)
+        for one in (() if report is None else report.levels)
+        for name, value in one.values().items()
+    )
+
+
 _FAMILIES = (
     _Family("gauge", "machine_state", "1 for the state of health the machine is in, 0 for others", _state, ("state",)),
     _Family("gauge", "publisher_alive", "1 if a publisher of the stream is there",
@@ -137,6 +146,8 @@ _FAMILIES = (
             _one(lambda machine: machine.worker.errors)),
     _Family("gauge", "restored_at_start", "1 if the monitor went on from where it stood before its latest start",
             _one(lambda machine: machine.worker.restart.startswith("went on"))),
+    _Family("gauge", "level", "Vibration levels of the latest window, in the unit of the channel", _levels,
+            ("channel", "measure", "unit")),
     _Family("gauge", "alarms", "Alarms that are not normal", _alarms, ("state", "severity")),
     _Family("counter", "alarm_events_total", "Alarm events in the history since the start, by kind",
             lambda machine: (((kind.value,), machine.events.get(kind.value, 0)) for kind in EventKind), ("kind",)),

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import TypeAdapter
 
-from models.alarm_names import ALARMS, MODEL, alarm_kind
+from models.alarm_names import ALARMS, MODEL, alarm_kind, is_alarm
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
@@ -181,7 +181,7 @@ class AlarmBook:
         danger = beyond and size > limits.danger_above
         return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
-    def update_state(
+    def update_state(  # noqa: PLR0913  # what is known of a state
         self,
         name: str,
         present: bool,
@@ -190,6 +190,8 @@ class AlarmBook:
         *,
         evidence: Evidence | None = None,
         at_once: bool = False,
+        danger: bool = False,
+        small: bool | None = None,
     ) -> tuple[AlarmEvent, ...]:
         """Judge what is no parameter.
 
@@ -207,13 +209,18 @@ class AlarmBook:
             The data that decided.
         at_once : bool
             Without a delay: it is a fact rather than an estimate.
+        danger : bool
+            Whether it is more than an alert.
+        small : bool, optional
+            Whether it is gone for good; where it is not present without it.
         """
         if not present and name not in self._alarms:
             return ()
         known = self._known(name, time_ns)
         evidence = evidence or known.evidence
         alarm = replace(known, note=note if present else known.note, evidence=evidence)
-        return self._judge(alarm, time_ns, beyond=present, small=not present, danger=False, at_once=at_once)
+        gone = not present if small is None else small
+        return self._judge(alarm, time_ns, beyond=present, small=gone, danger=danger, at_once=at_once)
 
     def suppress(self, speed_rpm: float | None, time_ns: int) -> tuple[AlarmEvent, ...]:
         """Follow the rules of suppression; where the speed is unknown, what depends on it stays as it is.
@@ -289,7 +296,7 @@ class AlarmBook:
         OperationRefused
             If it is in a state in which this cannot be done, a reason is missing, or the time is too long.
         """
-        if operation.alarm not in ALARMS:
+        if not is_alarm(operation.alarm):
             raise UnknownAlarm(f"no alarm {operation.alarm}; there are: {', '.join(ALARMS)}")
         alarm = self._known(operation.alarm, time_ns)
         self._must_be_as_seen(alarm, operation)
@@ -339,7 +346,7 @@ class AlarmBook:
         except ValueError as error:
             raise CheckpointError(f"alarms cannot be restored: {error}") from error
         # Another version of the program may have known others.
-        self._alarms = {alarm.name: alarm for alarm in page.alarms if alarm.name in ALARMS}
+        self._alarms = {alarm.name: alarm for alarm in page.alarms if is_alarm(alarm.name)}
         self._next_sequence = max(page.next_sequence, next_sequence or 0)
         self._untold = []
 

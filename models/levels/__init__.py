@@ -1,0 +1,1 @@
+"""Vibration levels: what is seen of a machine without any model of it."""

@@ -1,0 +1,226 @@
+"""Levels against their limits: absolute ones, and those relative to a reference.
+
+A limit relative to a reference is never nearer than the reference itself has been: not within a quarter of its largest
+healthy level, nor within six standard errors of one window. So excitation that varies as it did in the healthy windows
+raises nothing, and a line that was nothing but noise has to stand out of it.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.levels.measures import LevelPlan, WindowLevels
+from models.levels.reference import LevelReference, ReferenceLevel
+from models.levels.settings import LevelSettings
+from models.levels.zones import ZONES, zone_of
+from models.signals.channels import Channel, Quantity
+from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelLimits
+
+_BEYOND_RANGE = 1.25
+_ERRORS = 6.0
+_TURNED = 0.6
+_DEADBAND = 0.9
+_PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
+_WORDS = {
+    "overall": "overall", "velocity": "velocity", "s_max": "S_max", "x_half": "0.5x", "x1": "1x", "x2": "2x",
+    "x3": "3x", "not_x1": "not 1x", "high": "high frequency", "peak": "peak", "mean": "gap", "envelope": "envelope",
+    "crest": "crest factor", "kurtosis": "kurtosis",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class _Limit:
+    source: str
+    absolute: bool
+    alert: float | None = None
+    danger: float | None = None
+    fall: float | None = None
+
+
+class LevelJudge:
+    """Says what the levels of a machine's windows are, and on which side of their limits.
+
+    Parameters
+    ----------
+    plan : LevelPlan
+    channels : sequence of Channel
+        Of its columns.
+    settings : LevelSettings
+    """
+
+    def __init__(self, plan: LevelPlan, channels: Sequence[Channel], settings: LevelSettings) -> None:
+        self._plan = plan
+        self._channels = tuple(channels)
+        self._settings = settings
+        self._zones = {ZONES[name].shaft: name for name in settings.zones}
+
+    def judge(self, levels: WindowLevels, reference: LevelReference | None) -> tuple[ChannelLevels, ...]:
+        """Levels of one window, channel by channel."""
+        return tuple(self._channel(column, levels, reference) for column in range(len(self._channels)))
+
+    def _channel(self, column: int, levels: WindowLevels, reference: LevelReference | None) -> ChannelLevels:
+        channel, speed_rad_s = self._channels[column], levels.speed_rad_s
+        values = {name: _shown(channel, name, float(levels.values[name][column])) for name in LEVEL_MEASURES}
+        zone, limits = "", dict[str, list[_Limit]]()
+        for own in self._settings.limits:
+            if own.channel == channel.name:
+                limits.setdefault(own.measure, []).append(_Limit("own limit", True, own.alert, own.danger))
+        standard = self._standard(channel, speed_rad_s)
+        if standard is not None:
+            name, measure, boundaries = standard
+            zone = zone_of(values[measure], boundaries)
+            limits.setdefault(measure, []).append(_Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2]))
+        if reference is not None:
+            for measure, limit in self._relative(column, levels, reference):
+                limits.setdefault(measure, []).append(limit)
+        vectors = levels.vectors
+        lags = {}
+        if vectors is not None and speed_rad_s is not None:
+            turned = 1.0 if speed_rad_s >= 0 else -1.0
+            lags = {
+                f"{name}_phase_lag_deg": float(np.degrees(-turned * np.angle(vectors[row, column])) % 360)
+                for name, row in (("x1", 1), ("x2", 2))
+            }
+        casing = channel.quantity in {Quantity.VELOCITY, Quantity.ACCELERATION}
+        return ChannelLevels(
+            channel=channel.name,
+            unit=channel.unit,
+            detection="rms" if casing else "peak to peak",
+            band_hz=self._plan.band_hz if casing else None,
+            **{name: _rounded(value) for name, value in (values | lags).items()},
+            zone=zone,
+            limits=tuple(self._limited(channel, name, values[name], found) for name, found in limits.items()),
+        )
+
+    def _standard(
+        self, channel: Channel, speed_rad_s: float | None
+    ) -> tuple[str, str, tuple[float, float, float]] | None:
+        """The zones of a standard that apply to a channel: their name, the measure, boundaries as shown."""
+        shaft = channel.quantity is Quantity.DISPLACEMENT
+        name = self._zones.get(shaft)
+        if name is None or not (shaft or channel.quantity in {Quantity.VELOCITY, Quantity.ACCELERATION}):
+            return None
+        boundaries = ZONES[name].at(speed_rad_s)
+        if boundaries is None:
+            return None
+        measure = "velocity" if channel.quantity is Quantity.ACCELERATION else "overall"
+        first, second, third = (_shown(channel, measure, edge) for edge in boundaries)
+        return name, measure, (first, second, third)
+
+    def _relative(self, column: int, levels: WindowLevels, reference: LevelReference) -> Iterator[tuple[str, _Limit]]:
+        channel, given = self._channels[column], self._settings
+        state, seen = reference.at(levels.speed_rad_s)
+        source = reference.source if seen else f"{reference.source} at another speed"
+        shorter = math.sqrt(max(1.0, state.hops / levels.hops))  # while the window fills
+        for name, one in state.levels.get(channel.name, {}).items():
+            spread = _ERRORS * one.error * shorter
+            least = max(_BEYOND_RANGE * one.high, one.mean + spread)
+            alert = max(given.alert_ratio * one.mean, least)
+            danger = None  # what levels are at another speed says too little
+            if seen:
+                danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
+            fall = None
+            if name in {"overall", "velocity"} and given.fall_ratio:
+                fall = min(given.fall_ratio * one.mean, one.low / _BEYOND_RANGE, one.mean - spread)
+            shown = [None if edge is None else _shown(channel, name, edge) for edge in (alert, danger, fall)]
+            yield name, _Limit(source, False, *shown)
+            if seen and name == "x1" and one.vector is not None and levels.vectors is not None:
+                yield from self._turned(channel, one, complex(levels.vectors[1, column]), alert, spread)
+
+    def _turned(
+        self, channel: Channel, one: ReferenceLevel, now: complex, alert: float, spread: float
+    ) -> Iterator[tuple[str, _Limit]]:
+        """The acceptance region of the 1x vector (ISO 20816-1:2016, annex D): an alert outside it, however large."""
+        assert one.vector is not None  # noqa: S101  # for the type checker
+        of_amplitude = 2.0 if channel.quantity in _PEAK_TO_PEAK else math.sqrt(0.5)
+        radius = max(_TURNED * abs(complex(*one.vector)), _BEYOND_RANGE * one.turned, spread / of_amplitude)
+        if abs(now - complex(*one.vector)) > radius:
+            yield "x1", _Limit("1x vector", False, alert=_shown(channel, "x1", min(abs(now) * of_amplitude, alert)))
+
+    def _limited(self, channel: Channel, name: str, value: float, limits: Sequence[_Limit]) -> LevelLimits:
+        """The nearest limits of a level, and on which side it is."""
+        danger = min((one for one in limits if one.danger is not None), key=lambda one: one.danger or 0.0, default=None)
+        alert = min((one for one in limits if one.alert is not None), key=lambda one: one.alert or 0.0, default=None)
+        fall = max((one for one in limits if one.fall is not None), key=lambda one: one.fall or 0.0, default=None)
+        unit = _unit(channel, name)
+        said = f"{channel.name} ({channel.location} {channel.direction}) {_WORDS[name]}".rstrip()
+        said += f" {value:.3g} {unit}"
+        state, text, decided = "normal", "", alert or danger or fall
+        if danger is not None and value >= (danger.danger or math.inf):
+            state, text, decided = "danger", f"{said}, danger from {danger.danger:.3g} ({danger.source})", danger
+        elif alert is not None and value >= (alert.alert or math.inf):
+            what = (
+                "has moved out of its acceptance region"
+                if alert.source == "1x vector"
+                else (f"alert from {alert.alert:.3g} ({alert.source})")
+            )
+            state, text, decided = "alert", f"{said}, {what}", alert
+        elif fall is not None and value < (fall.fall or 0.0):
+            state, text, decided = "alert", f"{said}, alert below {fall.fall:.3g} ({fall.source})", fall
+        return LevelLimits.model_validate(
+            {
+                "measure": name,
+                "absolute": decided is not None and decided.absolute,
+                "alert": None if alert is None else _rounded(alert.alert or 0.0),
+                "danger": None if danger is None else _rounded(danger.danger or 0.0),
+                "fall": None if fall is None else _rounded(fall.fall or 0.0),
+                "source": "" if decided is None else decided.source,
+                "state": state,
+                "text": text,
+            }
+        )
+
+
+def _shown(channel: Channel, name: str, value: float) -> float:
+    """A level in the unit in which it is shown."""
+    if name in {"crest", "kurtosis"}:
+        return value
+    if name == "velocity":
+        return value * 1e3
+    return value / channel.to_si
+
+
+def _unit(channel: Channel, name: str) -> str:
+    if name in {"crest", "kurtosis"}:
+        return ""
+    if name == "velocity":
+        return "mm/s rms"
+    if name in {"peak", "s_max", "mean"}:
+        return f"{channel.unit} peak" if name != "mean" else channel.unit
+    return f"{channel.unit} {'pp' if channel.quantity in _PEAK_TO_PEAK and name != 'not_x1' else 'rms'}"
+
+
+def _rounded(value: float) -> float:
+    """Five digits: no sensor has more."""
+    return float(f"{value:.5g}")
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelState:
+    """How a channel stands as a whole: its worst level, and whether all are well within their limits."""
+
+    beyond: bool
+    danger: bool
+    absolute: bool  # beyond a limit of the machine file or of a standard, not only of a reference
+    small: bool  # every level is back by a tenth of its limit: the deadband of ISA-18.2
+    text: str
+
+
+def channel_state(levels: ChannelLevels) -> ChannelState:
+    """Sum up the limits of a channel."""
+    limits = levels.limits
+    beyond, danger = (any(one.state in of for one in limits) for of in (("alert", "danger"), ("danger",)))
+    small = all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits)
+    texts = sorted((one.state != "danger", one.text) for one in limits if one.text)
+    absolute = any(one.state != "normal" and one.absolute for one in limits)
+    return ChannelState(beyond, danger, absolute, small, "; ".join(text for _, text in texts))
+
+
+def _near(value: float | None, limits: LevelLimits) -> bool:
+    """Whether a level that is within its limits is within the deadband of one of them."""
+    if value is None:
+        return False
+    above = min((edge for edge in (limits.alert, limits.danger) if edge is not None), default=math.inf)
+    return value > _DEADBAND * above or (limits.fall is not None and value < limits.fall / _DEADBAND)

@@ -1,0 +1,357 @@
+"""What is measured of a channel in one hop and in one window: overall, orders of running speed, shape of the waveform.
+
+========== ======================================================= ===================================================
+measure    displacement (shaft)                                    velocity, acceleration (casing)
+========== ======================================================= ===================================================
+overall    peak to peak, mean of the hops (ISO 20816-1, S_p-p)     velocity: rms in the band; acceleration: rms
+velocity                                                           of acceleration: rms velocity in the band, integrated
+                                                                   in the frequency domain (ISO 20816-1)
+s_max      largest distance from the mean position of the orbit
+           (ISO 20816-1), at its first channel
+peak       largest deviation from the mean: a true peak            the same
+x_half, x1 peak to peak at half, once, twice and three times       rms there
+x2, x3     running speed (ISO 13373-2)
+not_x1     rms of what is not at running speed                     the same
+mean       mean position: the gap (API 670)
+crest      peak over rms                                           the same
+kurtosis   fourth moment over the square of the second: 3 of a     the same
+           Gaussian vibration (ISO 13373-3)
+high                                                               of acceleration: rms above 1 kHz (ISO 13373-3)
+envelope                                                           of acceleration: rms of the envelope of that, about
+                                                                   its mean (ISO 13373-3, VDI 3832)
+========== ======================================================= ===================================================
+
+All in SI units here. A level of random vibration scatters: over a time T with bandwidth B an rms has a relative
+standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th ed., Eq. 8.53).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy  # its sub-packages are loaded when they are first used
+
+from models.checkpoint import checked
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, Quantity
+
+ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
+"""Multiples of running speed, by the name of their measure."""
+COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
+"""Those that are compared with a reference."""
+
+_SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
+_HIGH_HZ = 1000.0
+_NYQUIST_PART = 0.8
+"""Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
+_MANY_REVOLUTIONS = 8.0
+_STANDS = 2 * np.pi * 0.5
+"""Slower than this, rad/s, a shaft is not taken to turn."""
+
+_ComplexArray = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class LevelPlan:
+    """Which levels a machine's channels have.
+
+    Attributes
+    ----------
+    rate_hz : float
+    quantities : tuple of Quantity
+        Of the columns that levels are taken of.
+    band_hz : tuple of float
+        Of velocities, from and to.
+    pairs : tuple of (int, int)
+        Columns of displacements of one place at right angles.
+    """
+
+    rate_hz: float
+    quantities: tuple[Quantity, ...]
+    band_hz: tuple[float, float]
+    pairs: tuple[tuple[int, int], ...]
+
+    @property
+    def high_hz(self) -> tuple[float, float] | None:
+        """The high-frequency band of accelerometers; None where the sampling rate allows none."""
+        end_hz = _NYQUIST_PART * self.rate_hz / 2
+        return (_HIGH_HZ, end_hz) if end_hz >= 2 * _HIGH_HZ else None
+
+    def columns(self, *quantities: Quantity) -> npt.NDArray[np.intp]:
+        """Columns of some quantities."""
+        return np.array([at for at, one in enumerate(self.quantities) if one in quantities], dtype=np.intp)
+
+
+def level_plan(channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float, float]) -> LevelPlan:
+    """Plan the levels of a machine.
+
+    Parameters
+    ----------
+    channels : sequence of Channel
+        In the order of the columns; none of them a shaft angle.
+    band_hz : tuple of float
+        Of velocities; cut off where the sampling rate ends it.
+    """
+    at = {(one.location, one.direction): n for n, one in enumerate(channels) if one.quantity is Quantity.DISPLACEMENT}
+    pairs = [(at[place, "y"], at[place, "z"]) for place, way in at if way == "y" and (place, "z") in at]
+    low, high = band_hz
+    return LevelPlan(
+        rate_hz, tuple(one.quantity for one in channels), (low, min(high, _NYQUIST_PART * rate_hz / 2)), tuple(pairs)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class HopLevels:
+    """What one hop adds to the levels of a window.
+
+    Attributes
+    ----------
+    n_samples : int
+    sums : ndarray, shape (8, n)
+        Mean, mean square about it, largest deviation from it, peak to peak, fourth moment, mean square velocity in
+        the band, mean squares of the high-frequency band and of its envelope about its mean; nan where a quantity has
+        none.
+    orders : ndarray of complex, shape (4, n)
+        q of x = Re{q e^{jkθ}} for the orders k of `ORDERS`; nan without a rotation. At half running speed its angle
+        means nothing: the shaft angle is known to a whole turn.
+    radius : ndarray, shape (n_pairs,)
+        Largest distance from the mean position.
+    """
+
+    n_samples: int
+    sums: FloatArray
+    orders: _ComplexArray
+    radius: FloatArray
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        return {
+            "n_samples": np.array(self.n_samples, dtype=np.int64),
+            "sums": self.sums,
+            "orders": self.orders,
+            "radius": self.radius,
+        }
+
+    @classmethod
+    def restored(cls, arrays: Mapping[str, np.ndarray]) -> "HopLevels":
+        """Levels from what `checkpoint` gave.
+
+        Raises
+        ------
+        CheckpointError
+            If an array is missing or of another form.
+        """
+        sums = checked(arrays, "sums", np.float64, (len(_SUMS), None))
+        return cls(
+            int(checked(arrays, "n_samples", np.int64, ())),
+            sums,
+            checked(arrays, "orders", np.complex128, (len(ORDERS), sums.shape[1])),
+            checked(arrays, "radius", np.float64, (None,)),
+        )
+
+
+def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | None) -> HopLevels:
+    """Take the levels of one hop.
+
+    Parameters
+    ----------
+    plan : LevelPlan
+    samples : ndarray, shape (n_samples, n)
+        SI units.
+    angle_rad : ndarray, shape (n_samples,), or None
+        Shaft angle, or one that turns with it from an unknown zero.
+    """
+    x = np.array(samples.T, order="C")  # a copy: the mean is taken out of it
+    n, n_samples = x.shape
+    mean = x.mean(axis=1)
+    x -= mean[:, None]
+    low, high = x.min(axis=1), x.max(axis=1)
+    square = x * x
+    sums = np.full((len(_SUMS), n), np.nan)
+    sums[0] = mean
+    sums[1] = square.mean(axis=1)
+    sums[2] = np.maximum(high, -low)
+    sums[3] = high - low
+    sums[4] = np.einsum("ij,ij->i", square, square) / n_samples
+    casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
+    if casing.size:
+        sums[5:, casing] = _band_squares(plan, x[casing], plan.columns(Quantity.ACCELERATION)[:, None] == casing)
+    radius = [float(np.sqrt((square[y] + square[z]).max())) for y, z in plan.pairs]
+    return HopLevels(n_samples, sums, _orders(x, angle_rad), np.array(radius))
+
+
+def _band_squares(plan: LevelPlan, x: FloatArray, of_acceleration: npt.NDArray[np.bool_]) -> FloatArray:
+    """Mean squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n)."""
+    accelerations = of_acceleration.any(axis=0)
+    n_samples = x.shape[1]
+    # Strong lines must not leak into the low end of the band, where integration would magnify them.
+    taper = _taper(n_samples)
+    spectrum = scipy.fft.rfft(x * taper, axis=1)
+    step_hz = plan.rate_hz / n_samples
+    scale = 2 / (n_samples * float(taper @ taper))
+    first, last = (round(edge / step_hz) for edge in plan.band_hz)
+    first = max(first, 1)
+    found = np.full((3, x.shape[0]), np.nan)
+    band = spectrum[:, first : last + 1]
+    power = band.real**2 + band.imag**2
+    found[0] = power.sum(axis=1)
+    omega = 2 * np.pi * step_hz * np.arange(first, first + power.shape[1])
+    found[0, accelerations] = power[accelerations] @ omega**-2
+    found[0] *= scale
+    if plan.high_hz is not None and accelerations.any():
+        first, last = (round(edge / step_hz) for edge in plan.high_hz)
+        band = spectrum[accelerations, first : last + 1]
+        found[1, accelerations] = scale * np.sum(np.abs(band) ** 2, axis=1)
+        # The band shifted to zero frequency: its magnitude is the envelope, a sample for each of its bins.
+        envelope = np.abs(scipy.fft.ifft(band, axis=1)) * (2 * band.shape[1] / n_samples)
+        weights = np.interp(np.arange(band.shape[1]) / band.shape[1], np.arange(n_samples) / n_samples, taper)
+        level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: compared with its like
+        found[2, accelerations] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2)
+    return found
+
+
+def _orders(x: FloatArray, angle_rad: FloatArray | None) -> _ComplexArray:
+    """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions."""
+    nothing = np.full((len(ORDERS), x.shape[0]), np.nan, dtype=np.complex128)
+    if angle_rad is None:
+        return nothing
+    # Half the angle, from the sign that whole turns leave: sines of small arguments are quicker.
+    turns = np.cumsum(np.round(np.diff(angle_rad, prepend=angle_rad[0]) / (2 * np.pi)))
+    half = angle_rad / 2
+    sign = 1 - 2 * np.mod(turns, 2)
+    count = 1 + 2 * len(ORDERS)
+    rows = np.empty((count + x.shape[0], half.size))
+    rows[count:] = x
+    regressors, cos, sin = rows[:count], rows[1:count:2], rows[2:count:2]
+    regressors[0] = 1
+    np.multiply(np.cos(half), sign, out=cos[0])
+    np.multiply(np.sin(half), sign, out=sin[0])
+    for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):  # cos and sin of a sum of angles
+        cos[row] = cos[first] * cos[second] - sin[first] * sin[second]
+        sin[row] = sin[first] * cos[second] + cos[first] * sin[second]
+    turned = abs(half[-1] - half[0] - np.pi * turns[-1]) / np.pi
+    weighted = regressors
+    if turned >= _MANY_REVOLUTIONS:
+        weighted = regressors * _taper(half.size)  # so that other lines stay out
+    try:
+        products = weighted @ rows.T
+        solved = np.linalg.solve(products[:, :count], products[:, count:])
+    except np.linalg.LinAlgError:  # a shaft that stands still
+        return nothing
+    return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
+
+
+@lru_cache(maxsize=8)
+def _taper(size: int) -> FloatArray:
+    """Hann's, of so many samples."""
+    taper = np.hanning(size + 1)[:-1]
+    taper.flags.writeable = False
+    return taper
+
+
+@dataclass(frozen=True, slots=True)
+class WindowLevels:
+    """Levels of one window, SI units.
+
+    Attributes
+    ----------
+    values : dict of str to ndarray, shape (n,)
+        By measure; nan where a quantity has none, or the rotation is not known.
+    errors : dict of str to ndarray, shape (n,)
+        Standard errors by the scatter of the hops, of the measures that are compared with a reference (`COMPARED`).
+    vectors : ndarray of complex, shape (4, n), or None
+        Mean of q of the hops at the orders, with a phase reference.
+    speed_rad_s : float or None
+        Mean speed; None where it is not known.
+    """
+
+    values: Mapping[str, FloatArray]
+    errors: Mapping[str, FloatArray]
+    vectors: _ComplexArray | None
+    speed_rad_s: float | None = None
+    hops: int = 1
+
+
+def window_levels(
+    plan: LevelPlan, hops: Sequence[HopLevels], speeds_rad_s: FloatArray, *, phase_reference: bool
+) -> WindowLevels:
+    """Levels of the window that hops make.
+
+    Parameters
+    ----------
+    plan : LevelPlan
+    hops : sequence of HopLevels
+        At least one.
+    speeds_rad_s : ndarray, shape (n_hops,)
+        Nan where the rotation is not known.
+    phase_reference : bool
+        Whether the angle is the shaft's own, so that the vectors of the hops can be added up.
+    """
+    sums = np.stack([hop.sums for hop in hops])
+    count, _, n = sums.shape
+    displacements, accelerations = (
+        np.isin(np.arange(n), plan.columns(*of))
+        for of in ((Quantity.DISPLACEMENT, Quantity.TILT), (Quantity.ACCELERATION,))
+    )
+    mean = sums[:, 0].mean(axis=0)
+    square = (sums[:, 1] + (sums[:, 0] - mean) ** 2).mean(axis=0)
+    rms, peak = np.sqrt(square), sums[:, 2].max(axis=0)
+    hop_rms, velocity, high, envelope = (np.sqrt(sums[:, row]) for row in (1, 5, 6, 7))
+    s_max = np.full((count, n), np.nan)
+    for number, (y, _) in enumerate(plan.pairs):
+        s_max[:, y] = [hop.radius[number] for hop in hops]
+    turning = np.abs(np.nan_to_num(speeds_rad_s)) > _STANDS
+    orders = np.stack([hop.orders for hop in hops])[turning]
+    amplitudes, scatter, vectors = _amplitudes(orders, phase_reference=phase_reference)
+    shown = np.where(displacements, 2.0, np.sqrt(0.5))
+    by_hop = {
+        "overall": np.where(displacements, sums[:, 3], np.where(accelerations, hop_rms, velocity)),
+        "velocity": np.where(accelerations, velocity, np.nan),
+        "s_max": s_max,
+        "high": high,
+        "envelope": envelope,
+    }
+    # Peak to peak is a mean of the hops, what is rms that of the whole window.
+    rms_of: dict[str, Any] = {
+        "overall": ~displacements,
+        "velocity": True,
+        "s_max": False,
+        "high": True,
+        "envelope": True,
+    }
+    taken = {
+        name: np.where(rms_of[name], np.sqrt((each**2).mean(axis=0)), each.mean(axis=0))
+        for name, each in by_hop.items()
+    }
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = taken | {
+            **{name: shown * amplitudes[number] for number, name in enumerate(ORDERS)},
+            "peak": peak,
+            "not_x1": np.sqrt(np.maximum(square - amplitudes[1] ** 2 / 2, 0.0)),
+            "mean": np.where(displacements, mean, np.nan),
+            "crest": peak / rms,
+            "kurtosis": sums[:, 4].mean(axis=0) / sums[:, 1].mean(axis=0) ** 2,
+        }
+    errors = {name: each.std(axis=0) / np.sqrt(max(1, count - 1)) for name, each in by_hop.items()}
+    errors |= {name: shown * scatter[number] for number, name in enumerate(ORDERS) if name in COMPARED}
+    speed_rad_s = float(speeds_rad_s[turning].mean()) if turning.any() else None
+    return WindowLevels(values, errors, vectors, speed_rad_s, count)
+
+
+def _amplitudes(orders: _ComplexArray, *, phase_reference: bool) -> tuple[FloatArray, FloatArray, _ComplexArray | None]:
+    """Amplitudes at the orders over some hops, their standard errors, and vectors; shape (4, n) each."""
+    count = orders.shape[0]
+    if not count:
+        nothing = np.full(orders.shape[1:], np.nan)
+        return nothing, nothing, None
+    amplitudes = np.sqrt((np.abs(orders) ** 2).mean(axis=0))
+    scatter = np.abs(orders).std(axis=0) / np.sqrt(max(1, count - 1))
+    if not phase_reference:
+        return amplitudes, scatter, None
+    vectors = orders.mean(axis=0)
+    amplitudes[1:] = np.abs(vectors[1:])
+    scatter[1:] = np.sqrt((np.abs(orders - vectors) ** 2).mean(axis=0)[1:] / max(1, count - 1))
+    return amplitudes, scatter, vectors

@@ -1,0 +1,236 @@
+"""What levels were when the machine was healthy: their mean, range and error in each operating state."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from models.checkpoint import checked, texts
+from models.errors import CheckpointError
+from models.levels.measures import COMPARED, WindowLevels
+
+_STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
+_Finite = Annotated[float, Field(allow_inf_nan=False)]
+_Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_SAME_SPEED = 0.03
+"""Windows whose speeds differ by less, relative, are of one operating state."""
+
+
+class ReferenceLevel(BaseModel):
+    """One measure of one channel over the healthy windows of an operating state, SI units.
+
+    Attributes
+    ----------
+    low, high : float
+        Smallest and largest of them.
+    error : float
+        Mean standard error of one window.
+    vector : tuple of float or None
+        Of 1x, with a phase reference: real and imaginary part of the mean of q.
+    turned : float
+        Largest distance of a window's vector from that.
+    """
+
+    model_config = _STORED
+
+    mean: _Level
+    low: _Level
+    high: _Level
+    error: _Level
+    vector: tuple[_Finite, _Finite] | None = None
+    turned: _Level = 0.0
+
+
+class OperatingState(BaseModel):
+    """Levels at one speed.
+
+    Attributes
+    ----------
+    speed_rad_s : tuple of float or None
+        Slowest and fastest window; None where the speed is not known.
+    levels : dict
+        By channel and measure.
+    hops : float
+        Mean number of hops in a window.
+    """
+
+    model_config = _STORED
+
+    windows: int = Field(ge=1)
+    speed_rad_s: tuple[_Finite, _Finite] | None
+    levels: dict[str, dict[str, ReferenceLevel]]
+    hops: float = Field(ge=1)
+
+
+class LevelReference(BaseModel):
+    """Healthy levels, state by state.
+
+    Attributes
+    ----------
+    source : str
+        Where they are from, as operators will read it.
+    """
+
+    model_config = _STORED
+
+    source: str
+    states: tuple[OperatingState, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        unknown = {name for state in self.states for one in state.levels.values() for name in one} - set(COMPARED)
+        if unknown:
+            raise ValueError(f"levels: {', '.join(sorted(unknown))} is not one of {', '.join(COMPARED)}")
+        return self
+
+    def at(self, speed_rad_s: float | None) -> tuple[OperatingState, bool]:
+        """The state nearest in speed, and whether the machine ran at such a speed when it was learned."""
+        if speed_rad_s is None or not math.isfinite(speed_rad_s):
+            return max(self.states, key=lambda state: state.windows), True
+
+        def distance(state: OperatingState) -> float:
+            if state.speed_rad_s is None:
+                return 0.0
+            slowest, fastest = sorted(abs(edge) for edge in state.speed_rad_s)
+            now = abs(speed_rad_s)
+            return max(slowest - now, now - fastest, 0.0) / max(fastest, 1e-9)
+
+        nearest = min(self.states, key=distance)
+        return nearest, distance(nearest) <= _SAME_SPEED
+
+
+def learn_levels(source: str, channels: Sequence[str], windows: Sequence[WindowLevels]) -> LevelReference:
+    """Learn from healthy windows that do not overlap.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        Names of the columns.
+    windows : sequence of WindowLevels
+        At least one.
+    """
+    groups: list[list[WindowLevels]] = []
+    for levels in sorted(windows, key=_speed):
+        if groups and _speed(levels) - _speed(groups[-1][-1]) <= _SAME_SPEED * _speed(levels):
+            groups[-1].append(levels)
+        else:
+            groups.append([levels])
+    return LevelReference(source=source, states=tuple(_state(channels, group) for group in groups))
+
+
+def _speed(levels: WindowLevels) -> float:
+    return abs(levels.speed_rad_s or 0.0)
+
+
+def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
+    speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
+    return OperatingState(
+        windows=len(group),
+        speed_rad_s=(min(speeds), max(speeds)) if speeds else None,
+        levels={
+            channel: {name: found for name in COMPARED if (found := _reference(name, column, group)) is not None}
+            for column, channel in enumerate(channels)
+        },
+        hops=float(np.mean([one.hops for one in group])),
+    )
+
+
+def _reference(name: str, column: int, levels: Sequence[WindowLevels]) -> ReferenceLevel | None:
+    values = np.array([one.values[name][column] for one in levels])
+    errors = np.array([one.errors[name][column] for one in levels])
+    if not np.all(np.isfinite(values)):
+        return None
+    vector, turned = None, 0.0
+    if name == "x1" and all(one.vectors is not None for one in levels):
+        of_windows = np.array([one.vectors[1, column] for one in levels if one.vectors is not None])
+        mean = complex(of_windows.mean())
+        vector, turned = (mean.real, mean.imag), float(np.abs(of_windows - mean).max())
+    return ReferenceLevel(
+        mean=float(values.mean()),
+        low=float(values.min()),
+        high=float(values.max()),
+        error=float(np.nanmean(errors)) if np.any(np.isfinite(errors)) else 0.0,
+        vector=vector,
+        turned=turned,
+    )
+
+
+class FirstWindows:
+    """Takes the first windows that are seen as a reference, where nothing was commissioned.
+
+    Parameters
+    ----------
+    channels : sequence of str
+    count : int
+        Windows that do not overlap.
+    """
+
+    def __init__(self, channels: Sequence[str], count: int) -> None:
+        self._channels = tuple(channels)
+        self._count = count
+        self._seen: list[WindowLevels] = []
+        self._end_ns = 0
+        self.reference: LevelReference | None = None
+
+    @property
+    def lacking(self) -> int:
+        """Windows that are still to come."""
+        return 0 if self.reference is not None else self._count - len(self._seen)
+
+    def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
+        """Take note of a full window."""
+        if self.reference is not None or start_ns < self._end_ns:
+            return
+        self._end_ns = end_ns
+        self._seen.append(levels)
+        if len(self._seen) == self._count:
+            self.reference = learn_levels("the first windows", self._channels, self._seen)
+            self._seen = []
+
+    def checkpoint(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays."""
+        seen = self._seen
+        speeds = [math.nan if one.speed_rad_s is None else one.speed_rad_s for one in seen]
+        shape = (len(seen), len(COMPARED), len(self._channels))
+        vectors = [np.zeros((0, 0)) if one.vectors is None else one.vectors for one in seen]
+        return {
+            "reference": np.array(["" if self.reference is None else self.reference.model_dump_json()]),
+            "end_ns": np.array(self._end_ns, dtype=np.int64),
+            "speeds": np.array(speeds, dtype=np.float64),
+            "hops": np.array([one.hops for one in seen], dtype=np.int64),
+            "values": np.array([[one.values[name] for name in COMPARED] for one in seen]).reshape(shape),
+            "errors": np.array([[one.errors[name] for name in COMPARED] for one in seen]).reshape(shape),
+            **{f"vectors_{number}": np.asarray(each, np.complex128) for number, each in enumerate(vectors)},
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on where `checkpoint` was called.
+
+        Raises
+        ------
+        CheckpointError
+            If the arrays are damaged, or of other channels; nothing is changed then.
+        """
+        (text,) = texts(arrays, "reference")
+        try:
+            reference = LevelReference.model_validate_json(text) if text else None
+        except ValueError as error:
+            raise CheckpointError(f"the reference of the levels cannot be restored: {error}") from error
+        speeds = checked(arrays, "speeds", np.float64, (None,))
+        hops = checked(arrays, "hops", np.int64, (speeds.size,)).tolist()
+        shape = (speeds.size, len(COMPARED), len(self._channels))
+        values, errors = (checked(arrays, name, np.float64, shape) for name in ("values", "errors"))
+        vectors = [checked(arrays, f"vectors_{number}", np.complex128, (None, None)) for number in range(speeds.size)]
+        self._seen = [
+            WindowLevels(
+                dict(zip(COMPARED, values[number], strict=True)),
+                dict(zip(COMPARED, errors[number], strict=True)),
+                vectors[number] if vectors[number].size else None,
+                speed if math.isfinite(speed) else None,
+                hops[number],
+            )
+            for number, speed in enumerate(speeds.tolist())
+        ]
+        self.reference, self._end_ns = reference, int(checked(arrays, "end_ns", np.int64, ()))

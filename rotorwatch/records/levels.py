@@ -1,0 +1,95 @@
+"""Vibration levels of a window, channel by channel."""
+
+from typing import Literal
+
+from pydantic import BaseModel, Field
+
+from rotorwatch.records.fields import JSON, Number
+
+__all__ = ["ChannelLevels", "LevelLimits"]
+
+
+class LevelLimits(BaseModel):
+    """What one level is judged by, and what came of it."""
+
+    model_config = JSON
+
+    measure: str = Field(description="which of the levels", examples=["overall"])
+    alert: Number = Field(default=None, description="alert from here on; null without such a limit", examples=[2.8])
+    danger: Number = Field(default=None, description="danger from here on; null without such a limit", examples=[4.5])
+    fall: Number = Field(default=None, description="alert below; null without such a limit", examples=[0.4])
+    source: str = Field(
+        description="where the nearest limit comes from", examples=["ISO 20816-3 group 2 rigid", "commissioned"]
+    )
+    absolute: bool = Field(
+        default=False, description="whether that is a limit of the machine file or of a standard", examples=[True]
+    )
+    state: Literal["normal", "alert", "danger"] = Field(description="on which side of them it is", examples=["normal"])
+    text: str = Field(
+        default="",
+        description="the level and the limit it is beyond, in words; empty while it is normal",
+        examples=[""],
+    )
+
+
+class ChannelLevels(BaseModel):
+    """Vibration levels of one channel in one window."""
+
+    model_config = JSON
+
+    channel: str = Field(description="name of the channel", examples=["DE-H"])
+    unit: str = Field(description="unit of its levels, but for `velocity`", examples=["m/s2"])
+    detection: Literal["peak to peak", "rms"] = Field(
+        description="of overall and orders: displacement is peak to peak, all else rms", examples=["rms"]
+    )
+    band_hz: tuple[float, float] | None = Field(
+        description="band of velocities; null where there are none", examples=[(10.0, 1000.0)]
+    )
+    overall: Number = Field(description="overall level (ISO 20816-1)", examples=[1.93])
+    velocity: Number = Field(
+        default=None, description="of an accelerometer: velocity in the band, mm/s rms", examples=[2.1]
+    )
+    s_max: Number = Field(
+        default=None,
+        description="of the first of two displacements at right angles: largest distance of the shaft from its mean "
+        "position (ISO 20816-1)",
+        examples=[None],
+    )
+    peak: Number = Field(description="largest deviation from the mean: a true peak", examples=[6.4])
+    x_half: Number = Field(
+        default=None, description="at half running speed; null if that is not known", examples=[0.02]
+    )
+    x1: Number = Field(default=None, description="at running speed", examples=[1.1])
+    x1_phase_lag_deg: Number = Field(
+        default=None, description="phase lag of 1x; null without a phase reference", examples=[212.0]
+    )
+    x2: Number = Field(default=None, description="at twice running speed", examples=[0.3])
+    x2_phase_lag_deg: Number = Field(default=None, description="phase lag of 2x", examples=[44.0])
+    x3: Number = Field(default=None, description="at three times running speed", examples=[0.1])
+    not_x1: Number = Field(default=None, description="rms of what is not at running speed", examples=[1.6])
+    mean: Number = Field(default=None, description="of a displacement: mean position (gap)", examples=[None])
+    crest: Number = Field(default=None, description="crest factor: peak over rms", examples=[3.3])
+    kurtosis: Number = Field(default=None, description="3 of a Gaussian vibration", examples=[3.0])
+    high: Number = Field(default=None, description="of an accelerometer: rms above 1 kHz", examples=[0.8])
+    envelope: Number = Field(default=None, description="rms of the envelope of that", examples=[0.3])
+    zone: Literal["", "A", "B", "C", "D"] = Field(
+        default="", description="zone of the standard that applies; empty without one", examples=["B"]
+    )
+    limits: tuple[LevelLimits, ...] = Field(default=(), description="limits of those levels that have any")
+
+    def values(self) -> dict[str, float]:
+        """The levels that there are, by measure."""
+        found = {name: getattr(self, name) for name in LEVEL_MEASURES}
+        return {name: value for name, value in found.items() if value is not None}
+
+    def limit(self, measure: str) -> LevelLimits | None:
+        """Limits of one level."""
+        return next((one for one in self.limits if one.measure == measure), None)
+
+
+LEVEL_MEASURES = tuple(
+    name
+    for name, field in ChannelLevels.model_fields.items()
+    if field.annotation == float | None and not name.endswith("_deg")
+)
+"""Every measure, in the order in which they are shown."""

@@ -1,0 +1,131 @@
+"""What arrives of a machine's stream, looked at without a monitor."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.commissioning.commissioned import Installed
+from models.diagnosis.moments import plan_for
+from models.errors import WireError
+from models.ingest import Gate
+from models.levels.measures import hop_levels, window_levels
+from models.machine import MachineFile
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.recording import RecordedMessage
+from models.signals.wire import decode_block
+from service.monitor.descriptor import descriptor_mismatch
+from service.monitor.levels import LevelWatch
+
+__all__ = ["Arrival", "examined"]
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """What was seen.
+
+    Attributes
+    ----------
+    lines : tuple of str
+        What arrives, in words.
+    troubles : tuple of str
+        What is missing or differs from the machine file.
+    """
+
+    lines: tuple[str, ...]
+    troubles: tuple[str, ...]
+
+
+def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arrival:
+    """Look at the messages that arrived under a machine's keys.
+
+    Parameters
+    ----------
+    machine : MachineFile
+        What is expected.
+    messages : sequence of RecordedMessage
+        In the order of their arrival.
+    """
+    place, keys = f"{machine.site}/{machine.name}", machine.keys
+    troubles: list[str] = []
+    announced = [one.payload for one in messages if one.key == keys.descriptor]
+    if not announced:
+        troubles.append("no channel descriptor was announced: names and units of the channels cannot be compared")
+    troubles += descriptor_mismatch(announced[-1], machine) if announced else ()
+    stream = [one for one in messages if one.key == keys.stream]
+    if not stream:
+        others = sorted({one.key for one in messages})
+        heard = f"; heard were {', '.join(others)}" if others else ""
+        return Arrival((f"{place}: no sample blocks",), (f"nothing arrived under {keys.stream}{heard}", *troubles))
+    gate, refused, accepted = Gate(machine), Counter[str](), list[SampleBlock]()
+    rates: set[float] = set()
+    for message in stream:
+        try:
+            block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
+        except WireError as error:
+            refused[f"it cannot be decoded: {error}"] += 1
+            continue
+        rates.add(block.rate_hz)
+        verdict = gate.judge(block, schema_hash)
+        if not verdict.accepted:
+            refused[verdict.text] += 1
+            continue
+        if not verdict.continuous:
+            accepted.clear()
+            troubles.append(verdict.text)
+        accepted.append(block)
+    for text, count in refused.most_common(5):
+        troubles.append(f"{count} blocks would be refused: {text}")
+    lines = [f"{place}: {len(stream)} sample blocks, {len(stream) - sum(refused.values())} of them usable"]
+    if rates:
+        lines.append(
+            f"sampling rate {', '.join(f'{rate:g}' for rate in sorted(rates))} Hz, expected {machine.rate_hz:g}"
+        )
+    if accepted:
+        lines += _of_samples(machine, accepted, troubles)
+    return Arrival(tuple(lines), tuple(troubles))
+
+
+def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: list[str]) -> list[str]:
+    """Length, keyphasor and levels of blocks that follow each other."""
+    plan = plan_for(machine, levels=True)
+    samples = plan.to_si(np.concatenate([block.samples for block in blocks]))
+    duration_s = (blocks[-1].end_ns - blocks[0].start_ns) / 1e9
+    lines = [
+        f"{duration_s:.3g} s without a gap, in blocks of {np.median([len(one.samples) for one in blocks]):g} samples"
+    ]
+    speed, angle = np.nan, None
+    if plan.angle_column is None:
+        lines.append("no shaft angle (keyphasor): no phases, and 1x only near a known speed")
+    else:
+        angle = samples[:, -1]
+        speed = _speed(angle, plan.rate_hz)
+        lines.append(f"keyphasor: the shaft turns at {abs(speed) * 30 / np.pi:.1f} rpm")
+        if abs(speed) < np.pi:
+            troubles.append("the shaft angle does not turn: the machine stands still, or the keyphasor gives no pulses")
+    if plan.levels is None:
+        return lines
+    vibration = samples[:, : plan.columns.size]
+    found = window_levels(
+        plan.levels, [hop_levels(plan.levels, vibration, angle)], np.array([speed]), phase_reference=angle is not None
+    )
+    watch = LevelWatch(plan, machine, Installed(machine))
+    for channel in watch.judged(found):
+        values = channel.values()
+        detection = "pp" if channel.detection == "peak to peak" else "rms"
+        shown = [f"{values['overall']:.3g} {channel.unit} {detection}" if "overall" in values else "no level"]
+        shown += [f"velocity {values['velocity']:.3g} mm/s rms"] if "velocity" in values else []
+        shown += [f"1x {values['x1']:.3g}"] if "x1" in values else []
+        shown += [f"mean {values['mean']:.3g}"] if "mean" in values else []
+        shown += [f"zone {channel.zone}"] if channel.zone else []
+        lines.append(f"  {channel.channel}: {', '.join(shown)}")
+    for column, name in enumerate(machine.sensors[at].name for at in plan.columns):
+        if np.ptp(vibration[:, column]) == 0:
+            troubles.append(f"{name} does not move: a sensor that is not connected, or a range far too wide")
+    return lines
+
+
+def _speed(angle_rad: FloatArray, rate_hz: float) -> float:
+    steps = np.diff(angle_rad)
+    return float(((steps + np.pi) % (2 * np.pi) - np.pi).mean() * rate_hz)

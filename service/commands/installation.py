@@ -1,0 +1,185 @@
+"""``rotorwatch init`` and ``rotorwatch doctor``: begin with a machine, and see what arrives of it."""
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from models.errors import MachineFileError
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
+
+if TYPE_CHECKING:  # these import numpy, which --help must not wait for
+    from models.machine import MachineFile
+
+__all__ = ["register"]
+
+_SENSOR = ("name", "quantity", "unit", "location", "direction")
+_EXAMPLE = "DE-H acceleration g DE horizontal"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    app.command()(init)
+    app.command()(doctor)
+
+
+def init(
+    folder: Annotated[
+        Path, typer.Option("--folder", metavar="DIR", help="Where the two files go; made if it is not there.")
+    ] = Path(),
+    site: Annotated[str | None, typer.Option("--site", help="Site of the machine: a group of machines.")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Name of the machine.")] = None,
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate-hz", metavar="HZ", help="Samples per second and channel.")
+    ] = None,
+    sensor: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--sensor",
+            metavar="'NAME QUANTITY UNIT LOCATION DIRECTION'",
+            help=f"A channel of the stream, in their order, such as '{_EXAMPLE}'. Repeatable.",
+        ),
+    ] = None,
+    speed_rpm: Annotated[
+        float | None, typer.Option("--speed-rpm", metavar="RPM", help="Nominal speed, if it is known: for 1x and 2x.")
+    ] = None,
+    zones: Annotated[
+        list[str] | None,
+        typer.Option("--zones", help="Zones of a standard, such as 'ISO 20816-3 group 2 rigid'. Repeatable."),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that are there already.")] = False,
+) -> None:
+    """Write a machine file with nothing but sensors, and settings of a monitor for it; asks for what is left out.
+
+    The monitor watches vibration levels at once, and records. Diagnosis is added by [cyan]rotortrain commission[/cyan].
+
+    [bold]Example[/bold]
+
+    [cyan]rotorwatch init --site plant --name fan --rate-hz 25600 --sensor 'DE-H acceleration g DE horizontal'[/cyan]
+    [cyan]rotorwatch doctor --machine fan.toml[/cyan]
+    [cyan]rotorwatch run --config rotorwatch.toml[/cyan]
+    """
+    with exit_codes():
+        site = site or _asked("--site", "Site (a group of machines)")
+        name = name or _asked("--name", "Name of the machine")
+        rate = rate_hz or float(_asked("--rate-hz", "Samples per second and channel"))
+        lines = sensor or _asked_sensors()
+        from models.machine import MachineFile  # noqa: PLC0415  # keeps --help quick
+        from models.mistakes import checked  # noqa: PLC0415
+
+        fields: dict[str, Any] = {
+            "site": site,
+            "name": name,
+            "rate_hz": rate,
+            "operation": None if speed_rpm is None else {"speed_rpm": speed_rpm},
+            "levels": {"zones": zones or []},
+            "sensors": [_sensor(line) for line in lines],
+        }
+        machine_path, settings_path = folder / f"{name}.toml", folder / "rotorwatch.toml"
+        machine = checked(MachineFile, {key: value for key, value in fields.items() if value is not None}, machine_path)
+        for path in (machine_path, settings_path):
+            if path.exists() and not overwrite:
+                raise MachineFileError(f"{path}: exists already; --overwrite replaces it")
+        folder.mkdir(parents=True, exist_ok=True)
+        machine_path.write_text(_machine_text(machine, speed_rpm), encoding="utf-8")
+        settings_path.write_text(
+            f'[link]\nlisten = ["{ENDPOINT}"]\n\n[recording]\ndirectory = "recordings"\n\n'
+            f'[history]\nurl = "sqlite:///history.sqlite"\n\n[[machines]]\nfile = "{machine_path.name}"\n',
+            encoding="utf-8",
+        )
+        typer.echo(f"{machine_path}: {machine.site}/{machine.name}, {len(machine.sensors)} channels at {rate:g} Hz")
+        typer.echo(f"{settings_path}: listens on {ENDPOINT}, records into {folder / 'recordings'}")
+        typer.echo(f"samples are expected under {machine.keys.stream}; the wire format is in docs/wire.md")
+        typer.echo(f"see what arrives: rotorwatch doctor --machine {machine_path}")
+        typer.echo(f"monitor it:       rotorwatch run --config {settings_path}")
+
+
+def _asked(option: str, text: str) -> str:
+    if not sys.stdin.isatty():
+        raise MachineFileError(f"{option} is missing, and there is nobody to ask")
+    return str(typer.prompt(text))
+
+
+def _asked_sensors() -> list[str]:
+    """Channels, one a line, until an empty one."""
+    typer.echo(f"Channels of the stream, in their order: {' '.join(_SENSOR)}; such as: {_EXAMPLE}")
+    found: list[str] = []
+    while line := _asked("--sensor", f"Channel {len(found) + 1} (empty: no more)" if not found else "Next").strip():
+        found.append(line)
+        if not typer.confirm("Another one?", default=True):
+            break
+    return found
+
+
+def _sensor(line: str) -> dict[str, str]:
+    words = line.split()
+    if len(words) != len(_SENSOR):
+        raise MachineFileError(
+            f"--sensor {line!r} has {len(words)} words, expected {len(_SENSOR)}: {' '.join(_SENSOR)}, "
+            f"such as '{_EXAMPLE}'"
+        )
+    return dict(zip(_SENSOR, words, strict=True))
+
+
+def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
+    """A machine file of what is known, and hints at the rest."""
+    lines = [f"{key} = {json.dumps(value)}" for key, value in (("site", machine.site), ("name", machine.name))]
+    lines += [f"rate_hz = {machine.rate_hz}", f'dtype = "{machine.dtype}"']
+    if speed_rpm is not None:
+        lines += ["", "[operation]", f"speed_rpm = {float(speed_rpm)}"]
+    zones = json.dumps(machine.levels.zones)
+    lines += ["", "# Limits of vibration levels: docs/levels.md", "[levels]", f"zones = {zones}"]
+    for channel in machine.sensors:
+        told = channel.model_dump(mode="json")
+        lines += ["", "[[sensors]]", *(f"{key} = {json.dumps(told[key])}" for key in _SENSOR)]
+    return "\n".join(lines) + "\n"
+
+
+def doctor(
+    machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file: shipped name or path.")],
+    connect: ConnectOption = None,
+    listen: ListenOption = None,
+    seconds: Annotated[float, typer.Option("--seconds", min=1, max=3600, help="How long to listen.")] = 10.0,
+) -> None:
+    """Listen to a machine's stream for a while, and say what arrives: rate, units, levels, keyphasor; what is missing.
+
+    It listens as a monitor would, on tcp/127.0.0.1:7447. Where a monitor runs already, connect to it.
+
+    [bold]Examples[/bold]
+
+    Before the monitor is started; the sensors connect to this computer:
+    [cyan]rotorwatch doctor --machine fan.toml[/cyan]
+
+    Beside a monitor:
+    [cyan]rotorwatch doctor --machine fan.toml --connect tcp/127.0.0.1:7447[/cyan]
+    """
+    with exit_codes():
+        one_blas_thread()
+        from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
+        from models.signals.link import LinkSettings  # noqa: PLC0415
+        from models.signals.recording import RecordedMessage  # noqa: PLC0415
+        from service.analysis.arrival import examined  # noqa: PLC0415
+        from service.stream.transport import Link, MachineTap  # noqa: PLC0415
+
+        known = load_machine_file(machine)
+        ends = LinkSettings(mode="client", connect=tuple(connect)) if connect else None
+        link = Link(ends or LinkSettings(listen=tuple(listen or (ENDPOINT,))))
+        heard: list[RecordedMessage] = []
+        try:
+            tap = MachineTap(link, known.keys, heard.append)
+            typer.echo(f"listening for {seconds:g} s to {known.keys.root} ...")
+            sys.stdout.flush()
+            time.sleep(seconds)
+            tap.close()
+        finally:
+            link.close()
+        found = examined(known, heard)
+        for line in found.lines:
+            typer.echo(line)
+        for trouble in found.troubles:
+            typer.echo(f"  - {trouble}")
+    if found.troubles:
+        raise typer.Exit(1)

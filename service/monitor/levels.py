@@ -1,0 +1,92 @@
+"""The vibration levels of one machine: taken of every window, and judged against limits and reference."""
+
+from collections.abc import Collection
+
+from models.alarm_names import LEVEL
+from models.commissioning.commissioned import Installed
+from models.diagnosis.moments import Plan
+from models.diagnosis.window import SlidingWindow
+from models.levels.judgement import LevelJudge, channel_state
+from models.levels.measures import WindowLevels
+from models.levels.reference import FirstWindows, LevelReference
+from models.machine import MachineFile
+from models.signals.channels import state_name
+from rotorwatch.records.alarms import Evidence
+from rotorwatch.records.levels import ChannelLevels
+from service.monitor.alarms.book import AlarmBook
+
+__all__ = ["LevelWatch"]
+
+
+class LevelWatch:
+    """Judges the levels of every window.
+
+    Parameters
+    ----------
+    plan : Plan
+        With levels.
+    machine : MachineFile
+    installed : Installed
+        What was learned of the healthy machine.
+
+    Attributes
+    ----------
+    latest : tuple of ChannelLevels
+        Of the latest window; empty before the first hop.
+    first : FirstWindows
+        What is remembered: the first windows, where they are the reference.
+    """
+
+    def __init__(self, plan: Plan, machine: MachineFile, installed: Installed) -> None:
+        if plan.levels is None:
+            raise ValueError(f"{machine.site}/{machine.name}: no levels are planned")
+        channels = [machine.sensors[column] for column in plan.columns]
+        self._judge = LevelJudge(plan.levels, channels, machine.levels)
+        of = machine.levels.reference or ("first windows" if installed.watching else "commissioned")
+        self._takes_first = of == "first windows"
+        self._commissioned = None if installed.commissioned is None else installed.commissioned.levels
+        self.first = FirstWindows([channel.name for channel in channels], machine.levels.reference_windows)
+        self.latest: tuple[ChannelLevels, ...] = ()
+        self._states = [state_name(channel) for channel in channels]
+        self._hop_ns = round(machine.window.hop_s * 1e9)
+
+    @property
+    def reference(self) -> LevelReference | None:
+        """What relative limits refer to; None while there is nothing."""
+        return self.first.reference if self._takes_first else self._commissioned
+
+    def judged(self, levels: WindowLevels) -> tuple[ChannelLevels, ...]:
+        """Levels, channel by channel, against what limits there are."""
+        return self._judge.judge(levels, self.reference)
+
+    def take(self, window: SlidingWindow) -> None:
+        """Take the levels of the window as it is after a hop."""
+        found = window.levels()
+        if found is None:
+            return
+        self.latest = self.judged(found)
+        if self._takes_first and window.filled == 1:
+            self.first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
+
+    def tell(self, alarms: AlarmBook, end_ns: int, *, faulty: Collection[str] = (), explained: bool = False) -> None:
+        """Let operators hear of what is beyond its limits at the end of a hop.
+
+        Parameters
+        ----------
+        alarms : AlarmBook
+        end_ns : int
+        faulty : collection of str
+            States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
+            counts.
+        explained : bool
+            Whether parameters have been found to have changed: their alarms say what has become louder, and why, so
+            an alert is not raised beside them. What is raised already stays, and a danger is always told.
+        """
+        evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
+        for state, levels in zip(self._states, self.latest, strict=False):
+            now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
+            held = state in faulty or (explained and not alarms.present(name))
+            beyond = now.beyond and (now.absolute or now.danger or not held)
+            alarms.update_state(
+                name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small or not beyond
+            )

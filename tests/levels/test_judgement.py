@@ -1,0 +1,184 @@
+"""Levels against absolute limits, zones, and the reference of a healthy machine."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from models.levels.judgement import LevelJudge, channel_state
+from models.levels.measures import COMPARED, WindowLevels, level_plan
+from models.levels.reference import FirstWindows, LevelReference, learn_levels
+from models.levels.settings import LevelSettings
+from models.levels.zones import ZONES, zone_of
+from models.signals.channels import Channel
+from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelLimits
+
+CASING = Channel.model_validate(
+    {"name": "DE-H", "quantity": "velocity", "location": "DE", "direction": "horizontal", "unit": "mm/s"}
+)
+CASING_G = Channel.model_validate(CASING.model_dump() | {"name": "DE-A", "quantity": "acceleration", "unit": "g"})
+SHAFT = Channel.model_validate(
+    {"name": "XE-1", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"}
+)
+SPEED = 2 * np.pi * 25
+
+
+def window(
+    error: float = 0.0, speed_rad_s: float | None = SPEED, x1: complex | None = None, **si: float
+) -> WindowLevels:
+    """Levels of one channel: nothing is known but what is given."""
+    values = {name: np.array([si.get(name, np.nan)]) for name in LEVEL_MEASURES}
+    vectors = None
+    if x1 is not None:
+        values["x1"] = np.array([2 * abs(x1)])
+        vectors = np.zeros((4, 1), dtype=np.complex128)
+        vectors[1] = x1
+    errors = {name: np.array([error]) for name in COMPARED}
+    return WindowLevels(values, errors, vectors, speed_rad_s)
+
+
+def judged(
+    channel: Channel, levels: WindowLevels, reference: LevelReference | None = None, **settings: Any
+) -> ChannelLevels:
+    sizes = level_plan([channel], 10_000.0, (10.0, 1000.0))
+    (found,) = LevelJudge(sizes, [channel], LevelSettings.model_validate(settings)).judge(levels, reference)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("rms_mm_s", "zone", "state"),
+    [(1.3, "A", "normal"), (2.7, "B", "normal"), (2.9, "C", "alert"), (4.4, "C", "alert"), (4.6, "D", "danger")],
+)
+@pytest.mark.parametrize("channel", [CASING, CASING_G])
+def test_zones_of_the_standard(channel: Channel, rms_mm_s: float, zone: str, state: str) -> None:
+    measure = "overall" if channel is CASING else "velocity"
+    found = judged(channel, window(**{measure: rms_mm_s * 1e-3}), zones=["ISO 20816-3 group 2 rigid"])
+    assert found.zone == zone
+    assert limits(found)[measure].state == state
+    assert (limits(found)[measure].alert, limits(found)[measure].danger) == (2.8, 4.5)
+    if state == "danger":
+        assert "DE horizontal" in limits(found)[measure].text
+        assert "4.6 mm/s rms, danger from 4.5" in limits(found)[measure].text
+
+
+def test_zones_of_a_shaft_depend_on_the_speed() -> None:
+    settings: dict[str, Any] = {"zones": ["ISO 20816-3 shaft"]}
+    at_3000 = judged(SHAFT, window(speed_rad_s=100 * np.pi, overall=170e-6), **settings)
+    assert limits(at_3000)["overall"].alert == pytest.approx(9000 / np.sqrt(3000), rel=1e-4)
+    assert at_3000.zone == "C"
+    assert judged(SHAFT, window(speed_rad_s=None, overall=170e-6), **settings).limits == ()
+
+
+@pytest.mark.parametrize("name", ZONES)
+def test_boundaries_rise(name: str) -> None:
+    first, second, third = ZONES[name].boundaries
+    assert 0 < first < second < third
+    assert [zone_of(value, (first, second, third)) for value in (first, second, third, 2 * third)] == list("ABCD")
+
+
+def test_own_limits_are_in_the_unit_that_is_shown() -> None:
+    own = [{"channel": "DE-A", "alert": 0.5, "danger": 0.8}, {"channel": "DE-A", "measure": "crest", "alert": 6.0}]
+    found = judged(CASING_G, window(overall=0.6 * 9.80665, crest=5.0), limits=own)
+    assert found.overall == pytest.approx(0.6)
+    assert limits(found)["overall"].state == "alert"
+    assert limits(found)["crest"].state == "normal"
+
+
+def limits(levels: ChannelLevels) -> dict[str, LevelLimits]:
+    return {one.measure: one for one in levels.limits}
+
+
+def reference(*levels: WindowLevels, channel: Channel = CASING) -> LevelReference:
+    return learn_levels("commissioned", [channel.name], levels)
+
+
+@pytest.mark.parametrize(
+    ("factor", "state"), [(0.45, "alert"), (0.55, "normal"), (1.5, "normal"), (1.7, "alert"), (2.6, "danger")]
+)
+def test_levels_relative_to_a_steady_reference(factor: float, state: str) -> None:
+    healthy = reference(*(window(overall=value * 1e-3) for value in (0.98, 1.0, 1.02)))
+    found = judged(CASING, window(overall=factor * 1e-3), healthy)
+    assert limits(found)["overall"].state == state
+    assert channel_state(found).beyond == (state != "normal")
+
+
+def test_a_window_that_is_not_full_may_scatter_more() -> None:
+    healthy = reference(*(replace(window(error=1e-4, overall=1e-3), hops=16) for _ in range(3)))
+    full, first_hop = (judged(CASING, replace(window(overall=3e-3), hops=hops), healthy) for hops in (16, 1))
+    assert limits(full)["overall"].state == "danger"
+    assert limits(first_hop)["overall"].state == "normal"
+
+
+def test_what_varied_in_the_healthy_windows_may_vary() -> None:
+    healthy = reference(*(window(overall=value * 1e-3) for value in (0.5, 1.0, 2.0)))
+    assert limits(judged(CASING, window(overall=2.4e-3), healthy))["overall"].state == "normal"
+    assert limits(judged(CASING, window(overall=0.41e-3), healthy))["overall"].state == "normal"
+    assert limits(judged(CASING, window(overall=2.6e-3), healthy))["overall"].state == "alert"
+
+
+def test_a_line_that_was_noise_has_to_stand_out_of_it() -> None:
+    healthy = reference(*(window(error=1e-5, x2=value) for value in (1e-5, 2e-5, 1.5e-5)))
+    assert limits(judged(CASING, window(x2=6e-5), healthy))["x2"].state == "normal"
+    assert limits(judged(CASING, window(x2=9e-5), healthy))["x2"].state == "alert"
+
+
+def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() -> None:
+    healthy = reference(*(window(x1=10e-6 * np.exp(1j * turn)) for turn in (-0.05, 0.0, 0.05)), channel=SHAFT)
+    near, turned = (limits(judged(SHAFT, window(x1=10e-6 * np.exp(1j * turn)), healthy))["x1"] for turn in (0.3, 1.0))
+    assert near.state == "normal"
+    assert (turned.state, turned.source) == ("alert", "1x vector")
+    without_reference_of_phase = judged(SHAFT, replace(window(x1=-10e-6), vectors=None), healthy)
+    assert limits(without_reference_of_phase)["x1"].state == "normal"
+
+
+def test_every_operating_state_has_levels_of_its_own() -> None:
+    healthy = reference(
+        *(window(speed_rad_s=SPEED, overall=value) for value in (1e-3, 1.1e-3)),
+        *(window(speed_rad_s=-2 * SPEED, overall=value) for value in (4e-3, 4.1e-3)),
+    )
+    assert [state.windows for state in healthy.states] == [2, 2]
+    assert limits(judged(CASING, window(speed_rad_s=2 * SPEED, overall=4.5e-3), healthy))["overall"].state == "normal"
+    slow = judged(CASING, window(speed_rad_s=SPEED, overall=4.5e-3), healthy)
+    assert limits(slow)["overall"].state == "danger"
+    between = judged(CASING, window(speed_rad_s=1.3 * SPEED, overall=4.5e-3), healthy)
+    assert limits(between)["overall"].source == "commissioned at another speed"
+    assert limits(between)["overall"].state == "alert"
+
+
+def test_a_channel_clears_only_below_the_deadband() -> None:
+    settings: dict[str, Any] = {"limits": [{"channel": "DE-H", "alert": 10.0}]}
+    for level, beyond, small in ((10.5, True, False), (9.5, False, False), (8.9, False, True)):
+        state = channel_state(judged(CASING, window(overall=level * 1e-3), **settings))
+        assert (state.beyond, state.small) == (beyond, small), level
+
+
+def test_the_first_windows_become_the_reference_and_survive_a_restart() -> None:
+    first = FirstWindows(["DE-H"], 3)
+    for number in range(5):  # each overlaps the one before by half
+        first.take(number * 30, number * 30 + 60, window(overall=1e-3 * (1 + number), x1=1e-6j))
+        again = FirstWindows(["DE-H"], 3)
+        again.restore(first.checkpoint())
+        assert again.lacking == first.lacking
+        first = again
+    assert first.reference is not None
+    level = first.reference.states[0].levels["DE-H"]["overall"]
+    assert (level.low, level.high) == (1e-3, 5e-3)
+    assert first.reference.source == "the first windows"
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"zones": ["ISO 20816-3 group 3"]}, "did you mean"),
+        ({"zones": ["ISO 20816-3 group 1 rigid", "ISO 20816-3 group 2 rigid"]}, "one for the casing"),
+        ({"limits": [{"channel": "DE-H"}]}, "neither alert nor danger"),
+        ({"limits": [{"channel": "DE-H", "alert": 3, "danger": 2}]}, "must be below"),
+        ({"limits": [{"channel": "DE-H", "measure": "rsm", "alert": 3}]}, "is not one of"),
+        ({"band_hz": [1000, 10]}, "from < to"),
+        ({"alert_ratio": 3}, "must be below danger_ratio"),
+    ],
+)
+def test_mistakes_in_the_settings_are_named(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        LevelSettings.model_validate(settings)

@@ -1,0 +1,138 @@
+"""Machines of which nothing is known but their sensors: levels are watched from the first hop on."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from models.commissioning.commission import commission
+from models.commissioning.commissioned import FILE, Installed, RecordingEntry, install
+from models.commissioning.healthy import healthy_from_blocks
+from models.machine import MachineFile
+from models.signals.block import SampleBlock
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.health import HealthState
+from service.monitor.monitor import MachineMonitor
+
+RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
+FAN = MachineFile.model_validate(
+    {
+        "site": "plant",
+        "name": "fan",
+        "rate_hz": RATE_HZ,
+        "sensors": [
+            {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"},
+            {"name": "NDE-V", "quantity": "velocity", "location": "NDE", "direction": "vertical", "unit": "mm/s"},
+        ],
+        "window": {"length_s": 20.0, "max_span_s": 30.0},
+        "levels": {"reference_windows": 3},
+    }
+)
+
+
+def blocks(
+    seed: int, seconds: float, growth: tuple[float, float] = (1e9, 1.0), first: int = 0
+) -> Iterator[SampleBlock]:
+    """A fan whose drive end becomes louder from a time on, s from the start of all streams."""
+    rng = np.random.default_rng([91, seed, first])
+    size = round(BLOCK_S * RATE_HZ)
+    for number in range(first, first + round(seconds / BLOCK_S)):
+        t = number * BLOCK_S + np.arange(size) / RATE_HZ
+        gain = np.where(t >= growth[0], growth[1], 1.0)
+        drive = gain * (0.4 * np.sin(2 * np.pi * 24.8 * t) + 0.5 * rng.standard_normal(size))
+        other = 1.1 * np.sin(2 * np.pi * 24.8 * t) + 0.3 * rng.standard_normal(size)
+        yield SampleBlock(
+            run=1,
+            sequence=number,
+            start_ns=START_NS + round(number * BLOCK_S * 1e9),
+            rate_hz=RATE_HZ,
+            samples=np.column_stack([drive, other]).astype(np.float32),
+        )
+
+
+def run(monitor: MachineMonitor, stream: Iterator[SampleBlock]) -> tuple[list[str], list[tuple[EventKind, str, float]]]:
+    """Reports as JSON, and alarm events: what happened, to which alarm, when, s from the start of all streams."""
+    windows, events = [], []
+    for block in stream:
+        report = monitor.step(block)
+        assert report.verdict.accepted, report.verdict.text
+        assert report.fault is None
+        windows += [window.model_dump_json() for window in report.windows]
+        events += [(one.kind, one.alarm.name, (one.time_ns - START_NS) / 1e9) for one in report.events]
+    return windows, events
+
+
+def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_on() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    windows, events = run(monitor, blocks(1, 30))
+    assert len(windows) == 5  # the first hop needs a second of history
+    assert '"levels":[{"channel":"DE-H"' in windows[0]
+    assert not events
+    health = monitor.health()
+    assert health.state is HealthState.WATCHING
+    assert "neither known nor commissioned" in health.reason
+    assert health.latest is not None
+    drive, other = health.latest.levels
+    assert drive.overall == pytest.approx(np.hypot(0.4 / np.sqrt(2), 0.5), rel=0.02)
+    assert other.overall == pytest.approx(np.hypot(1.1 / np.sqrt(2), 0.3 * np.sqrt(990 / 2560)), rel=0.02)
+    assert (drive.unit, other.unit, other.velocity) == ("m/s2", "mm/s", None)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_machine_that_doubles_after_its_first_windows_raises_the_alarm_of_its_channel(seed: int) -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    _, events = run(monitor, blocks(seed, 140, growth=(90.0, 2.0)))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
+    assert 90 < events[0][2] <= 90 + 2 * FAN.window.length_s
+    alarm = next(one for one in monitor.health().alarms if one.name == "level:DE-H")
+    assert "alert from" in alarm.note
+    assert "the first windows" in alarm.note
+    assert monitor.health().state is HealthState.ALERT
+
+
+def test_a_growth_by_four_is_a_danger_and_clears_when_it_is_gone() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    _, events = run(monitor, blocks(4, 120, growth=(80.0, 4.0)))
+    kinds = [kind for kind, name, _ in events if name == "level:DE-H"]
+    assert kinds in ([EventKind.RAISED], [EventKind.RAISED, EventKind.ESCALATED])
+    assert monitor.health().state is HealthState.DANGER
+    _, events = run(monitor, blocks(4, 120, first=240))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.CLEARED, "level:DE-H")]
+    assert monitor.health().state is HealthState.WATCHING
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit(whole: bool) -> None:
+    straight = MachineMonitor(install(FAN, None))
+    expected = run(straight, blocks(5, 100, growth=(85.0, 3.0)))
+    stream = list(blocks(5, 100, growth=(85.0, 3.0)))
+    first = MachineMonitor(install(FAN, None))
+    before = run(first, iter(stream[:90]))
+    state = first.state(whole=whole)
+    second = MachineMonitor(install(FAN, None))
+    second.restore(state.state, tuple(data for _, data in state.new_parts))
+    second.restore_alarms(state.alarms)
+    if not whole:
+        for number, block in enumerate(stream[:90]):
+            second._window.recall(block.samples, block.start_ns, newest=number == 89)
+    after = run(second, iter(stream[90:]))
+    assert (before[0] + after[0], before[1] + after[1]) == expected
+
+
+def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
+    healthy = healthy_from_blocks("healthy.mcap", FAN, [(block, "") for block in blocks(6, 150)])
+    entry = RecordingEntry(
+        name="healthy.mcap", sha256="0" * 64, start_ns=START_NS, end_ns=START_NS + 150 * 10**9, used_s=145.0, gaps=0
+    )
+    made = commission(FAN, [healthy], [entry])
+    assert made.commissioned is not None, made.report.summary
+    assert made.report.verdict == "limited"
+    (tmp_path / FILE).write_text(made.commissioned.model_dump_json())
+    installed: Installed = install(FAN, tmp_path)
+    monitor = MachineMonitor(installed)
+    _, events = run(monitor, blocks(7, 60))
+    assert (monitor.health().state, monitor.health().reason, events) == (HealthState.UNCHANGED, "", [])
+    _, events = run(monitor, blocks(7, 40, growth=(0.0, 2.2), first=120))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
+    assert monitor.health().state is HealthState.ALERT
