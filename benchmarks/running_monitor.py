@@ -14,8 +14,6 @@ from pathlib import Path
 
 import httpx
 
-__all__ = ["ANSWER_S", "PLACE", "Monitor", "monitor"]
-
 PLACE = "demo/lab"
 ANSWER_S = 120.0
 

@@ -29,8 +29,6 @@ from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 
-__all__ = ["GOOD_RUN", "Grammar", "Message"]
-
 GOOD_RUN = 7
 """Of the first machine's own publisher."""
 

@@ -34,8 +34,6 @@ from service.commands.running import (
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from service.settings.service import ServiceSettings
 
-__all__ = ["app"]
-
 app = typer.Typer(
     name="rotorwatch",
     cls=Commands,

@@ -50,8 +50,6 @@ from service.stream.transport import Link, MachineCallbacks, MachineLink, Machin
 from service.stream.worker import MachineWorker
 from service.terminal.logs import logger
 
-__all__ = ["HttpError", "Runtime", "running"]
-
 _TICK_S = 0.25
 
 _log = logger(part="runtime")

@@ -3,8 +3,6 @@
 import os
 import socket
 
-__all__ = ["endpoint"]
-
 _WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 8
 _used_ports: set[int] = set()
 

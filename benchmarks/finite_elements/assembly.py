@@ -13,18 +13,6 @@ from benchmarks.finite_elements.elements import beam_inertia, beam_mass, beam_st
 from benchmarks.finite_elements.rotor import BeamRotor
 from models.signals.block import FloatArray
 
-__all__ = [
-    "Equations",
-    "Mode",
-    "assemble",
-    "harmonic_response",
-    "modes",
-    "place",
-    "probed",
-    "unbalance_force",
-    "unbalance_response",
-]
-
 ComplexArray = npt.NDArray[np.complex128]
 
 

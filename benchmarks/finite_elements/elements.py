@@ -9,8 +9,6 @@ import numpy as np
 
 from models.signals.block import FloatArray
 
-__all__ = ["beam_inertia", "beam_mass", "beam_stiffness", "shear_ratio"]
-
 
 def shear_ratio(EI: float, shear_stiffness_N: float, length_m: float) -> float:
     """Φ = 12 EI / (κGA L²): bending over shear stiffness of an element; 0 leaves shear out."""

@@ -12,8 +12,6 @@ from models.physics.excitation import ColouringFilter, Source, colouring_filter
 from models.physics.response import advance, discretise, stationary_covariance
 from models.signals.block import FloatArray
 
-__all__ = ["Force", "covariance_under", "force_samples", "forced"]
-
 
 @dataclass(frozen=True, slots=True)
 class Force:

@@ -5,8 +5,6 @@ from dataclasses import replace
 
 from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc
 
-__all__ = ["ROTORS", "rotor_named"]
-
 _OVERHUNG = BeamRotor(
     name="overhung",
     description="Disc overhung beyond two bearings, a coupling disc at the other end",

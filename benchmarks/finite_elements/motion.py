@@ -28,8 +28,6 @@ from benchmarks.finite_elements.rotor import BeamRotor
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 
-__all__ = ["PROBES", "Motion", "move"]
-
 PROBES = (
     *("y1", "y2", "z1", "z2"),
     *("y1_dot", "y2_dot", "z1_dot", "z2_dot"),

@@ -21,21 +21,6 @@ from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage, RecordingWriter
 from simulator.stream import JSON_ENCODING, block_message
 
-__all__ = [
-    "MOTION",
-    "RATE_HZ",
-    "SITE",
-    "RunCondition",
-    "WindowSizes",
-    "descriptor",
-    "machine_file",
-    "machine_of",
-    "plan",
-    "record_run",
-    "sampled",
-    "windows_of",
-]
-
 RATE_HZ = 2000.0
 SITE = "beams"
 MOTION = PROBES[:8]

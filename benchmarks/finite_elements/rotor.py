@@ -4,8 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-__all__ = ["CHANGEABLE", "BeamRotor", "Bearing", "Disc", "changed_rotor"]
-
 CHANGEABLE = ("k_by", "c_by", "k_bz", "c_bz", "e")
 """Parameters that can change: stiffness and damping of the measured bearing, unbalance of all discs."""
 

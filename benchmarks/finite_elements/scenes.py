@@ -10,8 +10,6 @@ from benchmarks.finite_elements.forces import Force, covariance_under
 from benchmarks.finite_elements.observed import RunCondition
 from benchmarks.finite_elements.rotor import BeamRotor
 
-__all__ = ["COMMISSIONED", "SceneRange", "SourceLayout", "drawn_condition"]
-
 
 class SourceLayout(StrEnum):
     """How the stochastic force reaches the machine."""

@@ -22,8 +22,6 @@ from models.physics.response import synchronous_response
 from models.physics.rotor import STATE_INDEX, changed
 from models.signals.block import FloatArray
 
-__all__ = ["TrueCondition", "cramer_rao"]
-
 _PULL = 1e-6
 """Keeps directions invertible that the sensors do not see at all."""
 

@@ -21,8 +21,6 @@ from models.machine import Machine
 from models.physics.rotor import STATE_INDEX, system_A
 from models.signals.block import FloatArray
 
-__all__ = ["FeatureVector", "Hotelling", "SubspaceModes", "reference_modes"]
-
 _MORE_ORDERS = 16
 """Model orders from twice the number of modes to this many above it, as in a stabilisation diagram; the median over
 them counts."""

@@ -19,19 +19,6 @@ from models.machine import Machine
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Equation
 
-__all__ = [
-    "PAPER_EQUATIONS",
-    "PaperDiagnostician",
-    "PaperEquation",
-    "PaperHealthy",
-    "PaperNetwork",
-    "calibrate_paper",
-    "full_correlation",
-    "mean_squared_deviation",
-    "paper_rows",
-    "phase_correlation",
-]
-
 _PHASE = "n"
 _SCALE_QUANTILE = 0.9
 

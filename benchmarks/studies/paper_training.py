@@ -10,8 +10,6 @@ from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 
-__all__ = ["train_paper_network"]
-
 _STEPS = 1000
 
 

@@ -11,8 +11,6 @@ from PIL import Image
 
 from benchmarks.studies.results import Chart, Estimate
 
-__all__ = ["draw"]
-
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """After Okabe and Ito: told apart with any colour vision."""
 _MARKERS = ("o", "s", "^", "D", "v", "P")

@@ -21,8 +21,6 @@ from service.access.tokens import masked
 from service.history.records import AuditEntry
 from service.terminal.logs import logger
 
-__all__ = ["STARTED", "AuditLog", "AuditNote", "AuditTrail", "Visit"]
-
 STARTED = "started"
 """Action of an entry that was written before the action, whose status is 0."""
 

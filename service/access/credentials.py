@@ -10,8 +10,6 @@ from starlette.datastructures import Headers
 from service.access.origin import SAFE_METHODS
 from service.access.scopes import Caller
 
-__all__ = ["BEARER", "NEEDED", "address_of", "challenges", "key_of", "network_of", "presented_text", "unauthenticated"]
-
 NEEDED = "an access token is needed, as header Authorization: Bearer rw_…"
 BEARER = 'Bearer realm="rotorwatch"'
 _BASIC = 'Basic realm="rotorwatch", charset="UTF-8"'

@@ -42,8 +42,6 @@ from service.history.records import TokenRecord
 from service.settings.access import AccessSettings
 from service.terminal.logs import Limiter, logger
 
-__all__ = ["ACCESS_PROBLEMS", "AccessError", "Guard"]
-
 ACCESS_PROBLEMS = (401, 403, 429, 503)
 """What any guarded route may answer besides its own; those that take a body also 413 and 415."""
 

@@ -20,8 +20,6 @@ from service.access.requirement import CALLER
 from service.access.scopes import Caller
 from service.terminal.logs import Limiter, logger
 
-__all__ = ["VISIT", "AccessMiddleware"]
-
 VISIT = "access_visit"
 """Where the request on its way is kept, in ``request.state``."""
 

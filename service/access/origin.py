@@ -12,8 +12,6 @@ from starlette.exceptions import HTTPException
 
 from models.signals.link import is_address
 
-__all__ = ["SAFE_METHODS", "check_body_type", "check_origin"]
-
 SAFE_METHODS = frozenset(("GET", "HEAD", "OPTIONS"))
 """Methods that change nothing."""
 

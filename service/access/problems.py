@@ -18,8 +18,6 @@ from rotorwatch.records.monitor import Problem
 from service.history.records import StoreError
 from service.terminal.logs import logger
 
-__all__ = ["add_problems", "problem_answer", "problem_responses", "responses", "share_problems"]
-
 _PROBLEM = "application/problem+json"
 _ANYWHERE = (422, 429, 500)
 _GUARDED = (401, 403, 503)

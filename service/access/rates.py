@@ -11,8 +11,6 @@ from contextlib import contextmanager
 
 from models.errors import RotorwatchError
 
-__all__ = ["MovingWindow", "StreamSeats", "TooManyStreamsError"]
-
 _MINUTE_S = 60.0
 _KEYS = 10_000
 

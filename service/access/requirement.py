@@ -11,8 +11,6 @@ from service.access.audit import AuditNote
 from service.access.credentials import BEARER, NEEDED
 from service.access.scopes import Caller, Scope
 
-__all__ = ["CALLER", "Requirement", "caller_of", "requires"]
-
 CALLER = "access_caller"
 """Where the middleware leaves the caller, in ``request.state``."""
 

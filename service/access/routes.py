@@ -10,8 +10,6 @@ from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from service.access.requirement import Requirement
 from service.access.scopes import Scope
 
-__all__ = ["PROBE_PATHS", "PUBLIC_PATHS", "declared_scopes", "undeclared_routes", "unguarded_routes"]
-
 PUBLIC_PATHS = frozenset(("/healthz",))
 """Paths that anybody may GET."""
 

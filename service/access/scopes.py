@@ -3,8 +3,6 @@
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-__all__ = ["ANONYMOUS", "NOBODY", "Caller", "Scope"]
-
 
 class Scope(StrEnum):
     """What a caller may do; each is granted by itself, none includes another.

@@ -7,8 +7,6 @@ from typing import Any
 from models.errors import MachineFileError
 from service.settings.access import AccessSettings, TlsSettings
 
-__all__ = ["server_arguments", "tls_context"]
-
 _READABLE_BY_OTHERS = 0o004
 
 

@@ -13,8 +13,6 @@ from models.errors import MachineFileError
 from service.access.scopes import ANONYMOUS, Scope
 from service.history.records import TokenRecord
 
-__all__ = ["LONGEST_DAYS", "PresentedToken", "TokenStore", "masked", "new_token", "parse_token", "token_is_valid"]
-
 LONGEST_DAYS = 3650
 _ALPHABET = string.digits + string.ascii_uppercase + string.ascii_lowercase
 _ID_LENGTH = 12

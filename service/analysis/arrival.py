@@ -18,8 +18,6 @@ from models.signals.wire import decode_block
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.levels import LevelWatch
 
-__all__ = ["Arrival", "examined"]
-
 
 @dataclass(frozen=True, slots=True)
 class Arrival:

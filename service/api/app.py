@@ -24,9 +24,7 @@ from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
 from service.api.routes.service import add_service_routes
 from service.api.routes.snapshots import add_snapshot_routes
-from service.api.views import PLACE, MachineName, MachineView, ServiceView, SiteName, found_machine
-
-__all__ = ["MachineView", "ServiceView", "create_app"]
+from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
 

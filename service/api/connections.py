@@ -32,8 +32,6 @@ from service.access.credentials import network_of
 from service.settings.service import HttpSettings
 from service.terminal.logs import Limiter, logger
 
-__all__ = ["HttpConnections"]
-
 _LOOK_S = 0.2
 _MINUTE_S = 60.0
 _MOMENTS_S = 5.0

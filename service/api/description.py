@@ -9,8 +9,6 @@ from fastapi.routing import iter_route_contexts
 
 from service.access.problems import share_problems
 
-__all__ = ["DescribedApp", "only_known_arguments"]
-
 _STRICT = "/api/"
 
 

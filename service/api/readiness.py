@@ -5,8 +5,6 @@ from collections.abc import Iterator, Sequence
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.stream.liveness import STUCK_S
 
-__all__ = ["readiness_of"]
-
 
 def readiness_of(
     *,

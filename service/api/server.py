@@ -16,8 +16,6 @@ from service.settings.access import AccessSettings
 from service.settings.service import HttpSettings
 from service.terminal.logs import logger
 
-__all__ = ["HttpError", "HttpServer", "http_connections"]
-
 _JOIN_S = 10.0
 _LAST_ANSWERS_S = 5
 _SHARE = 3

@@ -24,19 +24,6 @@ from service.history.shared import AuditLog
 from service.monitor.alarms.operation import OperatorAction
 from service.monitor.reports import Identity
 
-__all__ = [
-    "PLACE",
-    "AlarmName",
-    "Limit",
-    "MachineName",
-    "MachineView",
-    "ServiceView",
-    "SinceNs",
-    "SiteName",
-    "UntilNs",
-    "found_machine",
-]
-
 PLACE = "/api/v1/machines/{site}/{machine}"
 _LATEST_NS = 2**63 - 1
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
     from service.history.store import Store
     from service.settings.service import HistorySettings
 
-__all__ = ["creation_hint", "register"]
-
 _PAGE = 500
 
 

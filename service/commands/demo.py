@@ -44,8 +44,6 @@ from rotorwatch.records.health import Report
 from service.stream.transport import TopicMessage, follow
 from service.terminal.lines import alarm_event_line, report_heading, report_row, with_minus_signs
 
-__all__ = ["FAULTS", "DemoError", "DemoOptions", "Outcome", "run_demo"]
-
 FAULTS = {"k_by": -0.25, "c_by": -0.30, "k_bz": -0.25, "c_bz": -0.30, "e": 0.30}
 """What can break, and the relative change; the simulator's scenarios of these names do the same."""
 

@@ -11,8 +11,6 @@ from service.commands.running import HistoryOption, exit_codes
 if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
     from service.history.file import HistoryFile
 
-__all__ = ["register"]
-
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""

@@ -14,8 +14,6 @@ from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
 
-__all__ = ["register"]
-
 _SENSOR = ("name", "quantity", "unit", "location", "direction")
 _EXAMPLE = "DE-H acceleration g DE horizontal"
 

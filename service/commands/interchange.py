@@ -8,8 +8,6 @@ import typer
 
 from service.commands.running import exit_codes, one_blas_thread
 
-__all__ = ["register"]
-
 _LISTED = 5
 _TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d"]
 

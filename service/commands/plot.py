@@ -15,8 +15,6 @@ from service.commands.running import Commands, FromOption, ToOption, exit_codes,
 if TYPE_CHECKING:
     from service.analysis.plots.request import Lines, Paint, Recorded
 
-__all__ = ["register"]
-
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
 _plots = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
 

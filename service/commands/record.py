@@ -20,8 +20,6 @@ if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from service.recordings.recorder import MachineRecorder
     from service.settings.service import HistorySettings, RecordingSettings
 
-__all__ = ["register"]
-
 _STATUS_S = 0.5
 
 

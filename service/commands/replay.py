@@ -24,8 +24,6 @@ if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must
     from service.stream.replay_link import NetworkPlan
     from service.terminal.stopping import StopRequest
 
-__all__ = ["NamespaceOption", "in_namespace", "register", "summary_lines"]
-
 _SLOWEST, _FASTEST = 0.1, 1000.0
 
 NamespaceOption = Annotated[

@@ -13,23 +13,6 @@ from typer.core import TyperGroup
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
 
-__all__ = [
-    "ENDPOINT",
-    "Commands",
-    "ConnectOption",
-    "FromOption",
-    "HistoryOption",
-    "LinkOption",
-    "ListenOption",
-    "ToOption",
-    "VersionOption",
-    "check_address_space",
-    "exit_codes",
-    "one_blas_thread",
-    "raise_file_limit",
-    "share_memory_arenas",
-]
-
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
 

@@ -19,8 +19,6 @@ if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait fo
     from rotorwatch.records.health import Health
     from service.stream.transport import TopicMessage
 
-__all__ = ["register"]
-
 _ALARM, _NO_DATA, _NO_ANSWER = 1, 3, 4
 _SUMMARY = {0: "well", _ALARM: "alarm", _NO_DATA: "no-data", _NO_ANSWER: "no-answer"}
 _BAD_STATES = ("alert", "danger", "outside-model", "data-health", "no-data")

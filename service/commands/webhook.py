@@ -8,8 +8,6 @@ import typer
 from models.errors import MachineFileError
 from service.commands.running import exit_codes
 
-__all__ = ["register"]
-
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""

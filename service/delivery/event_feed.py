@@ -23,8 +23,6 @@ from models.errors import RotorwatchError
 from rotorwatch.records.health import Health
 from service.history.records import StoredEvent, StoreError
 
-__all__ = ["CURSOR_PATTERN", "AlarmLog", "Cursor", "CursorError", "EventFeed", "cursor_text", "parsed_cursor"]
-
 Cursor = dict[str, int]
 """Sequence of the last alarm event that was delivered, for each ``site/machine``; -1 before the first."""
 

@@ -20,8 +20,6 @@ import zstandard
 
 from service.history.records import CheckpointHead, Step, StoredEvent, StoredReading, StoredReport, StoreError
 
-__all__ = ["Bundle", "Claim", "PackedReport", "pack", "unpack"]
-
 _LARGEST = 2**63
 _LEVEL = 15
 # Never changed: every report that was ever written is read with it, those of before it existed too.

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from sqlalchemy.dialects import postgresql, sqlite
     from sqlalchemy.sql.schema import Table
 
-__all__ = ["Database"]
-
 _ANSWER_S = 60.0  # at least; a query over a long time may take a while
 _FINISH_S = 2.0  # for what others have asked for when the history is closed
 _JOIN_S = 10.0

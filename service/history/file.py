@@ -14,8 +14,6 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from service.history.records import DamagedError, StoreError
 
-__all__ = ["HistoryFile", "back_up", "faults", "is_damage", "lock_file", "restore"]
-
 _DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 _COMPANIONS = ("", "-wal", "-shm")
 

@@ -16,8 +16,6 @@ from service.history.records import StoredEvent, StoreError
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, machines, reports, series, windows
 from service.history.windows import READING, fill_buckets, packed
 
-__all__ = ["SeriesNumbers", "write_group"]
-
 SeriesNumbers = dict[tuple[int, str, str], int]
 _Rows = defaultdict[Table, list[dict[str, Any]]]
 

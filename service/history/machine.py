@@ -19,8 +19,6 @@ from service.history.trend import trend
 from service.history.windows import READING, unpacked
 from service.history.writer import Writer
 
-__all__ = ["MachineStore"]
-
 _AT_ONCE = 1000  # windows
 _HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
 

@@ -10,22 +10,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from models.errors import RotorwatchError
 
-__all__ = [
-    "AuditEntry",
-    "Checkpoint",
-    "CheckpointHead",
-    "CheckpointStep",
-    "DamagedError",
-    "Dropped",
-    "Retention",
-    "Step",
-    "StoreError",
-    "StoredEvent",
-    "StoredReading",
-    "StoredReport",
-    "TokenRecord",
-]
-
 
 @dataclass(frozen=True, slots=True)
 class StoredEvent:

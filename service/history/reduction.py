@@ -11,8 +11,6 @@ from service.history.records import Dropped, Retention, StoreError
 from service.history.tables import buckets, machines, reports, series, windows
 from service.history.windows import fill_buckets
 
-__all__ = ["Reduction"]
-
 _DAY_NS = 86_400 * 10**9
 _EVERY_S = 300.0
 _BATCH = 500  # rows or windows in one transaction: others write between two of them

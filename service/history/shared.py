@@ -8,8 +8,6 @@ from service.history.database import Database
 from service.history.records import AuditEntry, StoredEvent, StoreError, TokenRecord
 from service.history.tables import alarm_events, audit_log, machines, tokens, webhook_cursors
 
-__all__ = ["EVENT", "AlarmLog", "AuditLog", "TokenStore", "WebhookCursors", "committed_events"]
-
 EVENT = [alarm_events.c[name] for name in StoredEvent.__dataclass_fields__]
 _MOST = 10_000
 _TIMEOUT_S = 5.0

@@ -24,8 +24,6 @@ from service.history.reduction import Reduction
 from service.history.shared import AlarmLog, AuditLog, TokenStore, WebhookCursors
 from service.history.writer import Writer
 
-__all__ = ["Store"]
-
 _PROBE_S = 3.0
 
 

@@ -17,11 +17,6 @@ import sqlalchemy as sa
 from sqlalchemy import BigInteger, Double, Integer, LargeBinary, Text
 from sqlalchemy.types import TypeEngine
 
-__all__ = [
-    "REVISION", "alarm_events", "audit_log", "buckets", "checkpoint_parts", "checkpoints", "machines", "metadata",
-    "reports", "series", "tokens", "webhook_cursors", "windows",
-]  # fmt: skip
-
 REVISION = "0004"
 """The migration that ends with these tables."""
 

@@ -11,8 +11,6 @@ from rotorwatch.records.history import ReadingBucket
 from service.history.tables import buckets, machines, series, windows
 from service.history.windows import BUCKET, READING, Records, add_up, finite, singles, unpacked
 
-__all__ = ["trend"]
-
 _SINGLE = 20_000
 """Windows whose single readings are reduced when a trend is asked for; over more of them the stored buckets are."""
 _END = 2**63 - 1

@@ -16,8 +16,6 @@ from sqlalchemy import Connection, select
 from service.history.database import Database
 from service.history.tables import buckets, windows
 
-__all__ = ["BUCKET", "READING", "Records", "add_up", "fill_buckets", "finite", "packed", "singles", "unpacked"]
-
 Records: TypeAlias = npt.NDArray[np.void]
 READING = np.dtype([("series_id", "<i4"), ("value", "<f8"), ("standard_error", "<f8")])
 """A standard error that there is none of is NaN."""

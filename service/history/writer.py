@@ -20,8 +20,6 @@ from service.history.group import SeriesNumbers, write_group
 from service.history.records import Step, StoreError
 from service.history.tables import machines
 
-__all__ = ["Writer"]
-
 _LOCK = 0x726F746F  # first number of PostgreSQL's advisory locks; the second is the machine's
 _LOOK_S = 2.0  # between looks whether the database is still where it should be
 _PATIENCE = 4.0  # times the database's timeout: others may be before this step

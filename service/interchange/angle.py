@@ -14,8 +14,6 @@ from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Piece, Read, Signal, pieces
 from service.interchange.source import Reference, Source, SourceError
 
-__all__ = ["AngleColumn", "read_pulses"]
-
 _TURN = 2 * np.pi
 
 

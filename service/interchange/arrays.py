@@ -13,8 +13,6 @@ import numpy as np
 
 from service.interchange.source import Array, Reference, Source, SourceError, Timing, readable
 
-__all__ = ["MatlabSource", "NumpySource", "WavSource", "columns_of"]
-
 
 def columns_of(path: Path, array: Any, reference: Reference) -> Any:  # an ndarray, or a data set that slices like one
     """One column of an array, still in the file if the array is: a function of a slice.

@@ -12,8 +12,6 @@ from models.signals.recording import RecordedMessage
 from models.signals.wire import encode_block
 from service.interchange.samples import Piece
 
-__all__ = ["BlockMaker", "Written"]
-
 _BLOCK_S = 0.1
 _TURN = 2 * np.pi
 

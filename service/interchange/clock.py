@@ -13,8 +13,6 @@ from models.signals.channels import time_unit_ns
 from service.interchange.mapping import TimeBase
 from service.interchange.source import Array, Reference, Source, SourceError, Timing
 
-__all__ = ["Clock", "check_order", "clock_for"]
-
 _MOST_RATIO = 2000
 
 

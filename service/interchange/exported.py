@@ -23,8 +23,6 @@ from models.signals.wire import decode_block
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import MEASURES, Report
 
-__all__ = ["Selection", "Table", "alarm_table", "report_table", "stream_table"]
-
 _ROWS = 65536
 _MESSAGES = 1000
 _Row = dict[str, object]

@@ -15,8 +15,6 @@ from models.errors import RecordingError
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.interchange.source import Array
 
-__all__ = ["ExportFormat", "ExportSubject", "export"]
-
 ExportFormat = Literal["parquet", "csv", "mat"]
 ExportSubject = Literal["stream", "reports", "alarms"]
 

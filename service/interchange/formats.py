@@ -9,8 +9,6 @@ from service.interchange.source import Source, SourceError
 if TYPE_CHECKING:
     from service.interchange.mapping import Mapping
 
-__all__ = ["Format", "open_source"]
-
 Format = Literal["csv", "parquet", "npz", "mat", "wav", "uff", "tdms", "mf4"]
 _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
     "csv": ("tables.CsvSource", (".csv", ".txt", ".tsv")),

@@ -23,8 +23,6 @@ from service.interchange.overlap import Integration, Overlap, Resampling
 from service.interchange.samples import Piece, Read, pieces, signals_of
 from service.interchange.source import Reference, SourceError
 
-__all__ = ["Imported", "import_file"]
-
 
 @dataclass(frozen=True, slots=True)
 class Imported:

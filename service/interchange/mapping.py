@@ -15,8 +15,6 @@ from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from service.interchange.formats import Format
 
-__all__ = ["Column", "CsvFormat", "Keyphasor", "Mapping", "TimeBase", "load_mapping"]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 _DATETIME = "datetime"
 

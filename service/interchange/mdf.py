@@ -9,8 +9,6 @@ import numpy as np
 
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, Timing, equally_long, readable
 
-__all__ = ["MdfSource"]
-
 _SAME_TIME_S = 1e-9
 
 

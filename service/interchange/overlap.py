@@ -14,8 +14,6 @@ from scipy.signal import resample_poly
 from models.signals.block import FloatArray, integrated, settling_s
 from service.interchange.samples import Piece, Signal
 
-__all__ = ["Integration", "Overlap", "Resampling", "WindowFilter"]
-
 _CORE_ROWS = 65536
 
 

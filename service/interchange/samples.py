@@ -13,8 +13,6 @@ from service.interchange.clock import Clock, check_order
 from service.interchange.mapping import Column, Mapping
 from service.interchange.source import Array, Reference, Source, SourceError, as_numbers
 
-__all__ = ["Gap", "Piece", "Read", "Signal", "pieces", "signals_of"]
-
 
 @dataclass(frozen=True, slots=True)
 class Signal:

@@ -15,19 +15,6 @@ import numpy.typing as npt
 
 from models.errors import MachineFileError
 
-__all__ = [
-    "CHUNK_ROWS",
-    "Array",
-    "Reference",
-    "Source",
-    "SourceError",
-    "Timing",
-    "as_numbers",
-    "equally_long",
-    "named",
-    "readable",
-]
-
 CHUNK_ROWS = 65536
 """Rows that are read at a time."""
 

@@ -8,8 +8,6 @@ from models.signals.block import lowest_valid_hz, settling_s
 from service.interchange.importing import Imported
 from service.interchange.samples import Gap
 
-__all__ = ["summary_lines"]
-
 _LISTED = 10
 
 

@@ -12,8 +12,6 @@ import pyarrow.parquet
 from service.interchange.mapping import CsvFormat
 from service.interchange.source import CHUNK_ROWS, Array, Reference, Source, SourceError, readable
 
-__all__ = ["CsvSource", "ParquetSource"]
-
 _BYTES = 4 << 20
 
 

@@ -8,8 +8,6 @@ import numpy as np
 
 from service.interchange.source import Reference, Source, SourceError, Timing, readable
 
-__all__ = ["TdmsSource"]
-
 
 class TdmsSource(Source):
     """A TDMS file, read piece by piece. Channels are named ``group/channel``, or ``channel`` where that is unique.

@@ -8,8 +8,6 @@ import numpy as np
 
 from service.interchange.source import Reference, Source, SourceError, Timing, readable
 
-__all__ = ["UniversalSource"]
-
 _TIME_RESPONSE = 1
 _EVEN = 1e-6
 

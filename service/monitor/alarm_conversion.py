@@ -13,8 +13,6 @@ from rotorwatch.records.fields import finite
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.reports import Identity
 
-__all__ = ["alarm_cloud_event", "alarm_entries", "alarm_log_page", "alarm_states", "rfc3339"]
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 

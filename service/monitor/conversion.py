@@ -8,9 +8,6 @@ from rotorwatch.records.machines import Channel, DetectableChanges, DetectablePa
 from service.monitor.alarm_conversion import alarm_entries, rfc3339
 from service.monitor.reports import Identity, MachineHealth
 
-__all__ = ["detectable_changes", "health", "machine_description"]
-
-
 _REPLAYED = "a replay is announced on this machine's own keys: what is replayed is not evaluated"
 
 

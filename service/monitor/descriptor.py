@@ -5,8 +5,6 @@ from pydantic import ValidationError
 from models.machine import MachineFile
 from models.signals.channels import ChannelDescriptor
 
-__all__ = ["MOST_BYTES", "MOST_DIFFERENCES", "descriptor_mismatch"]
-
 MOST_BYTES = 65_536
 """Of an announced descriptor that is read at all; one of 64 channels takes a tenth of it."""
 

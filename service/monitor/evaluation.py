@@ -33,8 +33,6 @@ from models.signals.channels import Channel, with_channel_names
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.windows import Equation, Opinion, Parameter, Shape
 
-__all__ = ["Evaluation", "WindowEvaluator", "evaluator_for"]
-
 _LIKELIHOOD, _SHAPE, _EXPLAINED = "likelihood", "shape", "explained_ns"
 _NO_EQUATION = "no equation can be evaluated on this machine; see what is said of each channel"
 _EMPTY = np.zeros((0, 0))

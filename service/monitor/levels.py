@@ -15,8 +15,6 @@ from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
 from service.monitor.alarms.book import AlarmBook
 
-__all__ = ["LevelWatch"]
-
 
 class LevelWatch:
     """Judges the levels of every window.

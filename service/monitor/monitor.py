@@ -42,8 +42,6 @@ from service.monitor.levels import LevelWatch
 from service.monitor.parts import divided, joined
 from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, WindowHeading, counted, identity_of
 
-__all__ = ["MachineMonitor"]
-
 _RPM = 30 / np.pi
 _NEWEST_SAMPLES = 20_000
 

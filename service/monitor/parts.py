@@ -17,8 +17,6 @@ from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
 from models.diagnosis.verdict.sequential import hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 
-__all__ = ["divided", "joined"]
-
 _HOP = "hop "
 _LARGE = 4096
 

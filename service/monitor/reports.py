@@ -12,18 +12,6 @@ from rotorwatch.records.health import HealthState, Quality, Report
 from rotorwatch.records.levels import ChannelLevels
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 
-__all__ = [
-    "Identity",
-    "MachineHealth",
-    "MonitorReport",
-    "MonitorState",
-    "Tally",
-    "WindowHeading",
-    "counted",
-    "identity_of",
-    "machine_hash",
-]
-
 
 class Identity(TypedDict):
     """Who speaks, the same in every record: the machine and the exact files its monitor runs on."""

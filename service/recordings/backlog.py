@@ -5,8 +5,6 @@ from collections import deque
 
 from models.signals.recording import RecordedMessage
 
-__all__ = ["Backlog"]
-
 _BATCH_BYTES = 1_000_000
 _MESSAGE_BYTES = 300  # what a message costs beyond its bytes
 

@@ -19,8 +19,6 @@ from pathlib import Path
 from models.errors import RecordingError
 from models.signals.recording import summarize_recording
 
-__all__ = ["KEPT", "PART", "SUFFIX", "Catalogue", "Recording", "kept_reasons", "name_of", "start_of"]
-
 SUFFIX = ".mcap"
 PART = ".part"
 KEPT = "kept.json"

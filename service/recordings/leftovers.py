@@ -12,8 +12,6 @@ from models.signals.recording import writing
 from models.signals.salvage import Salvage, salvage_recording
 from service.recordings.catalogue import PART, SUFFIX
 
-__all__ = ["DAMAGED", "LOCK", "is_locked", "leftovers", "lock", "loss_text", "recover_leftover"]
-
 DAMAGED = ".damaged"
 LOCK = ".lock"
 

@@ -10,8 +10,6 @@ from models.signals.wire import REPLAY_MARK
 from service.recordings.catalogue import PART, SUFFIX
 from service.terminal.logs import logger
 
-__all__ = ["recent_messages", "recorded_files"]
-
 _log = logger(part="recordings")
 
 

@@ -30,8 +30,6 @@ from service.recordings.retention import AlarmMark, alarm_mark, decide, write_ke
 from service.settings.service import RecordingSettings
 from service.terminal.logs import Limiter, logger
 
-__all__ = ["MachineRecorder", "RecorderStatus"]
-
 _SYNC_S = 1.0
 _RETRY_S = 1.0
 _JOIN_S = 30.0

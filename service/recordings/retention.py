@@ -19,8 +19,6 @@ from service.history.records import StoredEvent
 from service.recordings.catalogue import KEPT, Recording, start_of
 from service.settings.service import RecordingSettings
 
-__all__ = ["AlarmMark", "Decision", "alarm_mark", "decide", "write_kept"]
-
 _NS = 1_000_000_000
 
 

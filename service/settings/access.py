@@ -9,8 +9,6 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from models.errors import MachineFileError
 from models.signals.link import is_loopback
 
-__all__ = ["AccessSettings", "LimitSettings", "TlsSettings", "check_access"]
-
 _STRICT = ConfigDict(extra="forbid", frozen=True)
 
 

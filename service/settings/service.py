@@ -20,20 +20,6 @@ from service.history.records import Retention
 from service.settings.access import AccessSettings, check_access
 from service.settings.webhooks import WebhookSettings, repeated_name
 
-__all__ = [
-    "DEFAULT_LISTEN",
-    "HistorySettings",
-    "HttpSettings",
-    "LogSettings",
-    "MachineEntry",
-    "QueueSettings",
-    "RecordingSettings",
-    "ReplaySettings",
-    "ServiceSettings",
-    "check_distinct",
-    "load_settings",
-]
-
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
 _STRICT = ConfigDict(extra="forbid", frozen=True)

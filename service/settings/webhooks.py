@@ -8,8 +8,6 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.signals.link import is_loopback
 
-__all__ = ["WebhookKind", "WebhookSettings", "repeated_name"]
-
 WebhookKind = Literal[
     "raised",
     "escalated",

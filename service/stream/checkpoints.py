@@ -25,11 +25,6 @@ from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import Identity, MonitorState
 
-__all__ = [
-    "FORMAT", "StepWriter", "checkpoint_step", "recorded_after", "recorded_since_ns", "restored", "stored_event",
-    "stored_readings", "stored_report",
-]  # fmt: skip
-
 FORMAT = 2
 """Goes up when what a monitor remembers changes its form."""
 _LOOK_BACK_NS, _LATE_NS = 300 * 10**9, 3600 * 10**9

@@ -8,8 +8,6 @@ from typing import Literal
 
 from models.signals.wire import sender_of
 
-__all__ = ["Inbox", "RawBlock"]
-
 _MOST_ODD = 16
 
 

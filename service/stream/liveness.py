@@ -3,8 +3,6 @@
 import time
 from collections.abc import Callable
 
-__all__ = ["STUCK_S", "Pulse"]
-
 STUCK_S = 60.0
 """A thread that is at work on one block for longer is stuck; an evaluation takes a fraction of a second."""
 

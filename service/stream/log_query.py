@@ -4,8 +4,6 @@ import re
 
 from models.errors import RotorwatchError
 
-__all__ = ["MOST_EVENTS", "QueryError", "read_log_query"]
-
 MOST_EVENTS = 1000
 _DEFAULT_EVENTS = 100
 _LIMITS = {"after": (-1, 2**53), "limit": (1, MOST_EVENTS)}

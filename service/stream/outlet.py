@@ -2,8 +2,6 @@
 
 from typing import Protocol
 
-__all__ = ["Outlet"]
-
 
 class Outlet(Protocol):
     """Where a worker publishes; `service.stream.transport.MachineLink` is one."""

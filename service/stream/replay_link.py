@@ -26,8 +26,6 @@ from service.recordings.replay.player import PlayPlan, play
 from service.recordings.replay.source import RecordingSource
 from service.stream.transport import Link
 
-__all__ = ["LiveMachineError", "NetworkPlan", "ReplayLink", "ReplayTarget", "replay_to_network"]
-
 _JSON = "application/json"
 _CACHE_STREAM = 300
 _CACHE_OTHER = 100

@@ -32,8 +32,6 @@ from service.stream.inbox import RawBlock
 from service.stream.log_query import read_log_query
 from service.terminal.logs import logger
 
-__all__ = ["Link", "LinkError", "MachineCallbacks", "MachineLink", "MachineTap", "TopicMessage", "follow", "route"]
-
 _JSON = "application/json"
 _CLOUD_EVENT = "application/cloudevents+json"
 _HEARTBEAT_S = 1.0

@@ -20,7 +20,7 @@ from service.analysis.snapshots.machine import MachineSnapshots
 from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoredReport
 from service.monitor import conversion
-from service.monitor.alarm_conversion import alarm_log_page, alarm_states
+from service.monitor.alarm_conversion import alarm_cloud_event, alarm_log_page, alarm_states
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import NO_ALARMS
 from service.monitor.alarms.operation import NotInTime, OperatorAction
@@ -32,8 +32,6 @@ from service.stream.checkpoints import StepWriter, recorded_after, recorded_sinc
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.outlet import Outlet
 from service.terminal.logs import Limiter, logger
-
-__all__ = ["Clocks", "MachineWorker"]
 
 _OPERATION_S = 10.0
 _HELD_UP_S = 2.0
@@ -279,7 +277,8 @@ class MachineWorker:
             try:
                 time_ns = self._operated_ns = max(self._data_now_ns(), self._operated_ns + 1)
                 events = self._monitor.operate(operation, time_ns)
-                done.set_result(tuple(AlarmCloudEvent.model_validate_json(text) for text in self._conclude((), events)))
+                self._conclude((), events)
+                done.set_result(tuple(alarm_cloud_event(self.identity, event) for event in events))
             except Exception as error:  # belongs to whoever asked; the thread goes on
                 done.set_exception(error)
 
@@ -410,8 +409,8 @@ class MachineWorker:
 
     def _conclude(
         self, windows: tuple[Report, ...], events: tuple[AlarmEvent, ...], *, always: bool = False, whole: bool = False
-    ) -> tuple[str, ...]:
-        """Commit, then let it be seen and publish; returns the events as they are published."""
+    ) -> None:
+        """Commit, then let it be seen and publish."""
         events += self._monitor.take_events()  # left behind by a defect
         self.steps.owe(events)
         snapshot = self._monitor.health()
@@ -435,7 +434,6 @@ class MachineWorker:
             self._failed(error)
         if self.steps.refused is not None:
             self._fault(f"the history refuses what happens: {self.steps.refused}")
-        return texts
 
     def _commit(
         self, windows: tuple[Report, ...], *, whole: bool

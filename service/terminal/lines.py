@@ -9,16 +9,6 @@ from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
-__all__ = [
-    "alarm_event_line",
-    "alarm_state_lines",
-    "health_line",
-    "report_heading",
-    "report_line",
-    "report_row",
-    "with_minus_signs",
-]
-
 _NUMBER = 11
 _TOO_LITTLE = "too little data since the change"
 

@@ -10,8 +10,6 @@ from structlog.typing import FilteringBoundLogger, Processor
 
 from service.settings.service import LogSettings
 
-__all__ = ["Limiter", "configure_logging", "logger"]
-
 _QUIET_S = 10.0
 
 

@@ -14,8 +14,6 @@ from models.signals.block import FloatArray, SampleBlock
 from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 
-__all__ = ["LAB", "NOTHING", "PARTIAL", "commissioned", "healthy", "recording", "samples_of", "stream", "with_samples"]
-
 LAB = load_machine("lab")
 _PHYSICS = ("rotor", "operation", "condition")
 _UNKNOWN = ("k_by_N_per_m", "k_bz_N_per_m", "c_by_N_s_per_m", "c_bz_N_s_per_m", "e_m")

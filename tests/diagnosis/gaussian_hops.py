@@ -10,8 +10,6 @@ from models.diagnosis.verdict.stretch import Stretch, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
 
-__all__ = ["DelayStudy", "GaussianHops", "detection_delays"]
-
 
 @dataclass(frozen=True, slots=True)
 class DelayStudy:

@@ -8,8 +8,6 @@ from subprocess import SubprocessError
 from tests.faults.rig import BLOCK_S, Plant, plant
 from tests.faults.scenarios import Row
 
-__all__ = ["Outcome", "carried_out"]
-
 _SLACK_S = 1.0
 
 

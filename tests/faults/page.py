@@ -6,8 +6,6 @@ from tests.faults.measure import Outcome
 from tests.faults.scenarios import ROWS, Row
 from tests.service.live import ROOT
 
-__all__ = ["PAGE", "written"]
-
 PAGE = ROOT / "docs" / "reliability.md"
 
 _HEAD = """# Reliability

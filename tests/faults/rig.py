@@ -27,8 +27,6 @@ from rotorwatch.records.monitor import Readiness
 from tests.service.hooked import Hook
 from tests.service.live import LAB, Program, endpoint, program
 
-__all__ = ["BLOCK_S", "Event", "Plant", "Seen", "locked", "pause", "plant"]
-
 BLOCK_S = 0.2
 _PLACE = "/api/v1/machines/demo/lab"
 _SHELVED = "EI"  # an alarm that nothing here raises

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from tests.faults import faults
 from tests.faults.rig import Plant
 
-__all__ = ["ROWS", "Row"]
-
 _NOTHING = "nothing"
 
 

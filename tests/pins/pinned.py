@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["differences"]
-
 _FOLDER = Path(__file__).parent
 _NEAR = 1e-6
 """Other processors round the last digits of a sum differently."""

@@ -19,8 +19,6 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, Report
 from service.stream.log_query import MOST_EVENTS
 
-__all__ = ["asyncapi"]
-
 _JSON = "application/json"
 _DESCRIPTION = """Which parameter of a rotating machine changed, by how much, how sure: what a rotorwatch monitor hears
 and publishes over Zenoh. JSON is UTF-8; numbers are finite or null and carry their unit in their name; `..._ns` are

@@ -11,8 +11,6 @@ from models.signals.channels import unit_factor
 from simulator.scenario import Scenario, load_scenario
 from simulator.stream import blocks
 
-__all__ = ["FOREIGN", "Foreign", "as_blocks", "foreign", "late_copy", "simulated"]
-
 Foreign = Literal["sines", "two sines", "drift", "late copy", "white noise", "quantised silence"]
 FOREIGN: tuple[Foreign, ...] = ("sines", "two sines", "drift", "late copy", "white noise", "quantised silence")
 

@@ -204,6 +204,3 @@ def problem(answer: httpx.Response, status: int) -> str:
     found = answer.json()
     assert found["status"] == status
     return str(found["detail"])
-
-
-__all__ = ["JSON", "Clock", "Guarded", "application", "basic", "guarded", "problem", "send", "served"]

@@ -18,8 +18,6 @@ from service.delivery.webhooks.signature import new_secret
 from service.history.records import StoredEvent
 from service.settings.webhooks import WebhookSettings
 
-__all__ = ["Got", "Hook", "alarm_event", "hook", "settings_for"]
-
 Answering = Callable[["Got"], tuple[int, Mapping[str, str]]]
 
 

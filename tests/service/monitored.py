@@ -19,8 +19,6 @@ from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
 from tests.service.live import Feed, endpoint, machine_file, open_session, scenario_blocks, send, settings, until
 
-__all__ = ["GUARDED", "OPEN", "PLACE", "answered", "client", "faulty", "fed", "problem", "token"]
-
 PLACE = "/api/v1/machines/demo/lab"
 OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
 GUARDED = AccessSettings(

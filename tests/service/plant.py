@@ -12,8 +12,6 @@ from models.signals.keys import Grant, MachineKeys
 from models.signals.link import LinkSettings
 from tests.service.live import endpoint, until
 
-__all__ = ["GRANTS", "PUMP", "Plant", "at_once", "kept", "opened", "plant"]
-
 PUMP = MachineKeys("demo", "pump")
 GRANTS = (
     Grant(who=("lab",), publishes=("demo/lab",)),

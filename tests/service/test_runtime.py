@@ -20,10 +20,11 @@ from models.machine import load_machine
 from models.signals.link import LinkSettings
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health, Report
+from service.api.server import HttpError
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
-from service.runtime import HttpError, Runtime, running
+from service.runtime import Runtime, running
 from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
 from service.stream.checkpoints import stored_event, stored_report
 from service.stream.transport import LinkError, TopicMessage, follow

@@ -20,8 +20,6 @@ from rotorwatch.records.windows import Equation as EquationReading
 from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["Correlations", "Curve", "Panel", "correlations_of", "latest_window"]
-
 
 @dataclass(frozen=True, slots=True)
 class Curve:

@@ -8,8 +8,6 @@ from matplotlib.lines import Line2D
 from service.analysis.plots.correlation import Correlations, Panel
 from service.analysis.plots.style import COLOURS, GREY, INK, Look, heading, rpm, stretch_text
 
-__all__ = ["paint_correlations"]
-
 
 def paint_correlations(found: Correlations, name: str, networks: str, look: Look) -> Figure:
     """Two panels for each equation."""

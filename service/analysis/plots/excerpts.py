@@ -13,8 +13,6 @@ from models.signals.keys import MachineKeys
 from models.signals.wire import decode_block
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["Excerpt", "RecordedStream", "begins_again"]
-
 _TOLERANCE_S = 2e-4
 _RATE_TOLERANCE = 1e-4
 

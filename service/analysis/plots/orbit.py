@@ -12,8 +12,6 @@ from service.analysis.snapshots.channels import orbit_pairs
 from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
 from service.analysis.snapshots.revolutions import pulses
 
-__all__ = ["Orbit", "Orbits", "Vector", "orbits_of", "read_orbits"]
-
 _UM = 1e6
 _LONGEST_S = 3600.0
 

@@ -8,8 +8,6 @@ from matplotlib.lines import Line2D
 from service.analysis.plots.orbit import Orbit, Orbits, Vector
 from service.analysis.plots.style import COLOURS, GREY, INK, Look, heading, rpm, stretch_text
 
-__all__ = ["paint_orbits"]
-
 _BLANK = 0.07
 """Gap before the keyphasor's dot, of the ellipse's length."""
 

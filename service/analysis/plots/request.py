@@ -22,8 +22,6 @@ from service.analysis.plots.trend_figure import paint_trend
 from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.source import RecordingSource, parse_moment
 
-__all__ = ["Lines", "Paint", "Recorded", "correlation", "orbit", "recorded", "spectrum", "trend", "waterfall"]
-
 Paint = Callable[[Look], Figure]
 """Draws what was read; all functions here that return one raise `RotorwatchError` if there is nothing to be seen."""
 

@@ -12,17 +12,6 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
 from service.analysis.plots.excerpts import Excerpt, RecordedStream, begins_again
 
-__all__ = [
-    "Scaling",
-    "Spectrum",
-    "Waterfall",
-    "lowest_hz",
-    "read_spectrum",
-    "read_waterfall",
-    "shown_as",
-    "summed_power",
-]
-
 _MOST_SPECTRA = 400
 _MOST_SPEEDS = 120
 _STEADY = 0.02

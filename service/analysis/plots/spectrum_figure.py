@@ -22,8 +22,6 @@ from service.analysis.plots.style import (
     time_axis,
 )
 
-__all__ = ["paint_cascade", "paint_map", "paint_spectrum"]
-
 _DECADES = 4
 _MOST_TRACES = 60
 _ORDERS = (1, 2)

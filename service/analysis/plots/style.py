@@ -17,26 +17,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.alarms import AlarmEventData
 from service.recordings.replay.source import clock
 
-__all__ = [
-    "COLOURS",
-    "GREY",
-    "INK",
-    "PLATE",
-    "SEVERITY_COLOURS",
-    "STATE_COLOURS",
-    "Look",
-    "alarm_lines",
-    "alarm_text",
-    "as_date",
-    "as_dates",
-    "draw",
-    "heading",
-    "rpm",
-    "stretch_text",
-    "time_axis",
-    "write_figure",
-]
-
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """After Okabe and Ito: told apart with any colour vision."""
 INK, GREY = "#222222", "#777777"

@@ -21,11 +21,6 @@ from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 
-__all__ = [
-    "SHOWN", "LevelTrend", "ParameterTrend", "Trend", "read_trend", "recorded_alarms", "trend_machine", "trend_of",
-]  # fmt: skip
-
-
 SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
 """Events that say something of the machine; what operators did to alarms is left out of the picture."""
 

@@ -29,8 +29,6 @@ from service.analysis.plots.style import (
 )
 from service.analysis.plots.trend import LevelTrend, ParameterTrend, Trend
 
-__all__ = ["paint_trend"]
-
 _GAP = 2.5
 _DASHES = (0, (4, 3))
 _LEAST_PERCENT = 5.0

@@ -10,17 +10,6 @@ from models.machine import MachineFile
 from models.signals.channels import Channel, Quantity, state_name
 from rotorwatch.records.snapshots import Units
 
-__all__ = [
-    "MOST_PAIRS",
-    "SnapshotError",
-    "chosen_channels",
-    "chosen_pairs",
-    "figures",
-    "orbit_pairs",
-    "product_unit",
-    "si_unit",
-]
-
 MOST_PAIRS = 8
 """Pairs in a snapshot that no pair was asked for."""
 _MOST_CHANNELS = 64

@@ -12,8 +12,6 @@ from service.analysis.snapshots.heading import LatestData, Subject, heading, no_
 from service.analysis.snapshots.measured import MeasuredCorrelations, measured_correlations
 from service.analysis.snapshots.prediction import Prediction
 
-__all__ = ["correlation_snapshot"]
-
 
 def correlation_snapshot(
     subject: Subject,

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Ellipse", "phase_lag_deg"]
-
 
 @dataclass(frozen=True, slots=True)
 class Ellipse:

@@ -22,8 +22,6 @@ from models.physics.rotor import COORDINATES, RotorParameters
 from models.signals.block import FloatArray
 from service.analysis.snapshots.sensor_noise import noise_density, sensor_noise
 
-__all__ = ["LEFT_OUT_BINS", "Excitation", "excitation_of", "window_speed"]
-
 LEFT_OUT_BINS = 3
 """Lines on either side of the rotation that are not compared: what is left of 1× there is not stochastic."""
 _GROUPS = 150

@@ -12,8 +12,6 @@ from rotorwatch.records.snapshots import PredictedChange, Theory
 from rotorwatch.records.windows import Parameter
 from service.monitor.reports import Identity
 
-__all__ = ["Heading", "LatestData", "Subject", "heading", "no_window", "theory"]
-
 
 @dataclass(frozen=True, slots=True)
 class Subject:

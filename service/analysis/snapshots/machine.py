@@ -13,8 +13,6 @@ from service.analysis.snapshots.prediction import NO_PARAMETERS, Prediction, pre
 from service.analysis.snapshots.spectrum import spectrum_snapshot
 from service.monitor.reports import Identity
 
-__all__ = ["MachineSnapshots"]
-
 _NO_WINDOW = "there is no window yet"
 
 

@@ -9,8 +9,6 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 
-__all__ = ["MeasuredCorrelations", "measured_correlations"]
-
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCorrelations:

@@ -18,8 +18,6 @@ from service.analysis.snapshots.heading import LatestData, Subject, heading, no_
 from service.analysis.snapshots.path import NewestPath, newest_path
 from service.analysis.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 
-__all__ = ["orbit_snapshot"]
-
 _NO_SPEED = "the speed of rotation is not known"
 
 

@@ -10,8 +10,6 @@ from models.signals.channels import Channel
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.revolutions import pulses
 
-__all__ = ["MOST_REVOLUTIONS", "NewestPath", "newest_path"]
-
 MOST_REVOLUTIONS = 64
 _MOST_SAMPLES = 20_000
 

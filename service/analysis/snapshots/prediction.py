@@ -24,8 +24,6 @@ from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
 from service.analysis.snapshots.excitation import Excitation, excitation_of
 
-__all__ = ["NOTHING_READ", "NO_PARAMETERS", "Prediction", "predict", "read_changes"]
-
 NOTHING_READ = "no parameter was read in this window"
 NO_PARAMETERS = "the machine's parameters are not known, so there is no theory to predict from"
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(5)

@@ -7,8 +7,6 @@ import numpy.typing as npt
 
 from models.signals.block import FloatArray, SampleBlock
 
-__all__ = ["NewestBlocks", "pulses"]
-
 
 def pulses(angle_rad: npt.NDArray[np.floating] | None) -> tuple[int, FloatArray]:
     """Direction of rotation, and where the shaft angle passes 0, in samples from the first one, interpolated.

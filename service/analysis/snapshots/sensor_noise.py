@@ -10,8 +10,6 @@ import numpy as np
 
 from models.signals.block import FloatArray
 
-__all__ = ["noise_density", "sensor_noise"]
-
 _STEPS, _LONGEST, _CLOSE = 30, 1.5, 0.01
 _STEEPEST = 4.0
 _LEAST, _USUAL = 1e-7, 1e-3

@@ -17,8 +17,6 @@ from service.analysis.snapshots.excitation import LEFT_OUT_BINS
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 from service.analysis.snapshots.prediction import Prediction
 
-__all__ = ["MOST_LINES", "spectrum_snapshot"]
-
 MOST_LINES = 1000
 """Lines in a snapshot; where the band has more, neighbours are averaged."""
 _SHARED = (1 + 2 / 36, 4 / 9 + 2 * 0.0200, 1 / 36 + 2 * 0.0069)

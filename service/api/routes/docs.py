@@ -12,8 +12,6 @@ from fastapi.responses import FileResponse, HTMLResponse
 
 from service.access.guard import Guard
 
-__all__ = ["add_docs_routes"]
-
 _ASSETS = Path(str(files("fastapi_offline"))) / "static"
 _SCRIPT = (
     'SwaggerUIBundle({url: "/openapi.json", dom_id: "#api", deepLinking: true, validatorUrl: null, '

@@ -16,8 +16,6 @@ from service.access.scopes import Caller
 from service.api.views import ServiceView
 from service.delivery.event_feed import CURSOR_PATTERN, AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
 
-__all__ = ["add_event_routes", "stream_example"]
-
 _LONGEST = 20_000
 _FORM = {"pattern": CURSOR_PATTERN}  # described here, refused in words that say more
 

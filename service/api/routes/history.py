@@ -26,8 +26,6 @@ from service.api.views import (
     found_machine,
 )
 
-__all__ = ["add_history_routes"]
-
 _LARGEST = 2**63 - 1
 _QUANTITIES = ("parameter", "equation", "level", *MEASURES)
 

@@ -25,8 +25,6 @@ from service.monitor.alarms.operation import (
     UnknownAlarm,
 )
 
-__all__ = ["add_operation_routes"]
-
 _IF_MATCH = r'^(\*|(W/)?"-?[0-9]{1,18}")$'
 _ETAG = {
     "ETag": {

@@ -8,8 +8,6 @@ from rotorwatch.records.alarms import Alarm, Severity
 from rotorwatch.records.health import MEASURES, Health, Report
 from rotorwatch.records.windows import Opinion, Parameter, Verdict
 
-__all__ = ["front_page"]
-
 _RELOAD_S = 5
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem; color: #1c2530 }

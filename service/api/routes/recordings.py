@@ -14,8 +14,6 @@ from service.access.problems import problem_answer, problem_responses, responses
 from service.recordings.catalogue import Recording
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["RecordingIndex", "add_recording_routes", "found_recording"]
-
 _NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
 _NONE = "no recordings: the settings name no directory for them ([recording] directory)"
 

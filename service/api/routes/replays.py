@@ -30,8 +30,6 @@ from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, Rep
 from service.recordings.replay.machine import is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
 
-__all__ = ["ReplayDesk", "add_replay_routes"]
-
 _PLACE = "/api/v1/replays"
 _LOOK_S = 0.25
 _QUIET_S = 15.0

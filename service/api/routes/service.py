@@ -11,8 +11,6 @@ from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
 from service.delivery.webhooks.webhooks import Webhooks
 
-__all__ = ["MeasuredView", "MetricsText", "add_service_routes"]
-
 _EXAMPLE = (
     "# HELP rotorwatch_blocks_accepted_total Blocks accepted\n"
     "# TYPE rotorwatch_blocks_accepted_total counter\n"

@@ -11,8 +11,6 @@ from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.path import MOST_REVOLUTIONS
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
-__all__ = ["add_snapshot_routes"]
-
 _NONE: list[str] = []
 
 _First = Annotated[list[str], Query(max_length=64, description="channel i of a pair, by name; may be repeated")]

@@ -22,8 +22,6 @@ from service.history.records import StoreError
 from service.recordings.recorder import RecorderStatus
 from service.stream.worker import MachineWorker
 
-__all__ = ["CONTENT_TYPE", "MeasuredService", "Metrics"]
-
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _PAGE = 1000
 _WEBHOOK_STATES = ("working", "failing", "disabled")

@@ -11,8 +11,6 @@ from rotorwatch.records.health import Health, HealthState
 from service.recordings.recorder import RecorderStatus
 from service.stream.worker import MachineWorker
 
-__all__ = ["Observed", "machine_families"]
-
 _PLACE = ("site", "machine")
 _RECORDER_STATES = ("off", "idle", "recording", "failing")
 

@@ -5,8 +5,6 @@ from collections.abc import Mapping
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-__all__ = ["NO_ROUTE", "REASONS", "RequestCounts", "RequestMeter"]
-
 NO_ROUTE = "-"
 """Route of a request that was refused before one was looked for, or whose path is none."""
 

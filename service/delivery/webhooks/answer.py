@@ -7,8 +7,6 @@ from email.utils import parsedate_to_datetime
 from enum import Enum, auto
 from http import HTTPStatus
 
-__all__ = ["Answer", "Meaning", "answer_of", "no_answer", "pause_s"]
-
 _FIRST_S = {"trouble": 1.0, "refused": 60.0}
 _LONGEST_ASKED_S = 3600.0
 _MOST_DOUBLINGS = 30

@@ -29,8 +29,6 @@ from service.history.records import StoredEvent, StoreError
 from service.settings.webhooks import WebhookSettings
 from service.terminal.logs import Limiter, logger
 
-__all__ = ["Cursors", "Dispatcher", "Post"]
-
 _PAGE = 100
 _QUIET_S = 15.0
 _AGAIN_S = 1.0

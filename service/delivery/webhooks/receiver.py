@@ -14,8 +14,6 @@ from service.delivery.webhooks.answer import Answer, answer_of, no_answer
 from service.delivery.webhooks.signature import signature, signing_keys
 from service.settings.webhooks import WebhookSettings
 
-__all__ = ["CONTENT_TYPE", "Receiver"]
-
 CONTENT_TYPE = "application/cloudevents+json"
 _MOST_READ = 65_536
 

@@ -12,8 +12,6 @@ from pathlib import Path
 from models.errors import MachineFileError
 from service.settings.webhooks import WebhookSettings
 
-__all__ = ["PREFIX", "new_secret", "parse_secret", "signature", "signing_keys"]
-
 PREFIX = "whsec_"
 _SHORTEST = 24
 _LONGEST = 64

@@ -14,8 +14,6 @@ from service.delivery.webhooks.receiver import Receiver
 from service.monitor.alarm_conversion import rfc3339
 from service.settings.webhooks import WebhookSettings
 
-__all__ = ["NotDeliveredError", "Webhooks", "send_test"]
-
 
 class NotDeliveredError(RotorwatchError):
     """A test event was not taken; the message says why."""

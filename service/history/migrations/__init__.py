@@ -10,8 +10,6 @@ from sqlalchemy import Connection, inspect, text
 
 from service.history.records import StoreError
 
-__all__ = ["migrate"]
-
 MIGRATING = (0x726F746F, 0)  # PostgreSQL's advisory lock; second numbers from 1 are machines
 
 

@@ -7,8 +7,6 @@ from models.diagnosis.readings import Z95
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
 
-__all__ = ["Alarm", "AlarmEvent"]
-
 
 @dataclass(frozen=True, slots=True)
 class Alarm:

@@ -28,8 +28,6 @@ from service.monitor.alarms.operation import (
     UnknownAlarm,
 )
 
-__all__ = ["NO_ALARMS", "AlarmBook"]
-
 
 @dataclass(frozen=True, slots=True)
 class _Page:

@@ -9,8 +9,6 @@ from rotorwatch.records.sensor_faults import FaultKind
 from rotorwatch.records.windows import SensorFault
 from service.monitor.alarms.book import AlarmBook
 
-__all__ = ["DataPathAlarms"]
-
 
 class DataPathAlarms:
     """Judges what happens to the data on their way from the sensors through the monitor.

@@ -22,8 +22,6 @@ from types import MappingProxyType
 
 from rotorwatch.records.alarms import AlarmState
 
-__all__ = ["OWED", "REFUSED", "STAYS", "TABLE", "Cell", "Happening", "follow", "owed_after"]
-
 
 class Happening(StrEnum):
     """What can happen to an alarm."""

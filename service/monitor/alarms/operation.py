@@ -7,8 +7,6 @@ from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.operations import OperationKind
 from service.monitor.alarms.life_cycle import Happening
 
-__all__ = ["HAPPENINGS", "NotInTime", "OperationConflict", "OperationRefused", "OperatorAction", "UnknownAlarm"]
-
 HAPPENINGS: dict[OperationKind, tuple[Happening, EventKind]] = {
     "acknowledge": (Happening.ACKNOWLEDGE, EventKind.ACKNOWLEDGED),
     "reset": (Happening.RESET, EventKind.RESET),

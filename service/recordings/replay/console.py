@@ -16,8 +16,6 @@ from rotorwatch.records.replays import ReplayLine, ReplayProgress
 from service.recordings.replay.control import Control
 from service.recordings.replay.source import clock
 
-__all__ = ["Show", "obey", "orders", "show"]
-
 Show = Callable[[ReplayProgress], None]
 
 _EVERY_S = 0.25

@@ -3,8 +3,6 @@
 import threading
 import time
 
-__all__ = ["Control"]
-
 # The main thread must do something now and then: Python runs signal handlers nowhere else.
 _SLICE_S = 0.25
 

@@ -15,8 +15,6 @@ from models.signals.keys import PREFIX
 from models.signals.recording import RecordedMessage, RecordingSummary, read_recording
 from models.signals.wire import decode_block
 
-__all__ = ["DataSpan", "clock_key", "data_start_ns", "place_of", "span_of"]
-
 _BACK_NS = 5 * 10**9
 _STEADY_NS = 10**9
 _LATEST_NS = 2**63

@@ -22,8 +22,6 @@ from models.errors import RotorwatchError
 from rotorwatch.records.replays import ReplayJob, ReplayLine
 from service.terminal.logs import logger
 
-__all__ = ["REPLAYS", "JobPlan", "ReplayJobError", "ReplayJobs", "TooManyReplaysError"]
-
 REPLAYS = ".replays"
 _RESULTS = "results.jsonl"
 _MESSAGES = "messages.txt"

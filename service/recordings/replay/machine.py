@@ -8,8 +8,6 @@ from models.errors import MachineFileError
 from models.machine import load_machine_file
 from models.signals.keys import MachineKeys
 
-__all__ = ["choose_machine", "is_shipped_bundle", "is_shipped_machine"]
-
 
 def choose_machine(keys: MachineKeys, wanted: str | None) -> Installed:
     """Load the machine file, and what was trained or commissioned, for a recorded machine.

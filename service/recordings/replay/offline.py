@@ -19,8 +19,6 @@ from service.monitor.reports import Identity, MonitorReport
 from service.recordings.replay.control import Control
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["OfflineReplay", "result_lines"]
-
 
 def result_lines(identity: Identity, keys: MachineKeys, report: MonitorReport) -> list[str]:
     """JSON lines of what one block brought: topic and message, in the order of their data time, report before alarm."""

@@ -10,8 +10,6 @@ from service.recordings.replay.control import Control
 from service.recordings.replay.data_time import place_of
 from service.recordings.replay.source import RecordingSource
 
-__all__ = ["PlayPlan", "Sink", "play"]
-
 _LONGEST_PAUSE_NS = 3600 * 10**9
 _BELIEVED = 10
 

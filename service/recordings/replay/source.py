@@ -12,8 +12,6 @@ from models.signals.keys import PREFIX, MachineKeys
 from models.signals.recording import RecordedMessage, RecordingSummary, read_recording, summarize_recording
 from service.recordings.replay.data_time import DataSpan, clock_key, data_start_ns, place_of, span_of
 
-__all__ = ["RecordingSource", "clock", "parse_moment"]
-
 _NANOSECONDS = re.compile(r"\d{1,19}ns")
 _SECONDS = re.compile(r"\+?(\d+(\.\d*)?|\.\d+)s?")
 
