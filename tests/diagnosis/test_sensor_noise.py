@@ -105,11 +105,11 @@ def with_noise(samples: FloatArray, state: str, part: float, seed: int = 0) -> F
     return noisy
 
 
-def with_hum(samples: FloatArray, state: str, part: float) -> FloatArray:
-    """A line of 50 Hz, its rms a part of the channel's."""
+def with_hum(samples: FloatArray, state: str, part: float, line_hz: float = 50.0) -> FloatArray:
+    """A line, its rms a part of the channel's."""
     humming, at = samples.copy(), column(state)
     t_s = np.arange(len(samples)) / machine_of("lab").rate_hz
-    humming[:, at] += part * samples[:, at].std() * np.sqrt(2) * np.sin(2 * np.pi * 50 * t_s)
+    humming[:, at] += part * samples[:, at].std() * np.sqrt(2) * np.sin(2 * np.pi * line_hz * t_s)
     return humming
 
 
@@ -151,6 +151,14 @@ def test_mains_hum_in_one_channel_is_noise(displacements: bool) -> None:
     assert (finding.kind, finding.states) == ("noise", ("z2",))
     assert finding.value == pytest.approx(0.08, rel=0.25)
     assert ("50 Hz" in finding.text) == displacements
+
+
+@pytest.mark.parametrize(
+    ("line_hz", "hums"), [(50.1, True), (60.0, True), (100.2, True), (3 * 22.0, False), (87.3, False), (37.0, False)]
+)
+def test_a_line_that_one_sensor_sees_is_the_mains_or_the_machines(line_hz: float, hums: bool) -> None:
+    found = found_in(with_hum(recorded("lab", 924), "z2", 0.1, line_hz), displacements=True)
+    assert [(one.kind, one.states) for one in found] == ([("noise", ("z2",))] if hums else [])
 
 
 def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() -> None:

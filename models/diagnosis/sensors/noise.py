@@ -47,6 +47,8 @@ FLOOR_FLAT = 0.5  # part of the bands that must lie on the floor: a machine's ow
 LINE_RISE = 4.0
 # Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line.
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
+_MAINS_HZ = (50.0, 60.0)
+_MAINS_OFF_HZ = 0.2  # by how much the mains may be off (EN 50160:2010, 4.2.1 allows 1 % for most of a year)
 _FEWEST = 4  # channels that are needed to tell which of them rose alone
 # Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated.
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
@@ -175,6 +177,28 @@ def _guilty(bands: Banded, reading: PairReading, risen: npt.NDArray[np.bool_]) -
     return reading.pair.second if share > 0 else reading.pair.first
 
 
+def is_hum(line_hz: float, speed_rad_s: float, resolution_hz: float) -> bool:
+    """Whether a line can be the mains': at 50 or 60 Hz or a harmonic, and at no order of the shaft.
+
+    Any other line of one channel is the machine's: a bearing, a gear or a blade that one sensor sees.
+
+    Examples
+    --------
+    >>> is_hum(100.1, 138.2, 0.5), is_hum(100.1, 2 * np.pi * 25.0, 0.5), is_hum(88.2, 138.2, 0.5)
+    (True, False, False)
+    """
+    for mains_hz in _MAINS_HZ:
+        harmonic = round(line_hz / mains_hz)
+        if harmonic and abs(line_hz - harmonic * mains_hz) <= harmonic * _MAINS_OFF_HZ + resolution_hz / 2:
+            break
+    else:
+        return False
+    shaft_hz = abs(speed_rad_s) / (2 * np.pi)
+    if not np.isfinite(shaft_hz) or shaft_hz == 0:
+        return True
+    return abs(line_hz - round(line_hz / shaft_hz) * shaft_hz) > resolution_hz
+
+
 def _of_single(
     window: WindowStatistics, noises: Sequence[ChannelNoise], naming: Naming, reference: SensorReference
 ) -> list[SensorFault]:
@@ -196,7 +220,8 @@ def _of_single(
         name = naming.name(state)
         size = float(np.sqrt(2 * band_hz * np.exp(floor(np.log(now.density)))))
         risen = len(known) >= _FEWEST and rise[row] > np.log(FLOOR_RISE) and alone[row] > np.log(FLOOR_ALONE)
-        if now.line_rms > max(LEAST_LINE * own, np.sqrt(LINE_RISE) * then.line_rms):
+        hums = is_hum(now.line_hz, window.speed_rad_s, float(window.frequencies_hz[1] - window.frequencies_hz[0]))
+        if hums and now.line_rms > max(LEAST_LINE * own, np.sqrt(LINE_RISE) * then.line_rms):
             text = (
                 f"{name}: a line of {naming.value(state, now.line_rms)} rms at {now.line_hz:.4g} Hz that no other "
                 f"channel shows ({now.line_rms / own:.0%} of what it shows, {naming.value(state, then.line_rms)} on "
