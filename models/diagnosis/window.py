@@ -123,7 +123,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         cleaned = segments[:, :, :n] - segments[:, :, n:] @ own.segments.transpose(0, 2, 1)
         if phase_reference:
             synchronous = _synchronous(level)
-        else:
+        elif plan.states:
             vectors = np.stack([_synchronous(coefficients) for coefficients in own.hops])
             relative_synchronous, zero_angle = relative_vectors(vectors)
             zero_angle_state = plan.states[zero_angle]

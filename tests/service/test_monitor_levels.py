@@ -9,7 +9,7 @@ import pytest
 from models.commissioning.commission import commission
 from models.commissioning.commissioned import FILE, Installed, RecordingEntry, install
 from models.commissioning.healthy import healthy_from_blocks
-from models.machine import MachineFile
+from models.machine import MachineFile, Operation
 from models.signals.block import SampleBlock
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.health import HealthState
@@ -77,6 +77,15 @@ def test_a_machine_file_with_nothing_but_sensors_is_watched_from_the_first_hop_o
     assert drive.overall == pytest.approx(np.hypot(0.4 / np.sqrt(2), 0.5), rel=0.02)
     assert other.overall == pytest.approx(np.hypot(1.1 / np.sqrt(2), 0.3 * np.sqrt(990 / 2560)), rel=0.02)
     assert (drive.unit, other.unit, other.velocity) == ("m/s2", "mm/s", None)
+
+
+def test_a_running_speed_in_the_machine_file_is_followed_in_the_vibration() -> None:
+    monitor = MachineMonitor(install(FAN.model_copy(update={"operation": Operation(speed_rpm=1500.0)}), None))
+    run(monitor, blocks(1, 30))
+    health = monitor.health()
+    assert (health.state, health.filled) == (HealthState.WATCHING, 1.0)
+    assert health.latest is not None
+    assert [one.x1 for one in health.latest.levels] == pytest.approx([0.4 / np.sqrt(2), 1.1 / np.sqrt(2)], rel=0.02)
 
 
 @pytest.mark.parametrize("seed", range(3))
