@@ -9,6 +9,7 @@ import typer
 from benchmarks.studies.ablation import ablation
 from benchmarks.studies.delay import delay
 from benchmarks.studies.evaluate import evaluate
+from benchmarks.studies.levels import levels
 from benchmarks.studies.pages import write_page
 from benchmarks.studies.peers import peers
 from benchmarks.studies.reproduction import reproduction
@@ -24,6 +25,7 @@ STUDIES = {
     "sensors": sensors,
     "ablation": ablation,
     "delay": delay,
+    "levels": levels,
     "reproduction": reproduction,
 }
 
