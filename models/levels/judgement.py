@@ -211,11 +211,12 @@ class ChannelState:
 def channel_state(levels: ChannelLevels) -> ChannelState:
     """Sum up the limits of a channel."""
     limits = levels.limits
-    beyond, danger = (any(one.state in of for one in limits) for of in (("alert", "danger"), ("danger",)))
     small = all(one.state == "normal" and not _near(getattr(levels, one.measure), one) for one in limits)
-    texts = sorted((one.state != "danger", one.text) for one in limits if one.text)
+    texts = sorted((one.state != "danger", not one.absolute, one.text) for one in limits if one.text)
     absolute = any(one.state != "normal" and one.absolute for one in limits)
-    return ChannelState(beyond, danger, absolute, small, "; ".join(text for _, text in texts))
+    return ChannelState(
+        levels.beyond != "", levels.beyond == "danger", absolute, small, "; ".join(text for *_, text in texts)
+    )
 
 
 def _near(value: float | None, limits: LevelLimits) -> bool:

@@ -82,6 +82,30 @@ class ChannelLevels(BaseModel):
         found = {name: getattr(self, name) for name in LEVEL_MEASURES}
         return {name: value for name, value in found.items() if value is not None}
 
+    @property
+    def beyond(self) -> Literal["", "alert", "danger"]:
+        """The worse of the limits that a level is beyond; empty if all are within."""
+        states = {limit.state for limit in self.limits}
+        return "danger" if "danger" in states else "alert" if "alert" in states else ""
+
+    @property
+    def text(self) -> str:
+        """The levels that are read first, in words.
+
+        Examples
+        --------
+        >>> from rotorwatch.records.example import example
+        >>> ChannelLevels.model_validate(example(ChannelLevels)).text
+        'DE-H 1.93 m/s2 rms, velocity 2.1 mm/s rms, 1x 1.1, zone B'
+        """
+        detection = "pp" if self.detection == "peak to peak" else "rms"
+        overall = "nothing" if self.overall is None else f"{self.overall:.3g} {self.unit} {detection}"
+        parts = [f"{self.channel} {overall}"]
+        parts += [] if self.velocity is None else [f"velocity {self.velocity:.3g} mm/s rms"]
+        parts += [] if self.x1 is None else [f"1x {self.x1:.3g}"]
+        parts += [] if self.mean is None else [f"gap {self.mean:.3g}"]
+        return ", ".join(parts + ([f"zone {self.zone}"] if self.zone else []))
+
     def limit(self, measure: str) -> LevelLimits | None:
         """Limits of one level."""
         return next((one for one in self.limits if one.measure == measure), None)

@@ -109,15 +109,7 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
         plan.levels, [hop_levels(plan.levels, vibration, angle)], np.array([speed]), phase_reference=angle is not None
     )
     watch = LevelWatch(plan, machine, Installed(machine))
-    for channel in watch.judged(found):
-        values = channel.values()
-        detection = "pp" if channel.detection == "peak to peak" else "rms"
-        shown = [f"{values['overall']:.3g} {channel.unit} {detection}" if "overall" in values else "no level"]
-        shown += [f"velocity {values['velocity']:.3g} mm/s rms"] if "velocity" in values else []
-        shown += [f"1x {values['x1']:.3g}"] if "x1" in values else []
-        shown += [f"mean {values['mean']:.3g}"] if "mean" in values else []
-        shown += [f"zone {channel.zone}"] if channel.zone else []
-        lines.append(f"  {channel.channel}: {', '.join(shown)}")
+    lines += [f"  {channel.text}" for channel in watch.judged(found)]
     for column, name in enumerate(machine.sensors[at].name for at in plan.columns):
         if np.ptp(vibration[:, column]) == 0:
             troubles.append(f"{name} does not move: a sensor that is not connected, or a range far too wide")

@@ -32,7 +32,8 @@ def report_line(report: Report) -> str:
         parts += [_opinion(opinion) for opinion in report.opinions]
         tail = "  |  ".join(parts)
     else:
-        tail = report.reason or f"window {report.filled:.0%} full"
+        told = [one.text for one in report.levels if report.state == "watching" or one.beyond]
+        tail = "  |  ".join(told) or report.reason or f"window {report.filled:.0%} full"
     # No alarm yet, or none at all if the change stays below its limit; but healthy is what nothing is found on.
     state = "no alarm" if report.state == "healthy" and _found(verdict) else report.state
     return f"{_clock(report.end_ns)}  {report.site}/{report.machine}  {state:<13}  {tail}"

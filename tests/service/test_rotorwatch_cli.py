@@ -257,6 +257,8 @@ def test_lines_for_terminals() -> None:
     shown = report_line(report.model_copy(update={"verdict": calm, "opinions": (apart,)}))
     assert shown.endswith("no change, outside the model  |  relation disagrees on k_by")
     early = report.model_copy(update={"parameters": (), "filled": 0.25, "state": "warming"})
+    watching = report_line(early.model_copy(update={"state": "watching"}))
+    assert watching.endswith("watching       DE-H 1.93 m/s2 rms, velocity 2.1 mm/s rms, 1x 1.1, zone B")
     assert report_line(early) == "00:03:25  demo/lab  warming        window 25% full"
     assert report_line(early.model_copy(update={"reason": "too fast"})).endswith("too fast")
     event = AlarmCloudEvent.model_validate(example(AlarmCloudEvent))

@@ -46,7 +46,7 @@ def _machine(health: Health) -> str:
     if report is not None and report.verdict is not None:
         suspect = f" Best explained by: {html.escape(report.suspect)}." if report.suspect else ""
         said = f"<p>{html.escape(report.verdict.text)}.{suspect}</p>"
-    window = "" if report is None else _measures(report) + _table(report, raised) + _shapes(report)
+    window = "" if report is None else _measures(report) + _table(report, raised) + _shapes(report) + _levels(report)
     return (
         f'<h2><a href="{place}">{html.escape(name)}</a> <span class="{health.state}">{health.state}</span>{silent}</h2>'
         f"{reason}{said}<p>window {health.filled:.0%} full; {health.quality.accepted_blocks} blocks accepted, "
@@ -111,6 +111,33 @@ def _shapes(report: Report) -> str:
         return ""
     items = "".join(f"<li>{html.escape(shape.text)}" for shape in report.shapes)
     return f"<p>Each channel beside its own healthy form; no part of the machine can be named:</p><ul>{items}</ul>"
+
+
+def _levels(report: Report) -> str:
+    """Vibration levels of each channel, the nearest limits beside them, and what is beyond them."""
+    if not report.levels:
+        return ""
+    rows = ""
+    for one in report.levels:
+        shown = one.limit("velocity") or one.limit("overall")
+        edges = "" if shown is None else f"{_figure(shown.alert)} / {_figure(shown.danger)}"
+        figures = (one.overall, one.velocity, one.x1, one.x2, one.mean, one.crest, one.kurtosis)
+        rows += (
+            f"<tr{' class=raised' if one.beyond else ''}><td>{html.escape(one.channel)}<td>{html.escape(one.unit)} "
+            f"{'pp' if one.detection == 'peak to peak' else 'rms'}"
+            + "".join(f'<td class="number">{_figure(value)}' for value in figures)
+            + f'<td class="number">{edges}<td>{one.zone}<td>'
+            + (f'<span class="{one.beyond}">{one.beyond}</span>' if one.beyond else "")
+            + "</tr>"
+        )
+    return (
+        "<table><tr><th>channel<th>unit<th>overall<th>velocity, mm/s<th>1x<th>2x<th>gap<th>crest<th>kurtosis"
+        f"<th>alert / danger from<th>zone<th></tr>{rows}</table>"
+    )
+
+
+def _figure(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
 
 
 def _table(report: Report, raised: dict[str, Severity]) -> str:
