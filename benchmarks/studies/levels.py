@@ -348,7 +348,7 @@ def levels(options: Options) -> Study:
         *(("doubling", machine, "", 2.0) for machine in KINDS),
         *(("doubling", machine, "", 1.0) for machine in _KITS),
         ("bearing", _BEARING, "", 2.0),
-        *(("varying", of, f"{spread:g}, {how}", 0.5) for of in _REFERENCES for spread in _SPREADS for how in _DRAWN),
+        *(("varying", of, f"{spread:g}, {how}", 1.0) for of in _REFERENCES for spread in _SPREADS for how in _DRAWN),
     ]
     cells = tuple(
         Cell(
