@@ -168,7 +168,7 @@ def _kit_doublings(options: Options, case: int, machine: str, number: int) -> It
     of_reference = generator(options.seed, case, number, At.REFERENCE)
     healthy = list(simulated(of_reference, (8 if options.small else 15) * _LENGTH_S + 5.0))
     twice = _second_order(kit, speed_rad_s, healthy, ratio)
-    if file is kit:  # the theory of a linear rotor has no 2x, and is refused where there is one
+    if file is kit:  # the theory of a linear rotor has no 2x, and is mostly refused where there is one
         twice = np.zeros_like(twice)
     installed = _commissioned(file, _with_2x(kit, healthy, twice, np.inf))
     for at, doubled in enumerate(_DOUBLED[:2] if file is kit else _DOUBLED):
