@@ -99,8 +99,9 @@ class Channel(BaseModel, extra="forbid", frozen=True):
             )
         if (self.quantity, self.location, self.direction) in _STATE_NAMES:
             return self
-        hint = did_you_mean(self.location, _LOCATIONS) or did_you_mean(self.direction, _DIRECTIONS)
-        if self.quantity is Quantity.SHAFT_ANGLE or self.location in _LOCATIONS or hint:
+        known = self.location in _LOCATIONS
+        hint = did_you_mean(self.direction, _DIRECTIONS) if known else did_you_mean(self.location, _LOCATIONS)
+        if self.quantity is Quantity.SHAFT_ANGLE or known or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
                 "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z; "

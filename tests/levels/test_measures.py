@@ -134,11 +134,12 @@ def test_a_shaft_that_stands_still_has_no_orders() -> None:
     assert np.isfinite(found.values["overall"][0])
 
 
-def test_the_largest_radius_of_a_shaft_orbit() -> None:
+@pytest.mark.parametrize("location", ["bearing", "DE"])
+def test_the_largest_radius_of_a_shaft_orbit(location: str) -> None:
     t = times(5.0, 2000.0)
     theta = 2 * np.pi * 20 * t
     samples = np.column_stack([1e-4 + 30e-6 * np.cos(theta), -2e-4 + 40e-6 * np.cos(theta)])
-    sizes = level_plan([channel("displacement", "y"), channel("displacement", "z")], 2000.0, (10.0, 1000.0))
+    sizes = level_plan([channel("displacement", way, location) for way in "yz"], 2000.0, (10.0, 1000.0))
     found = taken(sizes, samples).values
     assert found["s_max"][0] == pytest.approx(50e-6, rel=1e-3)
     assert np.isnan(found["s_max"][1])
