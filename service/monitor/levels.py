@@ -85,6 +85,5 @@ class LevelWatch:
             now, name = channel_state(levels), f"{LEVEL}{levels.channel}"
             held = state in faulty or (explained and not alarms.present(name))
             beyond = now.beyond and (now.absolute or now.danger or not held)
-            alarms.update_state(
-                name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small or not beyond
-            )
+            # In the deadband, or while a sensor is at fault, an alarm stays as it is.
+            alarms.update_state(name, beyond, end_ns, now.text, evidence=evidence, danger=now.danger, small=now.small)

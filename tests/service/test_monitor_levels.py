@@ -9,10 +9,15 @@ import pytest
 from models.commissioning.commission import commission
 from models.commissioning.commissioned import FILE, Installed, RecordingEntry, install
 from models.commissioning.healthy import healthy_from_blocks
-from models.machine import MachineFile, Operation
+from models.diagnosis.moments import plan_for
+from models.machine import AlarmSettings, MachineFile, Operation
 from models.signals.block import SampleBlock
 from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.example import example
 from rotorwatch.records.health import HealthState
+from rotorwatch.records.levels import ChannelLevels
+from service.monitor.alarms.book import AlarmBook
+from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
@@ -109,6 +114,22 @@ def test_a_growth_by_four_is_a_danger_and_clears_when_it_is_gone() -> None:
     _, events = run(monitor, blocks(4, 120, first=240))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.CLEARED, "level:DE-H")]
     assert monitor.health().state is HealthState.WATCHING
+
+
+def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
+    machine = FAN.model_copy(update={"alarms": AlarmSettings(on_delay_s=0.0, off_delay_s=0.0)})
+    watch, book = LevelWatch(plan_for(machine, levels=True), machine, install(machine, None)), AlarmBook(machine.alarms)
+    healthy = ChannelLevels.model_validate(example(ChannelLevels))
+    (limit,) = healthy.limits
+    for second, (level, state, raised) in enumerate(
+        [(9.9, "normal", False), (10.1, "alert", True), (9.5, "normal", True), (8.9, "normal", False)]
+    ):
+        now = limit.model_copy(
+            update={"measure": "overall", "alert": 10.0, "danger": 20.0, "fall": None, "state": state}
+        )
+        watch.latest = (healthy.model_copy(update={"overall": level, "limits": (now,)}),)
+        watch.tell(book, START_NS + second * 10**9)
+        assert book.present("level:DE-H") == raised, level
 
 
 @pytest.mark.parametrize("whole", [True, False])
