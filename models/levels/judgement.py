@@ -132,7 +132,7 @@ class LevelJudge:
     def _turned(
         self, channel: Channel, one: ReferenceLevel, now: complex, alert: float, spread: float
     ) -> Iterator[tuple[str, _Limit]]:
-        """The acceptance region of the 1x vector (ISO 20816-1:2016, annex D): an alert outside it, however large."""
+        """The acceptance region of the 1x vector (ISO 20816-1, criterion II): an alert outside it, however large."""
         assert one.vector is not None  # noqa: S101  # for the type checker
         of_amplitude = 2.0 if channel.quantity in _PEAK_TO_PEAK else math.sqrt(0.5)
         radius = max(_TURNED * abs(complex(*one.vector)), _BEYOND_RANGE * one.turned, spread / of_amplitude)

@@ -22,7 +22,7 @@ envelope                                                           of accelerati
 ========== ======================================================= ===================================================
 
 All in SI units here. A level of random vibration scatters: over a time T with bandwidth B an rms has a relative
-standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th ed., Eq. 8.53).
+standard error of 1/(2√(BT)) (J. S. Bendat, A. G. Piersol, "Random Data", 4th ed., chapter 8).
 """
 
 from collections.abc import Mapping, Sequence

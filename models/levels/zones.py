@@ -48,7 +48,7 @@ ZONES: Mapping[str, Zones] = MappingProxyType(
         "ISO 20816-3 group 1 flexible": _casing(3.5, 7.1, 11.0),
         "ISO 20816-3 group 2 rigid": _casing(1.4, 2.8, 4.5),
         "ISO 20816-3 group 2 flexible": _casing(2.3, 4.5, 7.1),
-        # ISO 20816-3:2022, annex B: shaft vibration relative to the bearing, µm peak to peak over √(rpm).
+        # ISO 20816-3, for the shaft relative to the bearing: µm peak to peak over √(rpm). From one source only so far.
         "ISO 20816-3 shaft": Zones(True, (4800e-6, 9000e-6, 13200e-6)),
     }
 )

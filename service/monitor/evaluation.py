@@ -162,28 +162,13 @@ def evaluator_for(installed: Installed) -> WindowEvaluator:
     return BaselineEvaluator(installed.machine, commissioned)
 
 
-class NoEvaluator:
-    """Of a machine of which nothing is known: its levels are watched, and nothing is diagnosed."""
-
-    @property
-    def by(self) -> str:
-        """Nobody."""
-        return "nobody"
+class _Unremembering:
+    """Whose evaluations each stand for themselves: only the whole window is taken, and nothing is remembered of it."""
 
     @property
     def takes_short(self) -> bool:
-        """There is nothing to evaluate."""
+        """Short stretches are not evaluated."""
         return False
-
-    @property
-    def needs_lags(self) -> bool:
-        """There is nothing to evaluate."""
-        return False
-
-    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
-        """Say that there is nothing to evaluate, see `WindowEvaluator`."""
-        _ = window, short
-        raise EstimationError("only vibration levels are watched: the machine is neither known nor commissioned")
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Nothing."""
@@ -193,6 +178,18 @@ class NoEvaluator:
         """Go on where `checkpoint` was called, see `WindowEvaluator`."""
         if arrays:
             raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
+
+
+class NoEvaluator(_Unremembering):
+    """Of a machine of which nothing is known: its levels are watched, and nothing is diagnosed."""
+
+    by = "nobody"
+    needs_lags = False
+
+    def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
+        """Say that there is nothing to evaluate, see `WindowEvaluator`."""
+        _ = window, short
+        raise EstimationError("only vibration levels are watched: the machine is neither known nor commissioned")
 
 
 class KnownMachineEvaluator:
@@ -312,7 +309,7 @@ class KnownMachineEvaluator:
         return stated if self._shared is None else with_shared_error(stated, self._shared)
 
 
-class BaselineEvaluator:
+class BaselineEvaluator(_Unremembering):
     """Compares the windows of one machine with what was learned on it when it was healthy.
 
     Parameters
@@ -338,11 +335,6 @@ class BaselineEvaluator:
         return self._baselines[0][1].by if self._baselines else _SHAPE
 
     @property
-    def takes_short(self) -> bool:
-        """Relations need whole windows."""
-        return False
-
-    @property
     def needs_lags(self) -> bool:
         """Relations hold between correlation functions."""
         return True
@@ -361,15 +353,6 @@ class BaselineEvaluator:
             deciding = Diagnosis(_SHAPE, nothing, covariance=_EMPTY)
         shapes = () if self._shape is None or deciding.evaluable else self._shape.judge(window, self._shape_rate)
         return Evaluation(deciding, {}, _row_readings(deciding, window), (), speed, shapes)
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Nothing: a baseline is what was commissioned, and every window is compared with it alone."""
-        return {}
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
-        if arrays:
-            raise CheckpointError(f"{self._place}: {', '.join(sorted(arrays))} is of another diagnostician")
 
     def _baseline_for(self, window: WindowStatistics) -> BaselineDiagnostician:
         """The baseline of these conditions."""

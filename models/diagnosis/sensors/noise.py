@@ -48,7 +48,7 @@ LINE_RISE = 4.0
 # Parts of the channel's rms that noise in the band must reach: seen by a pair, as a floor, and as a line.
 LEAST_PART, LEAST_FLOOR, LEAST_LINE = 0.02, 0.1, 0.03
 _MAINS_HZ = (50.0, 60.0)
-_MAINS_OFF_HZ = 0.2  # by how much the mains may be off (EN 50160:2010, 4.2.1 allows 1 % for most of a year)
+_MAINS_OFF_HZ = 0.2  # by how much the mains may be off (EN 50160 allows 1 % in 99.5 % of a year)
 _FEWEST = 4  # channels that are needed to tell which of them rose alone
 # Standard deviation of the logarithm of a healthy pair's rise, and of a healthy channel's floor, calibrated.
 _PAIR_SCATTER, _FLOOR_SCATTER = 0.2, 1.0
