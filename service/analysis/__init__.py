@@ -1,1 +1,1 @@
-"""What windows and recordings show: correlations, spectra and orbits beside theory, as records and as pictures."""
+"""What windows and recordings show: orbits, spectra, correlations, trends, and what theory predicts of them."""

@@ -12,9 +12,10 @@ from models.errors import WireError
 from models.ingest import Gate
 from models.levels.measures import hop_levels, window_levels
 from models.machine import MachineFile
-from models.signals.block import FloatArray, SampleBlock
+from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage
 from models.signals.wire import decode_block
+from service.analysis.revolutions import Excerpt
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.levels import LevelWatch
 
@@ -98,7 +99,7 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
         lines.append("no shaft angle (keyphasor): no phases, and 1x only near a known speed")
     else:
         angle = samples[:, -1]
-        speed = _speed(angle, plan.rate_hz)
+        speed = Excerpt(blocks[0].start_ns, plan.rate_hz, samples, angle).speed_rad_s
         lines.append(f"keyphasor: the shaft turns at {abs(speed) * 30 / np.pi:.1f} rpm")
         if abs(speed) < np.pi:
             troubles.append("the shaft angle does not turn: the machine stands still, or the keyphasor gives no pulses")
@@ -114,8 +115,3 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
         if np.ptp(vibration[:, column]) == 0:
             troubles.append(f"{name} does not move: a sensor that is not connected, or a range far too wide")
     return lines
-
-
-def _speed(angle_rad: FloatArray, rate_hz: float) -> float:
-    steps = np.diff(angle_rad)
-    return float(((steps + np.pi) % (2 * np.pi) - np.pi).mean() * rate_hz)

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import Commands, FromOption, ToOption, exit_codes, prepare_numerics
+from service.commands.running import Commands, FromOption, ToOption, exit_codes, one_blas_thread
 
 if TYPE_CHECKING:
-    from service.analysis.plots.request import Lines, Paint, Recorded
+    from service.analysis.figures.spectrum import Lines
+    from service.analysis.figures.style import Paint
+    from service.analysis.recorded import Recorded
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
 _plots = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
@@ -92,13 +94,13 @@ class _Picture:
 
     def recorded(self, at: str | None = None, *, reports: bool = False) -> "Recorded":
         """The data it is of."""
-        from service.analysis.plots.request import recorded  # noqa: PLC0415  # keeps --help quick
+        from service.analysis.recorded import Recorded  # noqa: PLC0415  # keeps --help quick
 
-        return recorded(tuple(self.files), self.key, (self.from_, self.to), at, reports=reports)
+        return Recorded.find(self.files, self.key, (self.from_, self.to), at, reports=reports)
 
     def draw(self, paint: "Paint") -> None:
         """Draw and write it."""
-        from service.analysis.plots.style import Look, draw  # noqa: PLC0415
+        from service.analysis.figures.style import Look, draw  # noqa: PLC0415
 
         draw(self.out, Look(self.title, self._inches(), self.dpi), paint)
         typer.echo(str(self.out))
@@ -119,7 +121,7 @@ def _kind(paint: Callable[..., "Paint"]) -> None:
 
     def command(**given: Any) -> None:
         with exit_codes():
-            prepare_numerics()
+            one_blas_thread()
             picture = _Picture(**{name: given.pop(name) for name in shared})
             picture.check()
             picture.draw(paint(picture, **given))
@@ -147,7 +149,7 @@ def trend(
     ] = False,
 ) -> "Paint":
     """Every parameter's change with its 95 % interval over time, or vibration levels; state, alarms and speed."""
-    from service.analysis.plots.request import trend as read  # noqa: PLC0415
+    from service.analysis.figures.trend import trend as read  # noqa: PLC0415
 
     return read(picture.recorded(reports=True), machine, levels=levels)
 
@@ -167,7 +169,7 @@ def correlation(
     ] = None,
 ) -> "Paint":
     """Correlations of one window against what the networks predict, equation by equation."""
-    from service.analysis.plots.request import correlation as read  # noqa: PLC0415
+    from service.analysis.figures.correlation import correlation as read  # noqa: PLC0415
 
     return read(picture.recorded(at), machine)
 
@@ -179,7 +181,7 @@ def orbit(
     revolutions: Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many.")] = 8,
 ) -> "Paint":
     """The shaft's path at bearing and disc, as measured and at running speed alone."""
-    from service.analysis.plots.request import orbit as read  # noqa: PLC0415
+    from service.analysis.figures.orbit import orbit as read  # noqa: PLC0415
 
     return read(picture.recorded(at), revolutions)
 
@@ -200,10 +202,10 @@ def spectrum(
     to_hz: _ToHzOption = None,
 ) -> "Paint":
     """Amplitudes or power spectral density of channels, 1× and 2× marked."""
-    from service.analysis.plots.request import spectrum as read  # noqa: PLC0415
+    from service.analysis.figures.spectrum import spectrum as read  # noqa: PLC0415
 
     lines = _lines(window, resolution, to_hz, density=density, log=density if scale is None else scale == "log")
-    return read(picture.recorded(at), tuple(channel or ()), lines)
+    return read(picture.recorded(at), channel or (), lines)
 
 
 @_kind
@@ -224,15 +226,15 @@ def waterfall(
     cascade: Annotated[bool, typer.Option("--cascade", help="Lines instead of colours.")] = False,
 ) -> "Paint":
     """Spectra of one channel over time, or over speed in a run-up."""
-    from service.analysis.plots.request import waterfall as read  # noqa: PLC0415
+    from service.analysis.figures.spectrum import waterfall as read  # noqa: PLC0415
 
     log = density or not cascade if scale is None else scale == "log"
     lines = _lines(window, resolution, to_hz, density=density, log=log)
-    return read(picture.recorded(), tuple(channel or ()), lines, over_speed=axis == "speed", cascade=cascade)
+    return read(picture.recorded(), channel or (), lines, over_speed=axis == "speed", cascade=cascade)
 
 
 def _lines(window_s: float, resolution_hz: float, to_hz: float | None, *, density: bool, log: bool) -> "Lines":
-    from service.analysis.plots.request import Lines  # noqa: PLC0415
+    from service.analysis.figures.spectrum import Lines  # noqa: PLC0415
 
     for name, number in (("--window", window_s), ("--resolution", resolution_hz), ("--to-hz", to_hz)):
         if number is not None and not 0 < number < 1e9:

@@ -22,8 +22,8 @@ from rotorwatch.records.health import Health, Report
 from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 from rotorwatch.records.windows import SensorFault
-from service.analysis.plots.excerpts import RecordedStream
-from service.analysis.plots.trend import read_trend
+from service.analysis.recorded import Recorded
+from service.analysis.trend import read_trend
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
@@ -290,10 +290,10 @@ def test_recordings_of_a_later_version_are_exported_and_plotted(of_later: Path) 
     for table in (stream_table, report_table, alarm_table):
         assert everything(table(later_on)) == everything(table(now))
     source = RecordingSource([of_later])
-    trend = read_trend(source, KEYS, None, 0, 2**62)
+    trend = read_trend(Recorded(source, KEYS, 0, 2**62))
     assert trend.origin == "as recorded"
     assert {event.kind for event in trend.alarms} == {EventKind.RAISED}
-    reader = RecordedStream(source, KEYS, 0, 2**62)
+    reader = Recorded(source, KEYS, 0, 2**62)
     assert len(reader.descriptor.channels) == 9
 
 

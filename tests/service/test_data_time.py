@@ -11,8 +11,8 @@ from models.signals.block import SampleBlock
 from models.signals.recording import RecordedMessage, read_recording
 from models.signals.wire import decode_block
 from rotorwatch.records.replays import ReplayLine, ReplayProgress
-from service.analysis.plots.excerpts import RecordedStream
-from service.analysis.plots.spectrum import read_spectrum, read_waterfall
+from service.analysis.recorded import Recorded
+from service.analysis.spectrum import read_spectrum, read_waterfall
 from service.commands.replay import summary_lines
 from service.recordings.replay.control import Control
 from service.recordings.replay.data_time import data_start_ns
@@ -62,9 +62,9 @@ def starts_s(source: RecordingSource, **limits: int) -> list[float]:
     return [(decode_block(one.payload, one.attachment, one.encoding)[0].start_ns - START_NS) / S for one in found]
 
 
-def stream_of(path: Path) -> RecordedStream:
+def stream_of(path: Path) -> Recorded:
     source = RecordingSource([path])
-    return RecordedStream(source, LAB.keys, *source.between(None, None))
+    return Recorded(source, LAB.keys, *source.between(None, None))
 
 
 def test_a_source_knows_the_times_of_the_data(quick: Path, tmp_path: Path) -> None:

@@ -17,13 +17,13 @@ from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
 from rotorwatch.records.health import MEASURES, Report
-from service.analysis.plots.correlation import correlations_of, latest_window
-from service.analysis.plots.excerpts import RecordedStream
-from service.analysis.plots.orbit import read_orbits
-from service.analysis.plots.spectrum import read_spectrum, read_waterfall, shown_as
-from service.analysis.plots.spectrum_figure import paint_cascade, paint_map, paint_spectrum
-from service.analysis.plots.style import Look
-from service.analysis.plots.trend import read_trend, trend_machine, trend_of
+from service.analysis.correlation import correlations_of, latest_window
+from service.analysis.figures.spectrum import Lines, paint_spectrum, paint_waterfall
+from service.analysis.figures.style import Look
+from service.analysis.orbit import phase_lag_deg, read_orbits
+from service.analysis.recorded import Recorded
+from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
+from service.analysis.trend import read_trend, trend_of
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 from simulator.scenario import load_scenario, parse_fault
@@ -51,12 +51,12 @@ def machine_blocks(
     ]
 
 
-def stream_of(path: Path, machine: Machine = LAB, seconds: tuple[float, float] | None = None) -> RecordedStream:
+def stream_of(path: Path, machine: Machine = LAB, seconds: tuple[float, float] | None = None) -> Recorded:
     source = RecordingSource([path])
     from_ns, to_ns = source.start_ns, source.end_ns + 1
     if seconds is not None:
         from_ns, to_ns = (START_NS + round(limit * S) for limit in seconds)
-    return RecordedStream(source, machine.keys, from_ns, to_ns)
+    return Recorded(source, machine.keys, from_ns, to_ns)
 
 
 @pytest.fixture(scope="module")
@@ -92,18 +92,18 @@ def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_m
     H = H_matrix(rotor, W)
     dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
     q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
-    assert [orbit.location for orbit in found.orbits] == ["bearing", "disc"]
+    assert [orbit.y.location for orbit in found.orbits] == ["bearing", "disc"]
     assert found.speed_rad_s == pytest.approx(W, rel=1e-4)
     assert found.end_ns - found.start_ns == pytest.approx(8 * 2e9 * np.pi / W, rel=1e-4)
     for orbit, y, z in zip(found.orbits, q_um[[0, 1]], q_um[[3, 4]], strict=True):
-        assert orbit.y.q_um == pytest.approx(y, rel=2e-3)
-        assert orbit.z.q_um == pytest.approx(z, rel=2e-3)
+        assert orbit.ellipse.y == pytest.approx(y, rel=2e-3)
+        assert orbit.ellipse.z == pytest.approx(z, rel=2e-3)
         circle = np.exp(1j * np.linspace(0, 2 * np.pi, 20_000))
         radius = np.hypot(np.real(y * circle), np.real(z * circle))
-        assert orbit.major_um == pytest.approx(2 * radius.max(), rel=2e-3)
-        assert orbit.minor_um == pytest.approx(2 * radius.min(), rel=2e-3)
+        assert 2 * orbit.ellipse.semi_major == pytest.approx(2 * radius.max(), rel=2e-3)
+        assert 2 * orbit.ellipse.semi_minor == pytest.approx(2 * radius.min(), rel=2e-3)
         assert np.ptp(orbit.y_um) == pytest.approx(2 * abs(y), rel=5e-3)
-        assert orbit.precession == "forward"
+        assert orbit.ellipse.precession == "forward"
         assert orbit.marks_um.shape == (9, 2)  # the pulse that begins and the one that ends, and between
         assert orbit.marks_um == pytest.approx(np.tile([y.real, z.real], (9, 1)), abs=0.01 * abs(y))
 
@@ -126,11 +126,12 @@ def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
     bearing = found.orbits[0]
     assert found.direction == -1
     assert found.speed_rad_s == pytest.approx(-turn, rel=1e-3)
-    assert bearing.y.peak_to_peak_um == pytest.approx(60, rel=1e-3)
-    assert bearing.y.phase_lag_deg == pytest.approx(90, abs=0.2)
-    assert bearing.z.phase_lag_deg == pytest.approx(180, abs=0.2)
-    assert (bearing.major_um, bearing.minor_um) == pytest.approx((60, 20), rel=1e-3)
-    assert bearing.precession == "backward"  # y to z, and the shaft turns from z to y
+    ellipse = bearing.ellipse
+    assert 2 * abs(ellipse.y) == pytest.approx(60, rel=1e-3)
+    assert phase_lag_deg(ellipse.y, found.direction) == pytest.approx(90, abs=0.2)
+    assert phase_lag_deg(ellipse.z, found.direction) == pytest.approx(180, abs=0.2)
+    assert (2 * ellipse.semi_major, 2 * ellipse.semi_minor) == pytest.approx((60, 20), rel=1e-3)
+    assert ellipse.precession == "backward"  # y to z, and the shaft turns from z to y
     assert abs(bearing.y_um.mean()) < 1
 
 
@@ -165,7 +166,7 @@ def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_win
     assert (found.start_ns, found.end_ns) == (START_NS + 1 * S, START_NS + 21 * S)
     density = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "density")
     assert density.values[0].sum() * 0.5 == pytest.approx(amplitude**2 / 2, rel=1e-3)
-    panel = paint_spectrum(found, "demo/lab", Look(), log=False).axes[0]
+    panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=False)).axes[0]
     assert panel.get_ylabel() == stated
     fall = read_waterfall(stream, stream.channels([name])[0], 4.0, 0.5, "amplitude")
     assert fall.values.max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
@@ -193,15 +194,16 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
     found = read_spectrum(stream, stream.channels(["y1"]), 20.0, 0.5, "amplitude")
     fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
     for log in (False, True):
-        panel = paint_spectrum(found, "demo/lab", Look(), log=log).axes[0]
+        panel = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log)).axes[0]
         assert panel.get_xlim() == (1.0, 80.0)  # two lines, from which on the window lets no mean through, to 4×
         assert panel.get_ylim()[1] > 20
-    low, high = paint_spectrum(found, "demo/lab", Look(), log=True).axes[0].get_ylim()
+    low, high = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", log=True)).axes[0].get_ylim()
     assert high / low < 10**5
-    for paint in (paint_map, paint_cascade):
-        axes = paint(fall, "demo/lab", Look(), (), over_speed=False, log=True).axes[0]
+    lines = Lines(4.0, 0.5, "amplitude", log=True)
+    for cascade in (False, True):
+        axes = paint_waterfall(fall, "demo/lab", Look(), (), lines, over_speed=False, cascade=cascade).axes[0]
         assert axes.get_xlim() == (1.0, 80.0)
-    wide = paint_spectrum(found, "demo/lab", Look(), log=False, up_to_hz=500.0).axes[0]
+    wide = paint_spectrum(found, "demo/lab", Look(), Lines(20.0, 0.5, "amplitude", False, 500.0)).axes[0]
     assert wide.get_xlim() == (1.0, 500.0)
 
 
@@ -264,7 +266,7 @@ def test_correlation_panels_carry_the_figures_of_the_report(
 ) -> None:
     report = [one for one in reports_of(lines) if one.equations][nth]
     source = RecordingSource([faulty])
-    window = latest_window(source, LAB.keys, LAB, source.start_ns, report.end_ns + S)
+    window = latest_window(Recorded(source, LAB.keys, source.start_ns, report.end_ns + S), LAB)
     found = correlations_of(window, LAB, load_bundle("lab", LAB))
     assert (found.start_ns, found.end_ns) == (report.start_ns, report.end_ns)
     assert [panel.number for panel in found.panels] == [equation.equation for equation in report.equations]
@@ -287,7 +289,7 @@ def test_correlation_panels_carry_the_figures_of_the_report(
 def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
     """Each curve against the window's own correlation of that reference with the target."""
     source = RecordingSource([faulty])
-    window = latest_window(source, LAB.keys, LAB, source.start_ns, source.end_ns + 1)
+    window = latest_window(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1), LAB)
     panel = correlations_of(window, LAB, load_bundle("lab", LAB)).panels[0]
     lags = window.lags_s >= 0.0099
     for curve in panel.curves:
@@ -299,13 +301,13 @@ def test_curves_are_labelled_with_their_references(faulty: Path) -> None:
 def test_no_full_window_is_said(faulty: Path) -> None:
     source = RecordingSource([faulty])
     with pytest.raises(RotorwatchError, match=r"a window is 60 s, usable data are 30 s"):
-        latest_window(source, LAB.keys, LAB, source.start_ns, START_NS + 30 * S)
+        latest_window(Recorded(source, LAB.keys, source.start_ns, START_NS + 30 * S), LAB)
 
 
 def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[str, object]]) -> None:
     source = RecordingSource([faulty])
     reports = reports_of(lines)
-    found = read_trend(source, LAB.keys, None, source.start_ns, source.end_ns + 1)
+    found = read_trend(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1))
     assert found.end_ns.tolist() == [report.end_ns for report in reports]
     assert found.states == tuple(report.state for report in reports)
     assert found.limits == LAB.alarms
@@ -350,10 +352,10 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
     messages.append(RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", START_NS + 1000, START_NS))
     path = write(tmp_path / "reports.mcap", [*messages, *messages[:3]])
     source, samples = RecordingSource([path]), RecordingSource([faulty])
-    keys = trend_machine(source, None)
+    keys = source.machine(reports=True)
     assert keys == LAB.keys
-    recorded = read_trend(source, keys, None, source.start_ns, source.end_ns + 1)
-    computed = read_trend(samples, keys, None, samples.start_ns, samples.end_ns + 1)
+    recorded = read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1))
+    computed = read_trend(Recorded(samples, keys, samples.start_ns, samples.end_ns + 1))
     assert (recorded.origin, recorded.limits) == ("as recorded", LAB.alarms)
     assert recorded.end_ns.tolist() == computed.end_ns.tolist()
     assert [alarm.time_ns for alarm in recorded.alarms] == [alarm.time_ns for alarm in computed.alarms]
@@ -361,14 +363,14 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
         np.testing.assert_array_equal(one.change, other.change)
         np.testing.assert_array_equal(one.high, other.high)
     with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
-        read_trend(source, keys, "lab", source.start_ns, source.end_ns + 1)
-    with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab; demo/fan is not"):
-        trend_machine(source, "demo/fan")
+        read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1), "lab")
+    with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab"):
+        source.machine("demo/fan", reports=True)
 
 
 def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
     source = RecordingSource([faulty])
-    filling = read_trend(source, LAB.keys, None, source.start_ns, START_NS + 30 * S)
+    filling = read_trend(Recorded(source, LAB.keys, source.start_ns, START_NS + 30 * S))
     assert (filling.parameters, len(filling.levels)) == ((), 8)
     bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
     with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):
@@ -377,6 +379,6 @@ def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
 
 def test_levels_are_shown_instead_of_parameters_where_they_are_asked_for(faulty: Path) -> None:
     source = RecordingSource([faulty])
-    found = read_trend(source, LAB.keys, None, source.start_ns, source.end_ns + 1, levels=True)
+    found = read_trend(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1), levels=True)
     assert (found.parameters, found.levels[0].title) == ((), "y1   um pp")
     assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in found.levels)

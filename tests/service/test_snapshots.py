@@ -16,12 +16,12 @@ from models.signals.block import SampleBlock
 from models.signals.channels import state_name
 from rotorwatch.records.example import example
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from service.analysis.prediction import Prediction, predict
+from service.analysis.revolutions import NewestBlocks
 from service.analysis.snapshots import machine as machine_module
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.path import MOST_REVOLUTIONS
-from service.analysis.snapshots.prediction import Prediction, predict
-from service.analysis.snapshots.revolutions import NewestBlocks
+from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (

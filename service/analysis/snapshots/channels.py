@@ -1,6 +1,6 @@
 """Which channels a snapshot is of: those asked for by name, or a sensible few."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -98,16 +98,6 @@ def chosen_pairs(
 def vibration_channels(machine: MachineFile) -> tuple[Channel, ...]:
     """All but the shaft angle, in the order of the stream."""
     return tuple(channel for channel in machine.sensors if state_name(channel) != "theta")
-
-
-def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
-    """Displacements in y and z, at each place where both are measured."""
-    found = {(one.location, one.direction): one for one in channels if one.quantity is Quantity.DISPLACEMENT}
-    return [
-        (found[place, "y"], found[place, "z"])
-        for place in ("bearing", "disc")
-        if (place, "y") in found and (place, "z") in found
-    ]
 
 
 def si_unit(channel: Channel) -> str:

@@ -7,10 +7,10 @@ import numpy as np
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
+from service.analysis.correlation import MeasuredCorrelations, measured_correlations
+from service.analysis.prediction import Prediction
 from service.analysis.snapshots.channels import chosen_pairs, figures, product_unit
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
-from service.analysis.snapshots.measured import MeasuredCorrelations, measured_correlations
-from service.analysis.snapshots.prediction import Prediction
 
 
 def correlation_snapshot(

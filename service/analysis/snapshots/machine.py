@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from models.commissioning.commissioned import Installed
 from models.diagnosis.window import WindowStatistics
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
+from service.analysis.prediction import NO_PARAMETERS, Prediction, predict
 from service.analysis.snapshots.correlation import correlation_snapshot
 from service.analysis.snapshots.heading import LatestData, Subject
 from service.analysis.snapshots.orbit import orbit_snapshot
-from service.analysis.snapshots.prediction import NO_PARAMETERS, Prediction, predict
 from service.analysis.snapshots.spectrum import spectrum_snapshot
 from service.monitor.reports import Identity
 

@@ -7,17 +7,20 @@ import numpy as np
 
 from models.diagnosis.moments import ComplexArray
 from models.diagnosis.window import WindowStatistics
-from models.machine import Machine
+from models.machine import Machine, MachineFile
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATE_INDEX, RotorParameters, changed
+from models.signals.block import SampleBlock
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
-from service.analysis.snapshots.channels import figures, orbit_pairs
-from service.analysis.snapshots.ellipse import Ellipse, phase_lag_deg
+from service.analysis.orbit import Ellipse, no_pair, orbit_pairs, phase_lag_deg
+from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
+from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions, no_revolutions
+from service.analysis.snapshots.channels import SnapshotError, figures
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
-from service.analysis.snapshots.path import NewestPath, newest_path
-from service.analysis.snapshots.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 
+MOST_REVOLUTIONS = 64
+_MOST_SAMPLES = 20_000
 _NO_SPEED = "the speed of rotation is not known"
 
 
@@ -59,17 +62,13 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     """
     machine, known, window = subject.machine, subject.known, data.window
     places = orbit_pairs(machine.sensors)
-    path = newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
+    path = _newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
     changes = read_changes(data.parameters)
     lacking = NO_PARAMETERS if known is None else ""
     estimated_reason = lacking or ("" if changes else data.why_not or NOTHING_READ)
     vectors = None if window is None else _vectors(window)
     if not places:
-        there = ", ".join(channel.name for channel in machine.sensors if channel.quantity == "displacement") or "none"
-        reason = (
-            f"{machine.site}/{machine.name}: an orbit needs the displacements in y and z at one place; measured "
-            f"displacements: {there}"
-        )
+        reason = f"{machine.site}/{machine.name}: {no_pair(machine.sensors)}"
     elif window is None:
         reason = no_window(machine, data)
     else:
@@ -82,10 +81,12 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     return OrbitSnapshot(
         **head,
         speed_source="unknown" if window is None else window.speed_source,
-        orbits=tuple(_place(pair, window, vectors, known, rotors, path, units) for pair in places),
-        revolutions=path.revolutions,
-        path_start_ns=path.start_ns,
-        pulses_s=tuple(one for one in figures(path.pulses_s) if one is not None),
+        orbits=tuple(
+            _place(pair, window, vectors, known, rotors, _path(machine, path, pair, units), units) for pair in places
+        ),
+        revolutions=path.count,
+        path_start_ns=None if path.excerpt is None else path.excerpt.start_ns,
+        pulses_s=tuple(one for one in figures(path.pulses / machine.rate_hz) if one is not None),
         theory=theory(changes, lacking, estimated_reason),
         reason=reason,
         path_reason=path.reason,
@@ -107,7 +108,7 @@ def _place(
     vectors: _Vectors | None,
     known: Machine | None,
     rotors: tuple[RotorParameters | None, RotorParameters | None],
-    path: NewestPath,
+    path: PathSamples | None,
     units: Units,
 ) -> PlaceOrbit:
     factor = 1.0 if units == "SI" else 1 / pair[0].to_si
@@ -128,7 +129,7 @@ def _place(
         ellipse=ellipse,
         nominal=nominal,
         estimated=estimated,
-        path=_path(pair, path, factor),
+        path=path,
     )
 
 
@@ -179,11 +180,28 @@ def _ellipse(vectors: ComplexArray, direction: int, *, absolute: bool) -> OrbitE
     )
 
 
-def _path(pair: tuple[Channel, Channel], path: NewestPath, factor: float) -> PathSamples | None:
-    if not path.revolutions:
+def _newest_path(
+    machine: MachineFile, blocks: tuple[SampleBlock, ...], revolutions: int, speed_rad_s: float | None
+) -> Revolutions:
+    if not 0 <= revolutions <= MOST_REVOLUTIONS:
+        place = f"{machine.site}/{machine.name}"
+        raise SnapshotError(f"{place}: revolutions is {revolutions}, expected 0 to {MOST_REVOLUTIONS}")
+    if not revolutions:
+        return no_revolutions("none were asked for")
+    if not blocks:
+        return no_revolutions("no samples have come in")
+    states = machine.descriptor.states
+    excerpt = Excerpt.of_blocks(blocks, machine.rate_hz, states.index("theta") if "theta" in states else None)
+    return newest_revolutions(excerpt, revolutions, speed_rad_s, _MOST_SAMPLES)
+
+
+def _path(machine: MachineFile, path: Revolutions, pair: tuple[Channel, Channel], units: Units) -> PathSamples | None:
+    if path.excerpt is None:
         return None
-    y, z = (path.values_si(channel) * factor for channel in pair)
-    times_s = np.arange(y.size) / path.rate_hz
+    names = [channel.name for channel in machine.sensors]
+    factor = 1.0 if units == "SI" else 1 / pair[0].to_si
+    y, z = (path.excerpt.samples[:, names.index(one.name)] * one.to_si * factor for one in pair)
+    times_s = np.arange(y.size) / machine.rate_hz
     return PathSamples(
         times_s=tuple(one for one in figures(times_s) if one is not None),
         y=figures(y - y.mean()),

@@ -12,10 +12,10 @@ from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, SpectrumSnapshot, Units
+from service.analysis.excitation import LEFT_OUT_BINS
+from service.analysis.prediction import Prediction
 from service.analysis.snapshots.channels import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
-from service.analysis.snapshots.excitation import LEFT_OUT_BINS
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
-from service.analysis.snapshots.prediction import Prediction
 
 MOST_LINES = 1000
 """Lines in a snapshot; where the band has more, neighbours are averaged."""

@@ -8,7 +8,7 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from service.access.guard import Guard
 from service.access.problems import responses
 from service.analysis.snapshots.channels import SnapshotError
-from service.analysis.snapshots.path import MOST_REVOLUTIONS
+from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
 _NONE: list[str] = []

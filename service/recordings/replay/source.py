@@ -64,38 +64,43 @@ class RecordingSource:
     @property
     def machines(self) -> tuple[MachineKeys, ...]:
         """Machines of which there are sample blocks."""
-        found = []
-        for key in sorted(self.keys):
-            parts = key.split("/")
-            if len(parts) == 4 and parts[0] == PREFIX and parts[3] == "stream":
-                found.append(MachineKeys(parts[1], parts[2]))
-        return tuple(found)
+        return self._machines("stream")
 
-    def machine(self, wanted: str | None = None) -> MachineKeys:
-        """Keys of the machine to replay.
+    def _machines(self, *leaves: str) -> tuple[MachineKeys, ...]:
+        """Machines with any of these keys."""
+        parts = [key.split("/") for key in sorted(self.keys)]
+        found = [MachineKeys(*one[1:3]) for one in parts if len(one) == 4 and one[0] == PREFIX and one[3] in leaves]
+        return tuple(dict.fromkeys(found))
+
+    def machine(self, wanted: str | None = None, *, reports: bool = False) -> MachineKeys:
+        """Keys of one machine.
 
         Parameters
         ----------
         wanted : str, optional
             ``SITE/MACHINE``; may be left out if the recordings hold one machine.
+        reports : bool
+            Whether reports will do where the samples were not kept.
 
         Raises
         ------
         MachineFileError
             If it is not in the recordings, or several are and none was named; the message lists them.
         """
-        there = {f"{keys.site}/{keys.machine}": keys for keys in self.machines}
+        found = self._machines("report", "stream") if reports else self.machines
+        there = {f"{keys.site}/{keys.machine}": keys for keys in found}
         listed = ", ".join(there) or "none"
-        place = ", ".join(path.name for path in self.paths)
+        place, what = (
+            ", ".join(path.name for path in self.paths),
+            "reports or sample blocks" if reports else "sample blocks",
+        )
         if wanted is None:
             if len(there) != 1:
-                raise MachineFileError(
-                    f"{place}: machines with sample blocks: {listed}; name one, as --key SITE/MACHINE"
-                )
+                raise MachineFileError(f"{place}: machines with {what}: {listed}; name one, as --key SITE/MACHINE")
             return next(iter(there.values()))
         name = wanted.removeprefix(f"{PREFIX}/").removesuffix("/stream")
         if name not in there:
-            raise MachineFileError(f"{place}: no sample blocks of {wanted}; machines with sample blocks: {listed}")
+            raise MachineFileError(f"{place}: no {what} of {wanted}; machines with {what}: {listed}")
         return there[name]
 
     @property

@@ -20,7 +20,6 @@ from models.machine import Machine
 from models.physics.excitation import low_pass
 from models.physics.rotor import COORDINATES, RotorParameters
 from models.signals.block import FloatArray
-from service.analysis.snapshots.sensor_noise import noise_density, sensor_noise
 
 LEFT_OUT_BINS = 3
 """Lines on either side of the rotation that are not compared: what is left of 1× there is not stochastic."""
@@ -48,7 +47,7 @@ class Excitation:
     speed_rad_s : float
         Speed of the gyroscopic terms.
     noise : dict of str to ndarray
-        Parameters of every sensor's noise (`service.analysis.snapshots.sensor_noise`), by state; an
+        Parameters of every sensor's noise (`service.analysis.excitation`), by state; an
         accelerometer's as that of the velocity it was integrated to.
     """
 
@@ -198,3 +197,75 @@ def _dof(state: str) -> int:
 def _order(state: str) -> int:
     """How often the coordinate is differentiated."""
     return {"": 0, "dot": 1, "ddot": 2}[state.partition("_")[2]]
+
+
+_NOISE_STEPS, _LONGEST, _CLOSE = 30, 1.5, 0.01
+_STEEPEST = 4.0
+_LEAST, _USUAL = 1e-7, 1e-3
+"""Density over the channel's mean density: the least that is looked for, and where the search begins."""
+_PULL = np.array([0.05, 1.0])
+"""Weak pull of level and colour to what is usual, for sensors whose noise does not show."""
+
+
+def noise_density(parameters: FloatArray, frequencies_hz: FloatArray, high_hz: float) -> FloatArray:
+    """d(f) of a sensor, SI²/Hz.
+
+    Parameters
+    ----------
+    parameters : ndarray, shape (2,)
+        ln d₀ and b.
+    frequencies_hz : ndarray
+    high_hz : float
+        End of the band.
+    """
+    shape = np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)
+    return np.asarray(np.exp(parameters[0] + parameters[1] * shape), dtype=np.float64)
+
+
+def sensor_noise(
+    measured: FloatArray, theory: FloatArray, averages: FloatArray, frequencies_hz: FloatArray, high_hz: float
+) -> FloatArray:
+    """Find ln d₀ and b of one sensor.
+
+    Parameters
+    ----------
+    measured, theory : ndarray, shape (n_groups,)
+        Densities as estimated, and as theory has them without noise, SI²/Hz.
+    averages : ndarray, shape (n_groups,)
+        Independent averages of `measured`.
+    frequencies_hz : ndarray, shape (n_groups,)
+    high_hz : float
+        End of the band.
+
+    Returns
+    -------
+    ndarray, shape (2,)
+    """
+    shape = np.log1p((frequencies_hz / (2 / 3 * high_hz)) ** 2)
+    level = float(np.log(averages @ measured / averages.sum()))
+    usual = np.array([level + np.log(_USUAL), 0.0])
+
+    def seen(point: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+        """Noise, expected density, and the log-likelihood with the pulls."""
+        noise = np.exp(point[0] + point[1] * shape)
+        expected = theory + noise
+        fits = -float(averages @ (np.log(expected) + measured / expected))
+        return noise, expected, fits - float(_PULL @ (point - usual) ** 2) / 2
+
+    found, damping = usual, 1e-3
+    noise, expected, value = seen(found)
+    for _ in range(_NOISE_STEPS):
+        slopes = np.stack([noise / expected, shape * noise / expected])
+        gradient = slopes @ (averages * (measured / expected - 1)) - _PULL * (found - usual)
+        information = (slopes * averages) @ slopes.T + np.diag(_PULL)
+        step = np.linalg.solve(information + damping * np.diag(np.diag(information)), gradient)
+        step = np.clip(step, -_LONGEST, _LONGEST)
+        trial = np.clip(found + step, (level + np.log(_LEAST), -_STEEPEST), (level, _STEEPEST))
+        there = seen(trial)
+        if there[2] > value:
+            found, (noise, expected, value), damping = trial, there, damping / 8
+            if np.all(np.abs(step) < _CLOSE):
+                break
+        else:
+            damping *= 8
+    return found

@@ -1,18 +1,26 @@
 """Picture of orbits: as measured and at running speed, with the keyphasor's dots."""
 
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from service.analysis.plots.orbit import Orbit, Orbits, Vector
-from service.analysis.plots.style import COLOURS, GREY, INK, Look, heading, rpm, stretch_text
+from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm, stretch_text
+from service.analysis.orbit import Orbit, Orbits, phase_lag_deg, read_orbits
+from service.analysis.recorded import Recorded
 
 _BLANK = 0.07
 """Gap before the keyphasor's dot, of the ellipse's length."""
 
 
-def paint_orbits(found: Orbits, name: str, look: Look) -> Figure:
+def orbit(data: Recorded, revolutions: int) -> Paint:
+    """Orbits of the latest revolutions."""
+    return partial(_paint, read_orbits(data, revolutions), data.name)
+
+
+def _paint(found: Orbits, name: str, look: Look) -> Figure:
     """A row for each place: raw, and 1×."""
     rows = len(found.orbits)
     figure = Figure(figsize=look.size_in or (7.6, 1.0 + 4.2 * rows), layout="constrained")
@@ -45,20 +53,20 @@ def paint_orbits(found: Orbits, name: str, look: Look) -> Figure:
 def _raw(axes: Axes, orbit: Orbit) -> None:
     axes.plot(orbit.y_um, orbit.z_um, color=COLOURS[0], linewidth=0.8)
     axes.plot(*orbit.marks_um.T, "o", color=COLOURS[1], markersize=5, markeredgecolor="white", markeredgewidth=0.6)
-    axes.set_title(f"{orbit.location}, as measured", fontweight="bold")
-    across = np.ptp(orbit.y_um), np.ptp(orbit.z_um)
-    _frame(axes, orbit, [f"{orbit.y.channel} {across[0]:.4g} µm pp", f"{orbit.z.channel} {across[1]:.4g} µm pp"])
+    axes.set_title(f"{orbit.y.location}, as measured", fontweight="bold")
+    across = (orbit.y, np.ptp(orbit.y_um)), (orbit.z, np.ptp(orbit.z_um))
+    _frame(axes, orbit, [f"{channel.name} {length:.4g} µm pp" for channel, length in across])
     _limit(axes, orbit.y_um, orbit.z_um)
 
 
 def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
-    sense = found.direction
-    y, z = orbit.at_running_speed(sense * np.linspace(0, 2 * np.pi, 720, endpoint=False))
-    at = orbit.at_running_speed(np.zeros(1))
-    far = np.hypot(y - at[0], z - at[1]) > _BLANK * orbit.major_um
+    ellipse = orbit.ellipse
+    turn = np.exp(1j * found.direction * np.linspace(0, 2 * np.pi, 720, endpoint=False))
+    y, z = np.real(ellipse.y * turn), np.real(ellipse.z * turn)
+    far = np.hypot(y - y[0], z - z[0]) > _BLANK * 2 * ellipse.semi_major
     last = int(np.flatnonzero(far)[-1]) + 1 if far.any() else y.size  # the way to the dot is left blank
     axes.plot(y[:last], z[:last], color=COLOURS[0], linewidth=1.8)
-    axes.plot(*at, "o", color=COLOURS[1], markersize=7, markeredgecolor="white", markeredgewidth=0.6)
+    axes.plot(y[:1], z[:1], "o", color=COLOURS[1], markersize=7, markeredgecolor="white", markeredgewidth=0.6)
     for part in (0.3, 0.8):  # which way it goes
         index = int(part * 720)
         axes.annotate(
@@ -67,21 +75,20 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
             (y[index], z[index]),
             arrowprops={"arrowstyle": "-|>", "color": COLOURS[0], "mutation_scale": 16},
         )
-    axes.set_title(f"{orbit.location}, 1× alone: {orbit.precession} precession", fontweight="bold")
-    shape = f"ellipse {orbit.major_um:.4g} × {orbit.minor_um:.4g} µm"
-    _frame(axes, orbit, [_vector(orbit.y), _vector(orbit.z), shape])
+    axes.set_title(f"{orbit.y.location}, 1× alone: {ellipse.precession} precession", fontweight="bold")
+    lines = [
+        f"{channel.name} {2 * abs(q):.4g} µm pp ∠ {phase_lag_deg(q, found.direction):.0f}° lag"
+        for channel, q in ((orbit.y, ellipse.y), (orbit.z, ellipse.z))
+    ]
+    _frame(axes, orbit, [*lines, f"ellipse {2 * ellipse.semi_major:.4g} × {2 * ellipse.semi_minor:.4g} µm"])
     _limit(axes, y, z)
-
-
-def _vector(vector: Vector) -> str:
-    return f"{vector.channel} {vector.peak_to_peak_um:.4g} µm pp ∠ {vector.phase_lag_deg:.0f}° lag"
 
 
 def _frame(axes: Axes, orbit: Orbit, lines: list[str]) -> None:
     axes.axhline(0, color=GREY, linewidth=0.6)
     axes.axvline(0, color=GREY, linewidth=0.6)
-    axes.set_xlabel(f"y: {orbit.y.channel}, µm")
-    axes.set_ylabel(f"z: {orbit.z.channel}, µm")
+    axes.set_xlabel(f"y: {orbit.y.name}, µm")
+    axes.set_ylabel(f"z: {orbit.z.name}, µm")
     axes.text(
         0.02, 0.985, "\n".join(lines), transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, zorder=5
     )

@@ -1,19 +1,23 @@
 """Pictures of spectra: of a moment, and one after the other."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
+from models.errors import MachineFileError
 from models.signals.channels import Channel
 from rotorwatch.records.alarms import AlarmEventData
-from service.analysis.plots.spectrum import Spectrum, Waterfall, lowest_hz, shown_as
-from service.analysis.plots.style import (
+from service.analysis.figures.style import (
     COLOURS,
     INK,
     PLATE,
     Look,
+    Paint,
     alarm_lines,
     as_dates,
     heading,
@@ -21,25 +25,70 @@ from service.analysis.plots.style import (
     stretch_text,
     time_axis,
 )
+from service.analysis.recorded import Recorded
+from service.analysis.spectrum import Scaling, Spectrum, Waterfall, lowest_hz, read_spectrum, read_waterfall, shown_as
+from service.analysis.trend import recorded_alarms
 
 _DECADES = 4
 _MOST_TRACES = 60
 _ORDERS = (1, 2)
 
 
-def paint_spectrum(found: Spectrum, name: str, look: Look, *, log: bool, up_to_hz: float | None = None) -> Figure:
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """How spectra are taken and shown.
+
+    Attributes
+    ----------
+    scaling : str
+        ``amplitude`` or ``density``.
+    log : bool
+        Whether amplitudes are on a logarithmic scale.
+    to_hz : float or None
+        Highest frequency shown; None is as far as there is something to be seen.
+    """
+
+    window_s: float
+    resolution_hz: float
+    scaling: Scaling
+    log: bool
+    to_hz: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.to_hz is not None and self.to_hz < 4 * self.resolution_hz:
+            raise MachineFileError(
+                f"--to-hz is {self.to_hz:g}, expected at least four lines of --resolution {self.resolution_hz:g} Hz"
+            )
+
+
+def spectrum(data: Recorded, channels: Sequence[str], lines: Lines) -> Paint:
+    """Spectra of the latest seconds; of all displacements if no channel is named."""
+    found = read_spectrum(data, data.chosen(channels), lines.window_s, lines.resolution_hz, lines.scaling)
+    return lambda look: paint_spectrum(found, data.name, look, lines)
+
+
+def waterfall(data: Recorded, channels: Sequence[str], lines: Lines, *, over_speed: bool, cascade: bool) -> Paint:
+    """Spectra of one channel, the first displacement if none is named, over time or speed, as colours or as lines."""
+    if len(channels) > 1:
+        raise MachineFileError(f"--channel: a waterfall is of one channel, found {', '.join(channels)}")
+    found = read_waterfall(data, data.chosen(channels)[0], lines.window_s, lines.resolution_hz, lines.scaling)
+    alarms = recorded_alarms(data)
+    return lambda look: paint_waterfall(found, data.name, look, alarms, lines, over_speed=over_speed, cascade=cascade)
+
+
+def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figure:
     """A panel for each channel."""
     count = len(found.channels)
     figure = Figure(figsize=look.size_in or (9.5, 1.2 + 1.75 * count), layout="constrained")
     panels = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
-    limits_hz, shown = _shown(found, up_to_hz)
+    limits_hz, shown = _shown(found, lines.to_hz)
     frequency = found.frequencies_hz[shown]
     for axes, channel, values in zip(panels, found.channels, found.values[:, shown], strict=True):
         axes.plot(frequency, values, color=COLOURS[0], linewidth=0.9)
         axes.set_title(f"{channel.name}   {_place(channel)}", fontweight="bold")
         axes.set_ylabel(shown_as(channel, found.scaling)[0])
         top = float(values.max()) or 1.0
-        if log:
+        if lines.log:
             axes.set_yscale("log")
             floor = max(float(values[values > 0].min(initial=top)), top * _depth(found))
             axes.set_ylim(0.7 * floor, 2.5 * top)
@@ -57,20 +106,34 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, *, log: bool, up_to_h
     return figure
 
 
-def paint_map(
+def paint_waterfall(
     found: Waterfall,
     name: str,
     look: Look,
     alarms: tuple[AlarmEventData, ...],
+    lines: Lines,
     *,
     over_speed: bool,
-    log: bool,
-    up_to_hz: float | None = None,
+    cascade: bool,
 ) -> Figure:
-    """Spectra as rows of colour."""
-    figure = Figure(figsize=look.size_in or (9.5, 6.0), layout="constrained")
+    """Spectra as rows of colour, or as lines one behind the other."""
+    figure = Figure(figsize=look.size_in or (9.5, 7.0 if cascade else 6.0), layout="constrained")
     axes = figure.subplots()
-    limits_hz, shown = _shown(found, up_to_hz)
+    limits_hz, shown = _shown(found, lines.to_hz)
+    axes.set_xlim(limits_hz)
+    axes.set_xlabel("frequency, Hz")
+    axes.grid(visible=False)
+    (_cascade if cascade else _map)(axes, found, shown, over_speed=over_speed, log=lines.log)
+    if over_speed:
+        axes.set_ylabel("speed, rpm")
+    else:
+        time_axis(axes, vertical=True)
+        alarm_lines(axes, alarms, vertical=True)
+    _waterfall_heading(figure, look, found, name)
+    return figure
+
+
+def _map(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over_speed: bool, log: bool) -> None:
     frequency = found.frequencies_hz[shown]
     half = found.resolution_hz / 2
     columns = np.append(frequency - half, frequency[-1] + half)
@@ -82,37 +145,16 @@ def paint_map(
         rows, values = _rows_in_time(found, found.values[:, shown])
     top = float(np.nanmax(values)) or 1.0
     norm = LogNorm(max(float(np.nanmin(values[values > 0], initial=top)), top * _depth(found)), top)
+    limits = axes.get_xlim()
     mesh = axes.pcolormesh(
         columns, rows, values, norm=norm if log else Normalize(0, top), cmap="cividis", rasterized=True
     )
-    figure.colorbar(mesh, ax=axes, label=shown_as(found.channel, found.scaling)[0], pad=0.02, aspect=32)
-    axes.grid(visible=False)
-    axes.set_xlim(limits_hz)
-    axes.set_xlabel("frequency, Hz")
+    axes.figure.colorbar(mesh, ax=axes, label=shown_as(found.channel, found.scaling)[0], pad=0.02, aspect=32)
+    axes.set_xlim(limits)
     _order_lines(axes, found, rows, over_speed=over_speed)
-    if over_speed:
-        axes.set_ylabel("speed, rpm")
-    else:
-        time_axis(axes, vertical=True)
-        alarm_lines(axes, alarms, vertical=True)
-    _waterfall_heading(figure, look, found, name)
-    return figure
 
 
-def paint_cascade(
-    found: Waterfall,
-    name: str,
-    look: Look,
-    alarms: tuple[AlarmEventData, ...],
-    *,
-    over_speed: bool,
-    log: bool,
-    up_to_hz: float | None = None,
-) -> Figure:
-    """Spectra as lines, one behind the other."""
-    figure = Figure(figsize=look.size_in or (9.5, 7.0), layout="constrained")
-    axes = figure.subplots()
-    limits_hz, shown = _shown(found, up_to_hz)
+def _cascade(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over_speed: bool, log: bool) -> None:
     frequency = found.frequencies_hz[shown]
     if over_speed:
         edges, values = found.over_speed()
@@ -130,14 +172,6 @@ def paint_cascade(
         axes.fill_between(frequency, at, at + scale * line, color="white", linewidth=0, zorder=2 + order)
         axes.plot(frequency, at + scale * line, color=COLOURS[0], linewidth=0.7, zorder=2 + order)
     axes.set_ylim(base[0] - step, base[-1] + 1.05 * scale)
-    axes.set_xlim(limits_hz)
-    axes.set_xlabel("frequency, Hz")
-    axes.grid(visible=False)
-    if over_speed:
-        axes.set_ylabel("speed, rpm")
-    else:
-        time_axis(axes, vertical=True)
-        alarm_lines(axes, alarms, vertical=True)
     if np.isfinite(found.speed_rad_s).all():
         running = base / 60 if over_speed else np.abs(found.speed_rad_s[there]) / (2 * np.pi)
         for number in _ORDERS:
@@ -164,8 +198,6 @@ def paint_cascade(
         zorder=400,
         bbox=PLATE,
     )
-    _waterfall_heading(figure, look, found, name)
-    return figure
 
 
 def _waterfall_heading(figure: Figure, look: Look, found: Waterfall, name: str) -> None:
@@ -239,9 +271,10 @@ def _place(channel: Channel) -> str:
     return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.direction}"
 
 
-def _shown(found: Spectrum | Waterfall, up_to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
+def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:
     """Ends of the frequency axis, and the lines between them."""
-    low, high = lowest_hz(found.resolution_hz), found.useful_hz if up_to_hz is None else up_to_hz
+    low, high = lowest_hz(found.resolution_hz), found.useful_hz if to_hz is None else to_hz
+    high = min(high, float(found.frequencies_hz[-1]))
     slack = 1e-6 * found.resolution_hz
     return (low, high), (found.frequencies_hz >= low - slack) & (found.frequencies_hz <= high + slack)
 

@@ -1,4 +1,4 @@
-"""Spectra of a recorded stream: of its latest seconds, and over time or speed."""
+"""Spectra of a recorded data: of its latest seconds, and over time or speed."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,7 +10,8 @@ from scipy.signal import welch
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
-from service.analysis.plots.excerpts import Excerpt, RecordedStream, begins_again
+from service.analysis.recorded import Recorded, begins_again
+from service.analysis.revolutions import Excerpt
 
 _MOST_SPECTRA = 400
 _MOST_SPEEDS = 120
@@ -147,7 +148,7 @@ class Waterfall:
 
 
 def read_spectrum(
-    stream: RecordedStream, channels: tuple[Channel, ...], window_s: float, resolution_hz: float, scaling: Scaling
+    data: Recorded, channels: tuple[Channel, ...], window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Spectrum:
     """Spectra of the latest `window_s` of a recorded stream; segments never reach across a gap.
 
@@ -158,14 +159,14 @@ def read_spectrum(
     RotorwatchError
         If there is no stretch so long without a gap.
     """
-    segment = _segment(stream, window_s, resolution_hz)
-    found = stream.latest(channels, window_s)
+    segment = _segment(data, window_s, resolution_hz)
+    found = data.latest(channels, window_s)
     used = [stretch for stretch in found if stretch.samples.shape[0] >= segment]
     if not used:
         longest_s = max((stretch.length_s for stretch in found), default=0.0)
         raise RotorwatchError(
-            f"{stream.place}: a spectrum with --resolution {resolution_hz:g} Hz needs {1 / resolution_hz:g} s without "
-            f"a gap, the longest stretch of {stream.name} in the last {window_s:g} s is {longest_s:.3g} s"
+            f"{data.place}: a spectrum with --resolution {resolution_hz:g} Hz needs {1 / resolution_hz:g} s without "
+            f"a gap, the longest stretch of {data.name} in the last {window_s:g} s is {longest_s:.3g} s"
         )
     total, averages = np.zeros((len(channels), segment // 2 + 1)), 0
     for stretch in used:
@@ -173,7 +174,7 @@ def read_spectrum(
         total, averages = total + power, averages + count
     lengths = np.array([stretch.length_s for stretch in used])
     speeds = np.array([stretch.speed_rad_s for stretch in used])
-    rate_hz = stream.descriptor.rate_hz
+    rate_hz = data.descriptor.rate_hz
     return Spectrum(
         start_ns=used[0].start_ns,
         end_ns=used[-1].end_ns,
@@ -188,9 +189,9 @@ def read_spectrum(
 
 
 def read_waterfall(
-    stream: RecordedStream, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
+    data: Recorded, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Waterfall:
-    """Spectra of one channel over a recorded stream, one per window; in long recordings over longer windows.
+    """Spectra of one channel over a recorded data, one per window; in long recordings over longer windows.
 
     Raises
     ------
@@ -199,10 +200,10 @@ def read_waterfall(
     RotorwatchError
         If there are not two stretches so long without a gap.
     """
-    segment = _segment(stream, window_s, resolution_hz)
-    each_s = max(window_s, (stream.to_ns - stream.from_ns) / 1e9 / _MOST_SPECTRA)
+    segment = _segment(data, window_s, resolution_hz)
+    each_s = max(window_s, (data.to_ns - data.from_ns) / 1e9 / _MOST_SPECTRA)
     rows: list[tuple[int, int, float, FloatArray]] = []
-    for stretch in stream.stretches((channel,), each_s):
+    for stretch in data.stretches((channel,), each_s):
         if stretch.samples.shape[0] < segment:
             continue
         while rows and begins_again(rows[-1][1], stretch.start_ns):
@@ -213,11 +214,11 @@ def read_waterfall(
         )
     if len(rows) < 2:
         raise RotorwatchError(
-            f"{stream.place}: {len(rows)} spectra of {stream.name} over {window_s:g} s without a gap, expected at "
+            f"{data.place}: {len(rows)} spectra of {data.name} over {window_s:g} s without a gap, expected at "
             "least 2 for a waterfall; a shorter --window may do"
         )
     starts, ends, speeds, values = zip(*rows, strict=True)
-    rate_hz = stream.descriptor.rate_hz
+    rate_hz = data.descriptor.rate_hz
     return Waterfall(
         channel=channel,
         frequencies_hz=_lines(segment, rate_hz),
@@ -286,9 +287,9 @@ def _values(power: FloatArray, channel: Channel, scaling: Scaling) -> FloatArray
     return factor * (np.sqrt(power) if scaling == "amplitude" else power)
 
 
-def _segment(stream: RecordedStream, window_s: float, resolution_hz: float) -> int:
+def _segment(data: Recorded, window_s: float, resolution_hz: float) -> int:
     """Samples of a segment, even."""
-    rate_hz = stream.descriptor.rate_hz
+    rate_hz = data.descriptor.rate_hz
     segment = 2 * round(rate_hz / resolution_hz / 2)
     if segment < 8:
         raise MachineFileError(

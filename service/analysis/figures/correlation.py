@@ -1,15 +1,33 @@
 """Picture of the correlations: measured against the networks' prediction, the residual below."""
 
+from functools import partial
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from service.analysis.plots.correlation import Correlations, Panel
-from service.analysis.plots.style import COLOURS, GREY, INK, Look, heading, rpm, stretch_text
+from models.errors import MachineFileError
+from service.analysis.correlation import Correlations, Panel, correlations_of, latest_window
+from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm, stretch_text
+from service.analysis.recorded import Recorded
+from service.recordings.replay.machine import choose_machine
 
 
-def paint_correlations(found: Correlations, name: str, networks: str, look: Look) -> Figure:
+def correlation(data: Recorded, choice: str | None) -> Paint:
+    """Correlations of the latest window, with the shipped machine file or ``FILE[@BUNDLE]``."""
+    installed = choose_machine(data.keys, choice)
+    machine, bundle = installed.known, installed.bundle
+    if machine is None or bundle is None:
+        raise MachineFileError(
+            "correlations are compared with what trained networks predict: name a bundle that has networks, as "
+            "--machine FILE@BUNDLE (one that was commissioned without the rotor's parameters has none)"
+        )
+    found = correlations_of(latest_window(data, machine), machine, bundle)
+    return partial(_paint, found, data.name, bundle.identity)
+
+
+def _paint(found: Correlations, name: str, networks: str, look: Look) -> Figure:
     """Two panels for each equation."""
     figure = Figure(figsize=look.size_in or (11.0, 8.4))
     figure.set_layout_engine("constrained", h_pad=0.03, hspace=0.0)

@@ -1,5 +1,7 @@
 """Picture of a trend: a panel for every parameter, over them the machine's state."""
 
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
@@ -12,13 +14,14 @@ from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmEventData
 from rotorwatch.records.health import MEASURES
-from service.analysis.plots.style import (
+from service.analysis.figures.style import (
     COLOURS,
     GREY,
     INK,
     SEVERITY_COLOURS,
     STATE_COLOURS,
     Look,
+    Paint,
     alarm_lines,
     alarm_text,
     as_date,
@@ -27,14 +30,20 @@ from service.analysis.plots.style import (
     stretch_text,
     time_axis,
 )
-from service.analysis.plots.trend import LevelTrend, ParameterTrend, Trend
+from service.analysis.recorded import Recorded
+from service.analysis.trend import LevelTrend, ParameterTrend, Trend, read_trend
 
 _GAP = 2.5
 _DASHES = (0, (4, 3))
 _LEAST_PERCENT = 5.0
 
 
-def paint_trend(trend: Trend, look: Look) -> Figure:
+def trend(data: Recorded, machine: str | None, *, levels: bool) -> Paint:
+    """Parameters or levels over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
+    return partial(_paint, read_trend(data, machine, levels=levels))
+
+
+def _paint(trend: Trend, look: Look) -> Figure:
     """Small multiples over one time axis."""
     count = len(trend.parameters)
     measures = [name for name in MEASURES if trend.parameters or np.isfinite(trend.measures[name]).any()]

@@ -75,7 +75,11 @@ class Look:
     dpi: float = 120.0
 
 
-def draw(path: Path, look: Look, paint: Callable[[Look], Figure]) -> None:
+Paint = Callable[[Look], Figure]
+"""Draws what was read; what returns one raises `RotorwatchError` if there is nothing to be seen."""
+
+
+def draw(path: Path, look: Look, paint: Paint) -> None:
     """Draw in the house style, whatever the settings of the person who draws, and write it.
 
     Raises

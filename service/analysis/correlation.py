@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from models.diagnosis.moments import plan_for
+from models.diagnosis.moments import ComplexArray, plan_for
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.equations import EQUATIONS, Equation, SynchronousEquation
 from models.diagnosis.networks.relation import EquationNetwork, read_equation, window_view
@@ -14,11 +14,10 @@ from models.errors import RotorwatchError, WireError
 from models.ingest import Gate
 from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
-from models.signals.keys import MachineKeys
 from models.signals.wire import decode_block
 from rotorwatch.records.windows import Equation as EquationReading
+from service.analysis.recorded import Recorded
 from service.monitor.descriptor import descriptor_mismatch
-from service.recordings.replay.source import RecordingSource
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +87,8 @@ class Correlations:
     panels: tuple[Panel, ...]
 
 
-def latest_window(
-    source: RecordingSource, keys: MachineKeys, machine: MachineFile, from_ns: int, to_ns: int
-) -> WindowStatistics:
-    """The latest full window of what was recorded, as a monitor that hears it from `from_ns` on has it.
+def latest_window(data: Recorded, machine: MachineFile) -> WindowStatistics:
+    """The latest full window of what was recorded, as a monitor that hears it from its start on has it.
 
     Raises
     ------
@@ -101,7 +98,7 @@ def latest_window(
     window, gate = SlidingWindow(plan_for(machine)), Gate(machine)
     latest: WindowStatistics | None = None
     refusal, data_s = "", 0.0
-    for block, schema_hash in _blocks(source, keys, machine, from_ns, to_ns):
+    for block, schema_hash in _blocks(data, machine):
         verdict = gate.judge(block, schema_hash)
         if not verdict.accepted:
             refusal = verdict.text
@@ -115,9 +112,8 @@ def latest_window(
             latest = window.statistics() or latest
     if latest is None:
         raise RotorwatchError(
-            f"{', '.join(path.name for path in source.paths)}: no full window of {keys.site}/{keys.machine} before "
-            f"this time: a window is {machine.window.length_s:g} s, usable data are {data_s:.3g} s"
-            + (f"; latest refusal: {refusal}" if refusal else "")
+            f"{data.place}: no full window of {data.name} before this time: a window is {machine.window.length_s:g} s, "
+            f"usable data are {data_s:.3g} s" + (f"; latest refusal: {refusal}" if refusal else "")
         )
     return latest
 
@@ -164,20 +160,99 @@ def _panel(
     return Panel(equation.number, equation.title, target, over, x, curves, reading)
 
 
-def _blocks(
-    source: RecordingSource, keys: MachineKeys, machine: MachineFile, from_ns: int, to_ns: int
-) -> Iterator[tuple[SampleBlock, str]]:
+def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock, str]]:
     """Blocks as the gate wants them; undecodable ones are left out.
 
     The schema hash covers site and name: where only these differ from the machine file it says nothing.
     """
-    descriptor = source.descriptor(keys, from_ns)
+    descriptor = data.source.descriptor(data.keys, data.from_ns)
     differences = () if descriptor is None else descriptor_mismatch(descriptor.payload, machine)
     only_named = all(text.startswith(("site is ", "machine is ")) for text in differences)
-    other_name = (machine.site, machine.name) != (keys.site, keys.machine)
-    for message in source.messages({keys.stream}, from_ns=from_ns, to_ns=to_ns):
+    other_name = (machine.site, machine.name) != (data.keys.site, data.keys.machine)
+    for message in data.messages(data.keys.stream):
         try:
             block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
         except WireError:
             continue
         yield block, "" if other_name and only_named else schema_hash
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredCorrelations:
+    """Correlation functions of some pairs, SI.
+
+    Attributes
+    ----------
+    lags_s : ndarray, shape (n_lags,)
+    values, errors : ndarray, shape (n_lags, n_pairs)
+        R_ij(τ) and its standard error.
+    band_hz : tuple of float or None
+        What they are limited to; None where they come from the samples.
+    outside_band : ndarray, shape (n_pairs,)
+        What that leaves out at lag zero, over the product of the rms; nan where they come from the samples.
+    """
+
+    lags_s: FloatArray
+    values: FloatArray
+    errors: FloatArray
+    band_hz: tuple[float, float] | None
+    outside_band: FloatArray
+
+
+def measured_correlations(
+    machine: MachineFile, window: WindowStatistics, pairs: list[tuple[int, int]]
+) -> MeasuredCorrelations:
+    """Correlation functions of a window, from its spectra if it holds them at lag zero alone.
+
+    Parameters
+    ----------
+    pairs : list of (int, int)
+        Reference and response, as columns of the window.
+    """
+    reference, response = (np.array(column, dtype=np.intp) for column in zip(*pairs, strict=True))
+    if window.lags_s.size > 1:
+        hops = window.hop_correlation[:, :, reference, response]
+        errors = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
+        values = window.correlation[:, reference, response]
+        return MeasuredCorrelations(window.lags_s, values, errors, None, np.full(len(pairs), np.nan))
+    segment_s = machine.window.segment_s
+    lags_s = plan_for(machine).lags_s
+    lags_s = lags_s[lags_s <= segment_s / 2]
+    spacing_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
+    band_hz = (window.frequencies_hz[0] - spacing_hz / 2, window.frequencies_hz[-1] + spacing_hz / 2)
+    turn = np.exp(-2j * np.pi * np.outer(lags_s, window.frequencies_hz))
+    values = (
+        2 * spacing_hz * (turn @ window.spectrum[:, reference, response]).real / _hann_fade(lags_s / segment_s)[:, None]
+    )
+    zero = window.correlation[0]
+    rms = np.sqrt(zero[reference, reference] * zero[response, response])
+    with np.errstate(invalid="ignore", divide="ignore"):  # a channel that does not move has no share
+        outside = (zero[reference, response] - values[0]) / rms
+    errors = _bartlett_errors(window, reference, response, turn, spacing_hz)
+    return MeasuredCorrelations(lags_s, values, errors, (float(band_hz[0]), float(band_hz[1])), outside)
+
+
+def _bartlett_errors(
+    window: WindowStatistics,
+    reference: np.typing.NDArray[np.intp],
+    response: np.typing.NDArray[np.intp],
+    turn: ComplexArray,
+    spacing_hz: float,
+) -> FloatArray:
+    """Standard errors of correlations of a Gaussian process that is T seconds long.
+
+    Var R̂_ij(τ) = (2/T) ∫ S_ii S_jj + Re{S_ij² e^{-4πjfτ}} df over positive frequencies (M. S. Bartlett, Supplement to
+    the J. Roy. Statist. Soc. 8 (1946), for one channel). A product of estimated spectra is larger than that of the true
+    ones by one over the number of averages.
+    """
+    spectrum = window.spectrum
+    own = spectrum[:, reference, reference].real * spectrum[:, response, response].real
+    both = (turn**2 @ spectrum[:, reference, response] ** 2).real
+    variance = 2 * spacing_hz / window.duration_s * (own.sum(axis=0) + both)
+    return np.asarray(np.sqrt(np.maximum(variance, 0) / (1 + 1 / window.n_segments)), dtype=np.float64)
+
+
+def _hann_fade(part: FloatArray) -> FloatArray:
+    """By how much a Hann-windowed segment weakens a correlation at a lag that is a part of its length."""
+    angle = 2 * np.pi * part
+    return np.asarray((1 - part) * (2 + np.cos(angle)) / 3 + np.sin(angle) / (2 * np.pi), dtype=np.float64)

@@ -1,7 +1,8 @@
-"""Samples of a recording as they are plotted: channels by name, stretches without a gap, the shaft's speed."""
+"""What was recorded of one machine in a stretch of time: channels by name, and samples without a gap."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from pydantic import ValidationError
@@ -10,48 +11,13 @@ from models.errors import MachineFileError, RecordingError, WireError
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Channel, ChannelDescriptor, Quantity
 from models.signals.keys import MachineKeys
+from models.signals.recording import RecordedMessage
 from models.signals.wire import decode_block
-from service.recordings.replay.source import RecordingSource
+from service.analysis.revolutions import Excerpt
+from service.recordings.replay.source import RecordingSource, parse_moment
 
 _TOLERANCE_S = 2e-4
 _RATE_TOLERANCE = 1e-4
-
-
-@dataclass(frozen=True, slots=True)
-class Excerpt:
-    """Consecutive samples of some channels, in the units of the channels.
-
-    Attributes
-    ----------
-    start_ns : int
-        Acquisition time of the first sample.
-    samples : ndarray, shape (n_samples, n_channels)
-    angle_rad : ndarray, shape (n_samples,) or None
-        Shaft angle; None if it is not measured.
-    """
-
-    start_ns: int
-    rate_hz: float
-    samples: FloatArray
-    angle_rad: FloatArray | None
-
-    @property
-    def length_s(self) -> float:
-        """Length."""
-        return float(self.samples.shape[0] / self.rate_hz)
-
-    @property
-    def end_ns(self) -> int:
-        """Acquisition time of the sample after the last one."""
-        return self.start_ns + round(self.length_s * 1e9)
-
-    @property
-    def speed_rad_s(self) -> float:
-        """Mean speed, negative where the shaft turns from z to y; nan without a shaft angle."""
-        if self.angle_rad is None or self.angle_rad.size < 2:
-            return float("nan")
-        whole = np.unwrap(self.angle_rad)
-        return float((whole[-1] - whole[0]) / (whole.size - 1) * self.rate_hz)
 
 
 def begins_again(end_ns: int, start_ns: int) -> bool:
@@ -59,34 +25,83 @@ def begins_again(end_ns: int, start_ns: int) -> bool:
     return start_ns < end_ns - _TOLERANCE_S * 1e9
 
 
-class RecordedStream:
-    """The sample blocks of one machine.
+class Recorded:
+    """Recorded data of one machine.
 
     Parameters
     ----------
     from_ns, to_ns : int
         Only data from `from_ns` up to, and without, `to_ns`.
-
-    Raises
-    ------
-    RecordingError
-        If no channel descriptor was recorded, or it cannot be read: the columns have no names and units then.
     """
 
     def __init__(self, source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> None:
-        self._source, self._keys = source, keys
+        self.source, self.keys = source, keys
         self.from_ns, self.to_ns = from_ns, to_ns
         self.name = f"{keys.site}/{keys.machine}"
         self.place = ", ".join(path.name for path in source.paths)
-        message = source.descriptor(keys, to_ns)
-        if message is None:
-            raise RecordingError(f"{self.place}: no channel descriptor on {keys.descriptor}, so no channel has a name")
+
+    @classmethod
+    def find(
+        cls,
+        files: Sequence[Path],
+        key: str | None,
+        between: tuple[str | None, str | None],
+        at: str | None = None,
+        *,
+        reports: bool = False,
+    ) -> "Recorded":
+        """Find a machine's data in recordings.
+
+        Parameters
+        ----------
+        key : str or None
+            ``SITE/MACHINE``, where the recordings hold several.
+        between : (str or None, str or None)
+            From and to, times of the data as `parse_moment` takes them.
+        at : str or None
+            Where the latest data end.
+        reports : bool
+            Whether a machine of which only reports were recorded will do.
+
+        Raises
+        ------
+        MachineFileError
+            If a file or time cannot be used, or there is no such machine.
+        """
         try:
-            self.descriptor = ChannelDescriptor.model_validate_json(message.payload)
+            source = RecordingSource(files)
+        except RecordingError as error:
+            raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
+        keys = source.machine(key, reports=reports)
+        from_ns, to_ns = source.between(*between, keys)
+        if at is not None:
+            at_ns = parse_moment(at, source.span(keys).start_ns, "--at")
+            if not from_ns < at_ns:
+                raise MachineFileError(f"--at {at}: nothing was recorded before that, from {between[0] or 0} on")
+            to_ns = min(to_ns, at_ns)
+        return cls(source, keys, from_ns, to_ns)
+
+    @cached_property
+    def descriptor(self) -> ChannelDescriptor:
+        """Names and units of the columns.
+
+        Raises
+        ------
+        RecordingError
+            If no channel descriptor was recorded, or it cannot be read.
+        """
+        key = self.keys.descriptor
+        message = self.source.descriptor(self.keys, self.to_ns)
+        if message is None:
+            raise RecordingError(f"{self.place}: no channel descriptor on {key}, so no channel has a name")
+        try:
+            return ChannelDescriptor.model_validate_json(message.payload)
         except ValidationError as error:
-            raise RecordingError(
-                f"{self.place}: the channel descriptor on {keys.descriptor} cannot be read: {error}"
-            ) from error
+            raise RecordingError(f"{self.place}: the channel descriptor on {key} cannot be read: {error}") from error
+
+    def messages(self, key: str) -> Iterator[RecordedMessage]:
+        """What was recorded under a key."""
+        return self.source.messages({key}, from_ns=self.from_ns, to_ns=self.to_ns)
 
     @property
     def displacements(self) -> tuple[Channel, ...]:
@@ -115,6 +130,19 @@ class RecordedStream:
                     f"--channel is {name!r}, which {what} of {self.name}; expected one of {', '.join(vibration)}"
                 )
         return tuple(there[name] for name in dict.fromkeys(names))
+
+    def chosen(self, names: Sequence[str]) -> tuple[Channel, ...]:
+        """Channels by name; without names all displacements.
+
+        Raises
+        ------
+        MachineFileError
+            If there is no such channel, or none that could be meant.
+        """
+        found = self.channels(names) or self.displacements
+        if not found:
+            raise MachineFileError(f"{self.name} measures no displacement: name channels with --channel")
+        return found
 
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
@@ -155,7 +183,7 @@ class RecordedStream:
 
     def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
         """The newest `length_s` of data before `to_ns`, in pieces if there are gaps."""
-        span = self._source.span(self._keys)
+        span = self.source.span(self.keys)
         end_ns = self.to_ns if self.to_ns <= span.end_ns else span.newest_ns
         found: list[Excerpt] = []
         for stretch in self.stretches(channels, from_ns=max(self.from_ns, end_ns - round(length_s * 1e9))):
@@ -176,7 +204,7 @@ class RecordedStream:
         tolerance_ns = round(max(_TOLERANCE_S, 0.5 / descriptor.rate_hz) * 1e9)
         last: SampleBlock | None = None
         since = self.from_ns if from_ns is None else from_ns
-        for message in self._source.messages({self._keys.stream}, from_ns=since, to_ns=self.to_ns):
+        for message in self.source.messages({self.keys.stream}, from_ns=since, to_ns=self.to_ns):
             try:
                 block, schema_hash = decode_block(message.payload, message.attachment, message.encoding)
             except WireError:

@@ -13,13 +13,13 @@ from models.errors import MachineFileError, RotorwatchError
 from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import FloatArray
-from models.signals.keys import PREFIX, MachineKeys
+from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import MEASURES, HealthState, Report
+from service.analysis.recorded import Recorded
 from service.monitor.reports import machine_hash
 from service.recordings.replay.machine import choose_machine
 from service.recordings.replay.offline import OfflineReplay
-from service.recordings.replay.source import RecordingSource
 
 SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
 """Events that say something of the machine; what operators did to alarms is left out of the picture."""
@@ -89,43 +89,13 @@ class Trend:
     origin: str
 
 
-def trend_machine(source: RecordingSource, wanted: str | None) -> MachineKeys:
-    """Keys of the machine to plot; reports will do where the samples were not kept.
-
-    Raises
-    ------
-    MachineFileError
-        If the recordings hold neither, or not the wanted machine, or several and none was named.
-    """
-    there: dict[str, MachineKeys] = {}
-    for key in sorted(source.keys):
-        parts = key.split("/")
-        if len(parts) == 4 and parts[0] == PREFIX and parts[3] in ("report", "stream"):
-            there[f"{parts[1]}/{parts[2]}"] = MachineKeys(parts[1], parts[2])
-    place, listed = ", ".join(path.name for path in source.paths), ", ".join(there) or "none"
-    if wanted is not None and wanted in there:
-        return there[wanted]
-    if wanted is None and len(there) == 1:
-        return next(iter(there.values()))
-    raise MachineFileError(
-        f"{place}: machines with reports or sample blocks: {listed}; "
-        + (f"{wanted} is not among them" if wanted is not None else "expected one, or --key SITE/MACHINE")
-    )
-
-
-def read_trend(
-    source: RecordingSource, keys: MachineKeys, machine: str | None, from_ns: int, to_ns: int, *, levels: bool = False
-) -> Trend:
+def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = False) -> Trend:
     """The recorded reports; or, without any or with another machine file, those of an offline replay.
 
     Parameters
     ----------
-    keys : MachineKeys
-        The recorded machine.
-    machine : str or None
+    machine : str, optional
         ``FILE`` or ``FILE@BUNDLE``, to be evaluated anew with it.
-    from_ns, to_ns : int
-        Only data from `from_ns` up to, and without, `to_ns`.
     levels : bool
         Vibration levels, also where parameters were read.
 
@@ -134,24 +104,21 @@ def read_trend(
     RotorwatchError
         If there are no reports and none can be computed, or nothing was read in any.
     """
-    if machine is None and keys.report in source.keys:
-        reports = list(_recorded_reports(source, keys, from_ns, to_ns))
-        if reports:
-            events = recorded_alarms(source, keys, from_ns, to_ns)
-            return trend_of(reports, events, _limits(keys, reports[-1]), "as recorded", levels=levels)
-    if keys.stream not in source.keys:
-        place = ", ".join(path.name for path in source.paths)
+    if machine is None and (reports := list(recorded_reports(data))):
+        limits = _limits(data.keys, reports[-1])
+        return trend_of(reports, recorded_alarms(data), limits, "as recorded", levels=levels)
+    if data.keys.stream not in data.source.keys:
         raise RotorwatchError(
-            f"{place}: no reports of {keys.site}/{keys.machine} in this stretch of time, and no sample blocks to "
-            "compute them from"
+            f"{data.place}: no reports of {data.name} in this stretch of time, and no sample blocks to compute them "
+            "from"
         )
-    return _computed(source, keys, choose_machine(keys, machine), from_ns, to_ns, levels)
+    return _computed(data, choose_machine(data.keys, machine), levels)
 
 
-def recorded_alarms(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> tuple[AlarmEventData, ...]:
+def recorded_alarms(data: Recorded) -> tuple[AlarmEventData, ...]:
     """Alarm events that were recorded, each once, by their time; unreadable ones are left out."""
     found: dict[str, AlarmEventData] = {}
-    for message in source.messages({keys.alarm_event}, from_ns=from_ns, to_ns=to_ns):
+    for message in data.messages(data.keys.alarm_event):
         try:
             event = AlarmCloudEvent.model_validate_json(message.payload)
         except ValidationError:
@@ -232,8 +199,9 @@ def _level_trends(reports: Sequence[Report]) -> Iterator[LevelTrend]:
         )
 
 
-def _recorded_reports(source: RecordingSource, keys: MachineKeys, from_ns: int, to_ns: int) -> Iterator[Report]:
-    for message in source.messages({keys.report}, from_ns=from_ns, to_ns=to_ns):
+def recorded_reports(data: Recorded) -> Iterator[Report]:
+    """Reports that were recorded, in the order of recording; unreadable ones are left out."""
+    for message in data.messages(data.keys.report):
         try:
             report = Report.model_validate_json(message.payload)
         except ValidationError:
@@ -255,9 +223,7 @@ def _limits(keys: MachineKeys, report: Report) -> AlarmSettings | None:
     return machine.alarms if machine_hash(machine) == report.machine_hash else None
 
 
-def _computed(
-    source: RecordingSource, keys: MachineKeys, installed: Installed, from_ns: int, to_ns: int, levels: bool
-) -> Trend:
+def _computed(data: Recorded, installed: Installed, levels: bool) -> Trend:
     """Reports of an offline replay, the same to the last bit as those of ``rotorwatch replay``."""
     machine = installed.machine
     reports: list[Report] = []
@@ -270,7 +236,7 @@ def _computed(
         else:
             alarms.append(AlarmCloudEvent.model_validate(message["message"]).data)
 
-    run = OfflineReplay(source, keys, installed, take, from_ns=from_ns, to_ns=to_ns)
+    run = OfflineReplay(data.source, data.keys, installed, take, from_ns=data.from_ns, to_ns=data.to_ns)
     summary = run.run()
     if summary.blocks == 0:
         raise RotorwatchError(f"no block was accepted: {summary.last_refusal or 'there was none'}")

@@ -22,7 +22,7 @@ from models.machine import Machine
 from models.physics.rotor import PARAMETERS, RotorParameters, changed, system_A
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Parameter
-from service.analysis.snapshots.excitation import Excitation, excitation_of
+from service.analysis.excitation import Excitation, excitation_of
 
 NOTHING_READ = "no parameter was read in this window"
 NO_PARAMETERS = "the machine's parameters are not known, so there is no theory to predict from"

@@ -1,0 +1,218 @@
+"""Orbits: the shaft's path across its axis, raw and at running speed alone, against the keyphasor."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from models.errors import MachineFileError, RotorwatchError
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, Quantity
+from service.analysis.recorded import Recorded
+from service.analysis.revolutions import Excerpt, newest_revolutions, pulses
+from service.analysis.vectors import vectors_of
+
+_UM = 1e6
+_LONGEST_S = 3600.0
+_AT_1X = 1
+"""Place of running speed among the orders of `Vectors`."""
+_AT_ONCE = 2
+"""Revolutions that vectors are taken of: in as many, orders do not disturb each other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipse:
+    """Orbit y = Re{y e^{jθ}}, z = Re{z e^{jθ}} over the shaft angle θ.
+
+    In the plane y + jz it is a part that goes round with the shaft and one that goes against it:
+    y(θ) + j z(θ) = F e^{jθ} + B e^{-jθ}.
+
+    Attributes
+    ----------
+    y, z : complex
+        Vectors, both in one unit; so are all lengths below.
+
+    Examples
+    --------
+    >>> circle = Ellipse(2.0, -2.0j)
+    >>> circle.semi_major, circle.semi_minor, circle.precession
+    (2.0, 2.0, 'forward')
+    """
+
+    y: complex
+    z: complex
+
+    @property
+    def _forward(self) -> complex:
+        return (self.y + 1j * self.z) / 2
+
+    @property
+    def _backward(self) -> complex:
+        return (self.y.conjugate() + 1j * self.z.conjugate()) / 2
+
+    @property
+    def semi_major(self) -> float:
+        """Half of the long axis."""
+        return abs(self._forward) + abs(self._backward)
+
+    @property
+    def semi_minor(self) -> float:
+        """Half of the short axis."""
+        return abs(abs(self._forward) - abs(self._backward))
+
+    @property
+    def precession(self) -> str:
+        """``forward``: round the orbit as θ grows from y to z; ``backward``: against it."""
+        return "forward" if abs(self._forward) >= abs(self._backward) else "backward"
+
+    @property
+    def tilt_deg(self) -> float:
+        """Angle from y, towards z, to the long axis, above -90 and up to 90°."""
+        turned = np.degrees(np.angle(self._forward) + np.angle(self._backward)) / 2
+        return float(90 - (90 - turned) % 180)
+
+
+def phase_lag_deg(vector: complex, direction: int) -> float:
+    """How far the shaft turns from the reference (angle 0) to the positive peak of Re{vector e^{jθ}}, 0 to 360°.
+
+    Parameters
+    ----------
+    direction : int
+        1 if the shaft angle grows, -1 if it falls.
+    """
+    return float(np.degrees(-np.angle(vector) * direction) % 360)
+
+
+@dataclass(frozen=True, slots=True)
+class Orbit:
+    """The orbit at one place.
+
+    Attributes
+    ----------
+    y, z : Channel
+    ellipse : Ellipse
+        The part at running speed, µm.
+    y_um, z_um : ndarray, shape (n,)
+        As measured, about the mean.
+    marks_um : ndarray, shape (n_pulses, 2)
+        Where the shaft was at each pulse of the keyphasor.
+    """
+
+    y: Channel
+    z: Channel
+    ellipse: Ellipse
+    y_um: FloatArray
+    z_um: FloatArray
+    marks_um: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Orbits:
+    """Orbits of the same revolutions at all places where both directions are measured.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        First and last pulse of the keyphasor.
+    speed_rad_s : float
+        Mean speed; negative where the shaft turns from z to y.
+    """
+
+    start_ns: int
+    end_ns: int
+    revolutions: int
+    speed_rad_s: float
+    orbits: tuple[Orbit, ...]
+
+    @property
+    def direction(self) -> int:
+        """1 if the shaft turns from y to z, -1 if from z to y."""
+        return 1 if self.speed_rad_s >= 0 else -1
+
+
+def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
+    """Displacements in y and z, at each place where both are measured."""
+    found = {(one.location, one.direction): one for one in channels if one.quantity is Quantity.DISPLACEMENT}
+    return [
+        (found[place, "y"], found[place, "z"])
+        for place in ("bearing", "disc")
+        if (place, "y") in found and (place, "z") in found
+    ]
+
+
+def no_pair(channels: Iterable[Channel]) -> str:
+    """What is said where `orbit_pairs` finds none."""
+    there = ", ".join(channel.name for channel in channels if channel.quantity is Quantity.DISPLACEMENT) or "none"
+    return f"an orbit needs the displacements in y and z at one place; measured displacements: {there}"
+
+
+def read_orbits(data: Recorded, revolutions: int) -> Orbits:
+    """Orbits of the latest revolutions that were recorded.
+
+    Raises
+    ------
+    MachineFileError
+        If the shaft angle is not measured, or at no place both y and z.
+    RotorwatchError
+        If there are not so many revolutions without a gap before the end.
+    """
+    if not data.has_angle:
+        raise MachineFileError(
+            f"{data.place}: {data.name} has no channel with the shaft angle (keyphasor), and an orbit is seen "
+            "against it"
+        )
+    pairs = orbit_pairs(data.descriptor.channels)
+    if not pairs:
+        raise MachineFileError(f"{data.place}, {data.name}: {no_pair(data.descriptor.channels)}")
+    channels = [channel for pair in pairs for channel in pair]
+    length_s = 2.0
+    while True:
+        found = data.latest(channels, length_s)
+        enough = bool(found) and pulses(found[-1].angle_rad)[1].size > revolutions
+        interrupted = len(found) > 1
+        if enough or interrupted or length_s > min(_LONGEST_S, (data.to_ns - data.from_ns) / 1e9):
+            break
+        length_s *= 2
+    if not found:
+        raise RotorwatchError(f"{data.place}: no sample blocks of {data.name} in this stretch of time")
+    return orbits_of(found[-1], pairs, revolutions)
+
+
+def orbits_of(excerpt: Excerpt, pairs: list[tuple[Channel, Channel]], revolutions: int) -> Orbits:
+    """Orbits of the latest revolutions of an excerpt.
+
+    Parameters
+    ----------
+    excerpt : Excerpt
+        Its columns are the channels of `pairs`, one pair after the other.
+
+    Raises
+    ------
+    RotorwatchError
+        If the shaft does not turn so often in it.
+    """
+    found = newest_revolutions(excerpt, revolutions)
+    path = found.excerpt
+    if path is None or found.count < revolutions:
+        raise RotorwatchError(
+            f"--revolutions is {revolutions}, but only {found.count} whole revolutions without a gap were recorded "
+            f"before this time ({excerpt.length_s:.3g} s of samples)"
+        )
+    channels = [channel for pair in pairs for channel in pair]
+    vectors = vectors_of(path, channels, _AT_ONCE)
+    q_um = _UM * np.average(vectors.orders[:, _AT_1X], axis=0, weights=vectors.revolutions)
+    about = path.samples * (_UM * np.array([channel.to_si for channel in channels]))
+    about -= about.mean(axis=0)
+    orbits = []
+    for at, (y, z) in zip(range(0, len(channels), 2), pairs, strict=True):
+        marks = np.stack([np.interp(found.pulses, np.arange(len(about)), about[:, at + one]) for one in (0, 1)], axis=1)
+        ellipse = Ellipse(complex(q_um[at]), complex(q_um[at + 1]))
+        orbits.append(Orbit(y, z, ellipse, about[:, at], about[:, at + 1], marks))
+    first, last = found.pulses[[0, -1]] / path.rate_hz
+    return Orbits(
+        start_ns=path.start_ns + round(first * 1e9),
+        end_ns=path.start_ns + round(last * 1e9),
+        revolutions=revolutions,
+        speed_rad_s=float(np.copysign(2 * np.pi * revolutions / (last - first), path.speed_rad_s)),
+        orbits=tuple(orbits),
+    )

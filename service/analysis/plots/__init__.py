@@ -1,1 +1,0 @@
-"""Plots of recordings: what is to be seen (trend, correlation, orbit, spectrum, waterfall), and its drawing."""

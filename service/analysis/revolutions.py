@@ -1,0 +1,186 @@
+"""Samples without a gap, and the revolutions of the shaft in them."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.signals.block import FloatArray, SampleBlock
+
+
+@dataclass(frozen=True, slots=True)
+class Excerpt:
+    """Consecutive samples of some channels, in the units of the channels.
+
+    Attributes
+    ----------
+    start_ns : int
+        Acquisition time of the first sample.
+    samples : ndarray, shape (n_samples, n_channels)
+    angle_rad : ndarray, shape (n_samples,) or None
+        Shaft angle; None if it is not measured.
+    """
+
+    start_ns: int
+    rate_hz: float
+    samples: FloatArray
+    angle_rad: FloatArray | None
+
+    @property
+    def length_s(self) -> float:
+        """Length."""
+        return float(self.samples.shape[0] / self.rate_hz)
+
+    @property
+    def end_ns(self) -> int:
+        """Acquisition time of the sample after the last one."""
+        return self.start_ns + round(self.length_s * 1e9)
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Mean speed, negative where the shaft turns from z to y; nan without a shaft angle."""
+        if self.angle_rad is None or self.angle_rad.size < 2:
+            return float("nan")
+        whole = np.unwrap(self.angle_rad)
+        return float((whole[-1] - whole[0]) / (whole.size - 1) * self.rate_hz)
+
+    def part(self, first: int, end: int) -> "Excerpt":
+        """Samples from `first` up to, and without, `end`."""
+        return Excerpt(
+            self.start_ns + round(first / self.rate_hz * 1e9),
+            self.rate_hz,
+            self.samples[first:end],
+            None if self.angle_rad is None else self.angle_rad[first:end],
+        )
+
+    @classmethod
+    def of_blocks(cls, blocks: Sequence[SampleBlock], rate_hz: float, angle_column: int | None) -> "Excerpt":
+        """All columns of blocks that follow each other."""
+        samples = np.concatenate([block.samples for block in blocks]).astype(np.float64)
+        start_ns = blocks[-1].end_ns - round(samples.shape[0] / rate_hz * 1e9)
+        return cls(start_ns, rate_hz, samples, None if angle_column is None else samples[:, angle_column])
+
+
+@dataclass(frozen=True, slots=True)
+class Revolutions:
+    """Samples of whole revolutions.
+
+    Attributes
+    ----------
+    excerpt : Excerpt or None
+        None where there is no whole revolution.
+    count : int
+    pulses : ndarray, shape (count + 1,)
+        Where the shaft angle is 0, in samples from the first one; empty where it is not measured.
+    reason : str
+        Why there are none, or fewer than asked for.
+    """
+
+    excerpt: Excerpt | None
+    count: int
+    pulses: FloatArray
+    reason: str
+
+
+def pulses(angle_rad: npt.NDArray[np.floating] | None) -> tuple[int, FloatArray]:
+    """Direction of rotation, and where the shaft angle passes 0, in samples from the first one, interpolated.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (n_samples,), or None
+        Shaft angle of consecutive samples.
+
+    Returns
+    -------
+    int
+        1 if the angle grows, -1 if it falls.
+    ndarray, shape (n_pulses,)
+        Empty without an angle.
+    """
+    if angle_rad is None or angle_rad.size < 2:
+        return 1, np.empty(0)
+    whole = np.unwrap(angle_rad)
+    direction = 1 if whole[-1] >= whole[0] else -1
+    onwards = np.maximum.accumulate(direction * whole)  # noise on the angle must not count a pulse twice
+    turns = np.arange(np.ceil(onwards[0] / (2 * np.pi)), np.floor(onwards[-1] / (2 * np.pi)) + 1)
+    return direction, np.asarray(np.interp(turns * 2 * np.pi, onwards, np.arange(onwards.size)))
+
+
+def newest_revolutions(
+    excerpt: Excerpt, wanted: int, speed_rad_s: float | None = None, most_samples: int | None = None
+) -> Revolutions:
+    """Cut the newest revolutions out of samples.
+
+    Parameters
+    ----------
+    wanted : int
+        Fewer are taken where there are not so many, or too many samples in them.
+    speed_rad_s : float, optional
+        Mean speed: how long they are where there is no shaft angle.
+    """
+    size, rate_hz = excerpt.samples.shape[0], excerpt.rate_hz
+    reason = ""
+    if excerpt.angle_rad is not None:
+        at = pulses(excerpt.angle_rad)[1]
+        whole = max(0, at.size - 1)
+    elif speed_rad_s is not None and np.isfinite(speed_rad_s) and speed_rad_s != 0:
+        each = 2 * np.pi / abs(speed_rad_s) * rate_hz
+        whole = int((size - 1) // each)
+        at = size - 1 - each * np.arange(whole, -1, -1)
+        reason = "the shaft angle is not measured: revolutions are as long as at the mean speed, and begin anywhere"
+    else:
+        return no_revolutions("neither the shaft angle nor the speed is known, so no revolution can be told")
+    if not whole:
+        return no_revolutions(f"the newest {excerpt.length_s:.3g} s of samples without a gap hold no whole revolution")
+    fit = whole if most_samples is None else int(np.count_nonzero(at[-1] - at[:-1] < most_samples))
+    count = min(wanted, whole, fit)
+    if count < wanted:
+        limit = f"{excerpt.length_s:.3g} s of samples without a gap" if whole <= fit else f"{most_samples} samples"
+        reason = "; ".join(filter(None, (f"{count} of {wanted} revolutions: there are {limit} at most", reason)))
+    if not count:
+        return no_revolutions(f"one revolution is longer than {most_samples} samples")
+    marks = at[-1 - count :]
+    first, last = int(np.floor(marks[0])), int(np.ceil(marks[-1]))
+    return Revolutions(
+        excerpt.part(first, last + 1),
+        count,
+        np.asarray(marks - first if excerpt.angle_rad is not None else np.empty(0), dtype=np.float64),
+        reason,
+    )
+
+
+def no_revolutions(reason: str) -> Revolutions:
+    """None, and why."""
+    return Revolutions(None, 0, np.empty(0), reason)
+
+
+class NewestBlocks:
+    """The newest accepted blocks of a stream, without a gap between them.
+
+    One thread adds, any thread may read: what is read is replaced as a whole.
+
+    Parameters
+    ----------
+    length_s : float
+        Data that are kept, s.
+    """
+
+    def __init__(self, length_s: float = 10.0) -> None:
+        self._length_s = length_s
+        self._held: deque[SampleBlock] = deque()
+        self._n_samples = 0
+        self.blocks: tuple[SampleBlock, ...] = ()
+
+    def add(self, block: SampleBlock, *, continuous: bool) -> None:
+        """Add the next accepted block; one that does not continue the others takes their place."""
+        if not continuous:
+            self._held.clear()
+            self._n_samples = 0
+        self._held.append(block)
+        self._n_samples += block.samples.shape[0]
+        kept = round(self._length_s * block.rate_hz)
+        while len(self._held) > 1 and self._n_samples - self._held[0].samples.shape[0] >= kept:
+            self._n_samples -= self._held.popleft().samples.shape[0]
+        self.blocks = tuple(self._held)
