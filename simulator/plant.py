@@ -163,16 +163,21 @@ def rotor_in(machine: Machine, condition: Condition) -> RotorParameters:
 
 
 def theoretical_rms(machine: Machine, condition: Condition) -> FloatArray:
-    """Root mean square of each of the twelve states in a condition, stochastic and synchronous together; SI.
+    """Root mean square of each of the twelve states in a condition, see `theoretical_moments`."""
+    return np.asarray(np.sqrt(np.diag(theoretical_moments(machine, condition))), dtype=np.float64)
+
+
+def theoretical_moments(machine: Machine, condition: Condition) -> FloatArray:
+    """Mean products of the twelve states in a condition, stochastic and synchronous together; SI, shape (12, 12).
 
     Of the linear rotor: a crack or a rub is left out.
     """
     rotor = rotor_in(machine, condition)
     speed_rad_s = condition.speed_rpm * 2 * np.pi / 60
     A, B = expanded_A(rotor, speed_rad_s, condition.sources), expanded_B(condition.sources)
-    variance = np.diag(stationary_covariance(A, B))[:12] * condition.excitation_level**2
+    covariance = stationary_covariance(A, B)[:12, :12] * condition.excitation_level**2
     q1, q2 = synchronous_response(rotor, speed_rad_s)
-    return np.asarray(np.sqrt(variance + (q1**2 + q2**2) / 2), dtype=np.float64)
+    return np.asarray(covariance + (np.outer(q1, q1) + np.outer(q2, q2)) / 2, dtype=np.float64)
 
 
 def _draw(covariance: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -12,7 +12,7 @@ import scipy.signal
 from models.machine import Machine
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
-from models.signals.channels import Channel, Quantity, state_name
+from models.signals.channels import Channel, Quantity, parts_seen
 from simulator.plant import PlantSamples
 from simulator.scenario import Sensors, SensorSettings
 from simulator.timeline import SWAPPED_WITH, SensorFaults
@@ -106,15 +106,15 @@ class SensorBank:
 
     Parameters
     ----------
-    rms : ndarray, shape (12,)
-        Theoretical rms of the states at the start, SI.
+    moments : ndarray, shape (12, 12)
+        Theoretical mean products of the states at the start, SI.
     """
 
     def __init__(
         self,
         machine: Machine,
         sensors: Sensors,
-        rms: FloatArray,
+        moments: FloatArray,
         faults: Mapping[str, Sequence[tuple[int, SensorFaults]]],
         rngs: Sequence[np.random.Generator],
     ) -> None:
@@ -124,7 +124,7 @@ class SensorBank:
             Sensor(
                 channel,
                 sensors.settings(channel),
-                _reference(channel, rms),
+                _reference(channel, moments),
                 machine.rate_hz,
                 rng,
                 max((_value(kinds, "delay", 0.0) for _, kinds in faults.get(channel.name, ())), default=0.0),
@@ -138,7 +138,7 @@ class SensorBank:
         samples = np.empty((n_samples, len(self._sensors)), dtype=self._dtype)
         for column, sensor in enumerate(self._sensors):
             angle = sensor.channel.quantity is Quantity.SHAFT_ANGLE
-            value = plant.theta_rad if angle else plant.states[:, STATE_INDEX[state_name(sensor.channel)]]
+            value = plant.theta_rad if angle else _seen(sensor.channel, plant.states)
             noise = sensor.noise(n_samples)
             for begin, end, faults in self._stretches(sensor.channel.name, first, n_samples):
                 samples[begin:end, column] = sensor.measure(value[begin:end], noise[begin:end], faults)
@@ -180,8 +180,18 @@ def _value(faults: SensorFaults, kind: str, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-def _reference(channel: Channel, rms: FloatArray) -> float:
-    return _TURN if channel.quantity is Quantity.SHAFT_ANGLE else float(rms[STATE_INDEX[state_name(channel)]])
+def _seen(channel: Channel, states: FloatArray) -> FloatArray:
+    """What a channel sees of states, shape (..., 12); those at an angle see two of them."""
+    parts = [(STATE_INDEX[state], part) for state, part in parts_seen(channel).items()]
+    if len(parts) == 1:
+        return states[..., parts[0][0]]
+    return np.asarray(sum(part * states[..., column] for column, part in parts), dtype=np.float64)
+
+
+def _reference(channel: Channel, moments: FloatArray) -> float:
+    if channel.quantity is Quantity.SHAFT_ANGLE:
+        return _TURN
+    return float(np.sqrt(_seen(channel, _seen(channel, moments))))
 
 
 def _wrapped(angle: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:

@@ -17,7 +17,7 @@ from pydantic import BaseModel, Field
 from models.machine import Machine, MachineFile
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.wire import encode_arrow, encode_block
-from simulator.plant import NONLINEAR, NonlinearPlant, Plant, theoretical_rms
+from simulator.plant import NONLINEAR, NonlinearPlant, Plant, theoretical_moments
 from simulator.scenario import NamedSource, Scenario
 from simulator.sensors import SensorBank
 from simulator.timeline import Condition, compile_timeline
@@ -167,7 +167,7 @@ class _Simulation:
         self._sensors = SensorBank(
             machine,
             scenario.sensors,
-            theoretical_rms(machine, initial),
+            theoretical_moments(machine, initial),
             timeline.sensor_faults,
             [np.random.default_rng(seed) for seed in sensor_seeds],
         )

@@ -102,14 +102,14 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
                     f"{window.duration_s:.3g} s"
                 )
                 break
-        powers = np.array([np.diag(w.correlation[0]) for w in windows[recording.name]])
+        powers = np.array([np.diag(w.as_mounted.correlation[0]) for w in windows[recording.name]])
         powers = np.maximum(powers, 0.0)  # of a channel that does not move rounding may leave less than nothing
         half = len(powers) // 2
         if half:
             ratio = np.sqrt(powers[half:].mean(axis=0) / np.maximum(powers[:half].mean(axis=0), np.finfo(float).tiny))
             worst = int(np.argmax(np.abs(np.log(np.maximum(ratio, np.finfo(float).tiny)))))
             if not 1 / _STEADY_LEVEL <= ratio[worst] <= _STEADY_LEVEL:
-                state = windows[recording.name][0].states[worst]
+                state = windows[recording.name][0].as_mounted.states[worst]
                 moved.append(
                     f"{recording.name}: the random vibration of {state} in the second half is {ratio[worst]:.2g} times "
                     "that of the first"

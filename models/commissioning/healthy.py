@@ -165,7 +165,7 @@ def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
     segments = np.concatenate([hop.segments for hop in hops]) if hops else np.empty((0, 0, 0))
     if segments.shape[0] < _FEWEST_SEGMENTS:
         return ()
-    states = recording.plan.states
+    states = recording.plan.mounted
     power = np.abs(segments[:, :, : len(states)]) ** 2
     mean = power.mean(axis=0)
     steadiness = (power**2).mean(axis=0) / np.maximum(mean**2, np.finfo(float).tiny)
@@ -173,7 +173,7 @@ def foreign_lines(recording: HealthyRecording) -> tuple[Line, ...]:
     step_hz = float(frequencies_hz[1] - frequencies_hz[0])
     size = max(5, 2 * round(_NEIGHBOURHOOD_HZ / step_hz / 2) + 1)
     floor = scipy.ndimage.median_filter(mean, size=(size, 1), mode="nearest")
-    window = window_statistics(recording.plan, hops, lagged=False)
+    window = window_statistics(recording.plan, hops, lagged=False).as_mounted
     total = np.maximum(np.diag(window.correlation[0]), np.finfo(float).tiny)
     speed_hz = window.speed_rad_s / (2 * np.pi)
     rotation = _near_rotation(frequencies_hz, speed_hz, step_hz)

@@ -28,7 +28,7 @@ from models.levels.measures import HopLevels, LevelPlan, hop_levels, level_plan
 from models.machine import MachineFile
 from models.physics.rotor import STATE_INDEX
 from models.signals.block import FloatArray
-from models.signals.channels import ACCELERATIONS
+from models.signals.channels import ACCELERATIONS, parts_seen, state_name
 
 ComplexArray = npt.NDArray[np.complex128]
 
@@ -60,6 +60,9 @@ class Plan:
     speed_rad_s: float | None = None
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
     levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
+    # What each column of `states` is as mounted: `states` themselves, but for sensors at an angle (``bearing@45``).
+    mounted: tuple[str, ...] = ()
+    turn: FloatArray | None = None  # (n, n), states = turn @ mounted; None where no sensor is at an angle
 
     @property
     def others(self) -> slice:
@@ -84,10 +87,10 @@ class Plan:
     @property
     def pairs(self) -> tuple[MotionPair, ...]:
         """Columns that measure the same motion."""
-        return motion_pairs(self.states)
+        return motion_pairs(self.mounted)
 
     def to_si(self, samples: npt.NDArray[np.float32] | FloatArray) -> FloatArray:
-        """Measured states and other channels in SI units and, last, the shaft angle if there is one.
+        """Sensors as mounted, and other channels, in SI units and, last, the shaft angle if there is one.
 
         Returns
         -------
@@ -115,6 +118,8 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
     others = tuple(name for name in order if name not in states and name != "theta")
     columns = np.array([order[name] for name in (*states, *others)], dtype=np.intp)
     channels = [machine.sensors[column] for column in columns]
+    rows = [[parts_seen(one).get(name, 0.0) for name in states] for one in channels[: len(states)]]
+    seen = np.array(rows).reshape(len(states), len(states))
     speed_rpm = None if machine.operation is None else machine.operation.speed_rpm
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
@@ -137,12 +142,14 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
         levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm)) if levels else None,
+        mounted=tuple(state_name(one) for one in channels[: len(states)]),
+        turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),
     )
 
 
 @dataclass(frozen=True, slots=True)
 class HopMoments:
-    """Sums over one hop, of the measured states x followed by the regressors n."""
+    """Sums over one hop, of what the sensors give as mounted, x, followed by the regressors n."""
 
     # Time of the first sample and of the one after the last.
     start_ns: int

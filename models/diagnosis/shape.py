@@ -88,6 +88,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         """
         if not 0 < rate < 1:
             raise ValueError(f"rate is {rate}, expected between 0 and 1")
+        window = window.as_mounted
         own_rate = -math.expm1(math.log1p(-rate) / len(self.channels))
         limit = -float(ndtri(own_rate))
         common = self._unlike(window)
@@ -154,6 +155,7 @@ def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:
     EstimationError
         If they are too few, differ in their lags, or no channel moves in all of them.
     """
+    windows = [window.as_mounted for window in windows]
     count = len(windows)
     if count < FEWEST_WINDOWS:
         raise EstimationError(

@@ -7,7 +7,7 @@ all of them were stored.
 
 from collections import deque
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -71,6 +71,14 @@ class WindowStatistics:
     waveforms: tuple[Waveform, ...]
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`)
     pair_powers: tuple[ComplexArray, ...]
+    # The same window of the sensors as they are mounted, where some of them are at an angle. `waveforms` and
+    # `pair_powers` are those of mounted sensors in either.
+    mounted: "WindowStatistics | None" = None
+
+    @property
+    def as_mounted(self) -> "WindowStatistics":
+        """Statistics of the sensors themselves: for whatever judges a sensor."""
+        return self if self.mounted is None else self.mounted
 
     @property
     def phase_reference(self) -> bool:
@@ -126,7 +134,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         elif plan.states:
             vectors = np.stack([_synchronous(coefficients) for coefficients in own.hops])
             relative_synchronous, zero_angle = relative_vectors(vectors)
-            zero_angle_state = plan.states[zero_angle]
+            zero_angle_state = plan.mounted[zero_angle]
     else:
         beta = regression(total[0], n)
         remove = np.hstack([np.eye(n), -beta])
@@ -140,8 +148,8 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     rest = np.ascontiguousarray(cleaned.transpose(1, 2, 0))
     spectrum = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
-    return WindowStatistics(
-        states=plan.states,
+    found = WindowStatistics(
+        states=plan.mounted,
         start_ns=hops[0].start_ns,
         end_ns=hops[-1].end_ns,
         n_samples=len(hops) * plan.hop,
@@ -163,6 +171,31 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         duration_s=len(hops) * plan.hop / plan.rate_hz,
         waveforms=tuple(hop.waveform for hop in hops),
         pair_powers=tuple(hop.pair_powers for hop in hops),
+    )
+    return found if plan.turn is None else _turned(found, plan.states, plan.turn)
+
+
+def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray) -> WindowStatistics:
+    """Statistics of the states, from those of sensors at an angle: every moment is turned from both sides."""
+
+    def vectors(mounted: ComplexArray | None) -> ComplexArray | None:
+        return None if mounted is None else np.asarray(mounted @ turn.T, dtype=np.complex128)
+
+    relative, zero_angle_state = vectors(window.relative_synchronous), ""
+    if relative is not None:
+        relative, zero_angle = relative_vectors(relative)
+        zero_angle_state = states[zero_angle]
+    return replace(
+        window,
+        states=states,
+        correlation=turn @ window.correlation @ turn.T,
+        hop_correlation=turn @ window.hop_correlation @ turn.T,
+        spectrum=turn @ window.spectrum @ turn.T,
+        synchronous=vectors(window.synchronous),
+        hop_synchronous=vectors(window.hop_synchronous),
+        relative_synchronous=relative,
+        zero_angle_state=zero_angle_state,
+        mounted=window,
     )
 
 

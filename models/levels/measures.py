@@ -36,7 +36,7 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
 from models.signals.block import FloatArray
-from models.signals.channels import Channel, Quantity
+from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 
 ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
 """Multiples of running speed, by the name of their measure."""
@@ -66,13 +66,16 @@ class LevelPlan:
     band_hz : tuple of float
         Of velocities, from and to.
     pairs : tuple of (int, int)
-        Columns of displacements of one place at right angles.
+        Columns of two displacements of one place.
+    skew : tuple of float
+        Cosine of the angle between their axes: 0 at right angles, as nearly all are.
     """
 
     rate_hz: float
     quantities: tuple[Quantity, ...]
     band_hz: tuple[float, float]
     pairs: tuple[tuple[int, int], ...]
+    skew: tuple[float, ...]
 
     @property
     def high_hz(self) -> tuple[float, float] | None:
@@ -95,12 +98,27 @@ def level_plan(channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float
     band_hz : tuple of float
         Of velocities; cut off where the sampling rate ends it.
     """
-    at = {(one.location, one.direction): n for n, one in enumerate(channels) if one.quantity is Quantity.DISPLACEMENT}
+    shaft = [(n, one) for n, one in enumerate(channels) if one.quantity is Quantity.DISPLACEMENT]
+    at = {(one.location, one.direction): n for n, one in shaft if one.angle_deg is None}
     pairs = [(at[place, "y"], at[place, "z"]) for place, way in at if way == "y" and (place, "z") in at]
+    for place in dict.fromkeys(one.location for _, one in shaft):
+        angled = [n for n, one in shaft if one.location == place and one.angle_deg is not None]
+        if len(angled) == 2 and apart_deg(*(channels[n] for n in angled)) >= LEAST_APART_DEG:
+            pairs.append((angled[0], angled[1]))
     low, high = band_hz
     return LevelPlan(
-        rate_hz, tuple(one.quantity for one in channels), (low, min(high, _NYQUIST_PART * rate_hz / 2)), tuple(pairs)
+        rate_hz,
+        tuple(one.quantity for one in channels),
+        (low, min(high, _NYQUIST_PART * rate_hz / 2)),
+        tuple(pairs),
+        tuple(_skew(channels[first], channels[second]) for first, second in pairs),
     )
+
+
+def _skew(first: Channel, second: Channel) -> float:
+    (a, b), (c, d) = first.axis, second.axis
+    cosine = a * c + b * d
+    return cosine if abs(cosine) > 1e-12 else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +197,10 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
     if casing.size:
         sums[5:, casing] = _band_squares(plan, x[casing], plan.columns(Quantity.ACCELERATION)[:, None] == casing)
-    radius = [float(np.sqrt((square[y] + square[z]).max())) for y, z in plan.pairs]
+    radius = [
+        float(np.sqrt((square[y] + square[z] - (2 * skew * x[y] * x[z] if skew else 0.0)).max() / (1 - skew**2)))
+        for (y, z), skew in zip(plan.pairs, plan.skew, strict=True)
+    ]
     return HopLevels(n_samples, sums, _orders(x, angle_rad), np.array(radius))
 
 

@@ -2,9 +2,11 @@
 
 import hashlib
 import json
+import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
+from itertools import groupby
 from typing import Literal, Self
 
 from pydantic import BaseModel, Field, field_validator, model_validator
@@ -56,6 +58,9 @@ _STATE_NAMES: dict[tuple[Quantity, str, str], str] = {
 }
 
 _LOCATIONS, _DIRECTIONS = ("bearing", "disc", "shaft"), ("y", "z", "rotation")
+_RATES: dict[Quantity, str] = {Quantity.DISPLACEMENT: "", Quantity.VELOCITY: "_dot", Quantity.ACCELERATION: "_ddot"}
+LEAST_APART_DEG = 30.0
+"""Angle between two sensors from which on they are turned to y and z: nearer, their noise would be all there is."""
 _PLACE = r"^[A-Za-z0-9][A-Za-z0-9 _.:/+-]*$"
 
 ACCELERATIONS: tuple[str, ...] = tuple(
@@ -82,6 +87,14 @@ class Channel(BaseModel, extra="forbid", frozen=True):
     unit: str = Field(
         description="; ".join(f"{', '.join(units)} for {quantity}" for quantity, units in UNIT_TO_SI.items())
     )
+    # Left out where it is not given: descriptors of other sensors, and their hashes, are as they were before it.
+    angle_deg: float | None = Field(
+        default=None,
+        ge=-360,
+        le=360,
+        exclude_if=lambda angle_deg: angle_deg is None,
+        description="angle of the sensor's axis from +y towards +z",
+    )
 
     @field_validator("unit", mode="before")
     @classmethod
@@ -97,17 +110,48 @@ class Channel(BaseModel, extra="forbid", frozen=True):
                 f"channel {self.name}: unit {self.unit!r} is not one of {', '.join(units)} for {self.quantity}"
                 f"{did_you_mean(self.unit, units)}"
             )
-        if (self.quantity, self.location, self.direction) in _STATE_NAMES:
+        if self.angle_deg is not None:
+            self._check_angle(self.angle_deg)
+        elif (self.quantity, self.location, self.direction) in _STATE_NAMES:
+            return self
+        if self.angle_deg is not None and self.location in ("bearing", "disc"):
             return self
         known = self.location in _LOCATIONS
         hint = did_you_mean(self.direction, _DIRECTIONS) if known else did_you_mean(self.location, _LOCATIONS)
         if self.quantity is Quantity.SHAFT_ANGLE or known or hint:
             raise ValueError(
                 f"channel {self.name}: no {self.quantity} at location {self.location!r}, direction {self.direction!r}; "
-                "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z; "
+                "the shaft angle is at 'shaft'/'rotation', tilt at 'disc', the rest at 'bearing' or 'disc' in y or z, "
+                "or two at an angle, each with angle_deg; "
                 f"at places with other names (DE, NDE, casing, …) only levels are watched{hint}"
             )
         return self
+
+    def _check_angle(self, angle_deg: float) -> None:
+        if self.quantity not in _RATES:
+            raise ValueError(
+                f"channel {self.name}: angle_deg is {angle_deg:g}, but a {self.quantity} sensor cannot be turned; "
+                f"expected it with {', '.join(_RATES)} only"
+            )
+        if _cardinal(angle_deg) != {"y": 0, "z": 1}.get(self.direction, _cardinal(angle_deg)):
+            raise ValueError(
+                f"channel {self.name}: direction {self.direction!r} and angle_deg {angle_deg:g} contradict each other; "
+                "give the direction the name it has on the machine, such as X or Y"
+            )
+
+    @property
+    def axis(self) -> tuple[float, float]:
+        """Parts of a motion in y and of one in z that it sees."""
+        if self.angle_deg is None:
+            return (1.0, 0.0) if self.direction == "y" else (0.0, 1.0)
+        exact = {0: (1.0, 0.0), 1: (0.0, 1.0), 2: (-1.0, 0.0), 3: (0.0, -1.0)}.get(_cardinal(self.angle_deg))
+        angle = math.radians(self.angle_deg)
+        return exact or (math.cos(angle), math.sin(angle))
+
+    @property
+    def way(self) -> str:
+        """Direction, with the angle where there is one."""
+        return self.direction if self.angle_deg is None else f"{self.direction} at {self.angle_deg:g}°"
 
     @property
     def to_si(self) -> float:
@@ -115,24 +159,110 @@ class Channel(BaseModel, extra="forbid", frozen=True):
         return UNIT_TO_SI[self.quantity][self.unit]
 
 
-_STATE = re.compile(r"(?<![\w-])(?:[yz][12](?:_d?dot)?|(?:psi|phi)(?:_dot)?|theta)(?![\w-])")
+def _cardinal(angle_deg: float) -> int:
+    """Quarter turns; -1 where it is none."""
+    turns = angle_deg / 90
+    return int(turns) % 4 if turns == round(turns) else -1
+
+
+_STATE = re.compile(
+    r"(?P<gain>(?<![\w-])gain of |)(?<![\w-])"
+    r"(?P<state>[yz][12](?:_d?dot)?|(?:psi|phi)(?:_dot)?|(?:bearing|disc)@[\d.]+(?:_d?dot)?|theta)(?![\w-])"
+)
 
 
 def state_name(channel: Channel) -> str:
     """Name of the state variable that a channel measures (``y1`` … ``phi_dot``, ``theta``).
 
-    One that is at none of the model's places is known by its own name, after an ``@``.
+    One at an angle is known by its place and angle, one that is at none of the model's places by its own name, after
+    an ``@``.
 
     Examples
     --------
-    >>> state_name(Channel(name="XE-1", quantity="velocity", location="bearing", direction="y", unit="mm/s"))
-    'y1_dot'
+    >>> fields = {"name": "XE-1", "quantity": "velocity", "location": "bearing", "unit": "mm/s"}
+    >>> state_name(Channel(direction="y", **fields)), state_name(Channel(direction="X", angle_deg=45, **fields))
+    ('y1_dot', 'bearing@45_dot')
     """
-    return _STATE_NAMES.get((channel.quantity, channel.location, channel.direction), f"@{channel.name}")
+    direction = channel.direction
+    if channel.angle_deg is not None and channel.location in ("bearing", "disc"):
+        direction = {0: "y", 1: "z"}.get(_cardinal(channel.angle_deg), "")
+        if not direction:
+            return f"{channel.location}@{channel.angle_deg % 360:g}{_RATES[channel.quantity]}"
+    return _STATE_NAMES.get((channel.quantity, channel.location, direction), f"@{channel.name}")
+
+
+def parts_seen(channel: Channel) -> dict[str, float]:
+    """States whose sum, each times a factor, is what a channel measures.
+
+    Examples
+    --------
+    >>> parts_seen(Channel(name="P", quantity="displacement", location="disc", direction="X", unit="um", angle_deg=180))
+    {'y2': -1.0, 'z2': 0.0}
+    """
+    if channel.angle_deg is None or channel.location not in ("bearing", "disc"):
+        return {state_name(channel): 1.0}
+    names = (_STATE_NAMES[channel.quantity, channel.location, direction] for direction in ("y", "z"))
+    return dict(zip(names, channel.axis, strict=True))
+
+
+def turned_pairs(channels: Sequence[Channel]) -> list[tuple[int, int]]:
+    """Columns of sensors at an angle that are turned to y and z: the one nearer to y, and the one nearer to z.
+
+    Raises
+    ------
+    ValueError
+        Naming sensors that cannot be turned.
+    """
+    found = []
+    columns = [column for column, one in enumerate(channels) if one.location in ("bearing", "disc")]
+    columns.sort(key=lambda column: (channels[column].location, channels[column].quantity))
+    for (location, quantity), group in groupby(columns, lambda at: (channels[at].location, channels[at].quantity)):
+        members = list(group)
+        angled = [column for column in members if channels[column].angle_deg is not None]
+        if not angled:
+            continue
+        names = [channels[column].name for column in angled]
+        said = f"{', '.join(names[:-1])} and {names[-1]}" if names[1:] else names[0]
+        others = [channels[column].name for column in members if column not in angled]
+        if len(angled) == 1:
+            beside = f"; {' and '.join(others)} has no angle_deg: 0 is that of y, 90 of z" if others else ""
+            raise ValueError(
+                f"channel {said}: one alone cannot be turned to y and z, expected a second {quantity} sensor with "
+                f"angle_deg at {location}{beside}; at a place with another name (DE, NDE, …) its levels are watched"
+            )
+        if len(angled) > 2:
+            count = "three" if len(angled) == 3 else f"{len(angled)}"
+            raise ValueError(
+                f"channels {said}: {count} {quantity} sensors with angle_deg at {location}, expected two; levels of "
+                "more are watched at a place with another name"
+            )
+        if others:
+            raise ValueError(
+                f"channel {' and '.join(others)}: measures y or z of {location} beside {said}, which are turned to "
+                "them; expected two sensors of a quantity at a place"
+            )
+        apart = apart_deg(channels[angled[0]], channels[angled[1]])
+        if apart < LEAST_APART_DEG - 1e-9:
+            raise ValueError(
+                f"channels {said}: their axes are {round(apart, 1):g}° apart, expected at least {LEAST_APART_DEG:g}°: "
+                "two sensors that look the same way do not tell y from z"
+            )
+        first, second = angled
+        nearer = abs(channels[second].axis[0]) > abs(channels[first].axis[0]) + 1e-9
+        found.append((second, first) if nearer else (first, second))
+    return found
+
+
+def apart_deg(first: Channel, second: Channel) -> float:
+    """Angle between the axes of two sensors, 0 to 90°, whichever way they point."""
+    (a, b), (c, d) = first.axis, second.axis
+    return math.degrees(math.atan2(abs(a * d - b * c), abs(a * c + b * d)))
 
 
 def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
     """A sentence about states (``y1``, ``z2_dot``) in the names that the machine's channels have.
+
+    A state that two sensors at an angle tell together is called by both.
 
     Examples
     --------
@@ -140,8 +270,19 @@ def with_channel_names(text: str, channels: Iterable[Channel]) -> str:
     >>> with_channel_names("gain of y1 or y1_dot", (probe,))
     'gain of XE-1 or y1_dot'
     """
-    names = {state_name(channel): channel.name for channel in channels}
-    return _STATE.sub(lambda found: names.get(found[0], found[0]), text)
+    known = tuple(channels)
+
+    def names(found: re.Match[str]) -> str:
+        state = found["state"]
+        seen_by = [one for one in known if state in {state_name(one), *parts_seen(one)}]
+        if found["gain"] and "@" not in state:
+            # Two sensors of a motion contradict each other: where one of them is turned, so may its partner be wrong.
+            own = state.partition("_")[0]
+            place = [one for one in known if own in {part.partition("_")[0] for part in parts_seen(one)}]
+            seen_by = place if any(len(parts_seen(one)) > 1 for one in place) else seen_by
+        return found["gain"] + (" or ".join(one.name for one in seen_by) or state)
+
+    return _STATE.sub(names, text)
 
 
 class ChannelDescriptor(BaseModel, frozen=True):
@@ -170,8 +311,7 @@ class ChannelDescriptor(BaseModel, frozen=True):
     @model_validator(mode="after")
     def _unique(self) -> Self:
         names = [channel.name for channel in self.channels]
-        states = [state_name(channel) for channel in self.channels]
-        for what, values in (("name", names), ("measured quantity", states)):
+        for what, values in (("name", names), ("measured quantity", self.states)):
             twice = sorted({value for value in values if values.count(value) > 1})
             if twice:
                 raise ValueError(f"channel {what} occurs twice: {', '.join(twice)}")
@@ -185,8 +325,12 @@ class ChannelDescriptor(BaseModel, frozen=True):
 
     @property
     def states(self) -> tuple[str, ...]:
-        """State variable measured by each column, in column order."""
-        return tuple(state_name(channel) for channel in self.channels)
+        """State variable measured by each column, in column order; of two at an angle, that which each is turned to."""
+        names = [state_name(channel) for channel in self.channels]
+        for pair in turned_pairs(self.channels):
+            for column, name in zip(pair, parts_seen(self.channels[pair[0]]), strict=True):
+                names[column] = name
+        return tuple(names)
 
 
 _INCH = 25.4e-3

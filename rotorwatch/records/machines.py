@@ -37,8 +37,13 @@ class Channel(BaseModel):
         description="bearing, disc or shaft; or a place with another name, of which only levels are watched",
         examples=["bearing"],
     )
-    direction: str = Field(description="y, z or rotation; or another one", examples=["y"])
+    direction: str = Field(description="y, z or rotation; or another one, such as X with an angle", examples=["y"])
     unit: str = Field(description="unit of the samples", examples=["um"])
+    angle_deg: float | None = Field(
+        default=None,
+        description="angle of the sensor's axis from +y towards +z; null where its direction says it all",
+        examples=[None],
+    )
 
 
 class MachineDescription(BaseModel):

@@ -246,7 +246,10 @@ class RunningSpeedVector(BaseModel):
 
     model_config = JSON
 
-    channel: str = Field(description="name of the channel", examples=["y1"])
+    channel: str = Field(
+        description="name of the channel; of two at an angle, which are turned to y and z: 'y of VE-1X and VE-1Y'",
+        examples=["y1"],
+    )
     amplitude: float = Field(
         description="peak amplitude, in `unit` of the orbit; twice it is peak to peak", examples=[8.1]
     )

@@ -2,16 +2,19 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
-from models.signals.channels import Channel, Quantity
+from models.signals.channels import Channel, Quantity, turned_pairs
 from service.analysis.recorded import Recorded
 from service.analysis.revolutions import Excerpt, newest_revolutions, pulses
 from service.analysis.vectors import vectors_of
 
+_Value = TypeVar("_Value", np.float64, np.complex128)
 _UM = 1e6
 _LONGEST_S = 3600.0
 _AT_1X = 1
@@ -89,7 +92,10 @@ class Orbit:
 
     Attributes
     ----------
-    y, z : Channel
+    location : str
+        ``bearing`` or ``disc``.
+    names : tuple of str
+        Of y and z: the channels', or what two at an angle are turned to.
     ellipse : Ellipse
         The part at running speed, µm.
     y_um, z_um : ndarray, shape (n,)
@@ -98,8 +104,8 @@ class Orbit:
         Where the shaft was at each pulse of the keyphasor.
     """
 
-    y: Channel
-    z: Channel
+    location: str
+    names: tuple[str, str]
     ellipse: Ellipse
     y_um: FloatArray
     z_um: FloatArray
@@ -131,13 +137,45 @@ class Orbits:
 
 
 def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
-    """Displacements in y and z, at each place where both are measured."""
-    found = {(one.location, one.direction): one for one in channels if one.quantity is Quantity.DISPLACEMENT}
+    """Displacements in y and z, or at an angle and to be turned to them, at each place where both are measured."""
+    known = [one for one in channels if one.quantity is Quantity.DISPLACEMENT]
+    angled = {known[first].location: (known[first], known[second]) for first, second in turned_pairs(known)}
+    found = {(one.location, one.direction): one for one in known if one.angle_deg is None}
     return [
-        (found[place, "y"], found[place, "z"])
+        angled.get(place) or (found[place, "y"], found[place, "z"])
         for place in ("bearing", "disc")
-        if (place, "y") in found and (place, "z") in found
+        if place in angled or ((place, "y") in found and (place, "z") in found)
     ]
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """Two sensors of one place as sensors in y and z.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of y and z: the channels' own, or what they are turned to.
+    turn : ndarray, shape (2, 2)
+        From what they show to y and z; None where they are in y and z.
+    """
+
+    names: tuple[str, str]
+    turn: FloatArray | None
+
+    def turned(self, values: npt.NDArray[_Value]) -> npt.NDArray[_Value]:
+        """Values of both, shape (2, ...), in y and z."""
+        return values if self.turn is None else np.asarray(self.turn @ values, dtype=values.dtype)
+
+
+def planes_of(pair: tuple[Channel, Channel]) -> Planes:
+    """How two sensors of one place tell y and z."""
+    first, second = pair
+    seen = np.array([first.axis, second.axis])
+    if np.array_equal(seen, np.eye(2)):
+        return Planes((first.name, second.name), None)
+    both = f"{first.name} and {second.name}"
+    return Planes((f"y of {both}", f"z of {both}"), np.linalg.inv(seen))
 
 
 def no_pair(channels: Iterable[Channel]) -> str:
@@ -204,10 +242,12 @@ def orbits_of(excerpt: Excerpt, pairs: list[tuple[Channel, Channel]], revolution
     about = path.samples * (_UM * np.array([channel.to_si for channel in channels]))
     about -= about.mean(axis=0)
     orbits = []
-    for at, (y, z) in zip(range(0, len(channels), 2), pairs, strict=True):
-        marks = np.stack([np.interp(found.pulses, np.arange(len(about)), about[:, at + one]) for one in (0, 1)], axis=1)
-        ellipse = Ellipse(complex(q_um[at]), complex(q_um[at + 1]))
-        orbits.append(Orbit(y, z, ellipse, about[:, at], about[:, at + 1], marks))
+    for at, pair in zip(range(0, len(channels), 2), pairs, strict=True):
+        planes = planes_of(pair)
+        y, z = planes.turned(about[:, at : at + 2].T)
+        marks = np.stack([np.interp(found.pulses, np.arange(len(about)), one) for one in (y, z)], axis=1)
+        ellipse = Ellipse(*map(complex, planes.turned(q_um[at : at + 2])))
+        orbits.append(Orbit(pair[0].location, planes.names, ellipse, y, z, marks))
     first, last = found.pulses[[0, -1]] / path.rate_hz
     return Orbits(
         start_ns=path.start_ns + round(first * 1e9),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
 
 _SENSOR = ("name", "quantity", "unit", "location", "direction")
+_ANGLE = "angle_deg"
 _EXAMPLE = "DE-H acceleration g DE horizontal"
 
 
@@ -37,8 +38,9 @@ def init(
         list[str] | None,
         typer.Option(
             "--sensor",
-            metavar="'NAME QUANTITY UNIT LOCATION DIRECTION'",
-            help=f"A channel of the stream, in their order, such as '{_EXAMPLE}'. Repeatable.",
+            metavar="'NAME QUANTITY UNIT LOCATION DIRECTION [ANGLE]'",
+            help=f"A channel of the stream, in their order, such as '{_EXAMPLE}'; of a probe at an angle also that, in "
+            "degrees from +y towards +z: 'VE-1X displacement um bearing X 45'. Repeatable.",
         ),
     ] = None,
     speed_rpm: Annotated[
@@ -103,7 +105,7 @@ def _asked(option: str, text: str) -> str:
 
 def _asked_sensors() -> list[str]:
     """Channels, one a line, until an empty one."""
-    typer.echo(f"Channels of the stream, in their order: {' '.join(_SENSOR)}; such as: {_EXAMPLE}")
+    typer.echo(f"Channels of the stream, in their order: {' '.join(_SENSOR)} [{_ANGLE}]; such as: {_EXAMPLE}")
     found: list[str] = []
     while line := _asked("--sensor", f"Channel {len(found) + 1} (empty: no more)" if not found else "Next").strip():
         found.append(line)
@@ -114,12 +116,12 @@ def _asked_sensors() -> list[str]:
 
 def _sensor(line: str) -> dict[str, str]:
     words = line.split()
-    if len(words) != len(_SENSOR):
+    if len(words) not in {len(_SENSOR), len(_SENSOR) + 1}:
         raise MachineFileError(
             f"--sensor {line!r} has {len(words)} words, expected {len(_SENSOR)}: {' '.join(_SENSOR)}, "
-            f"such as '{_EXAMPLE}'"
+            f"such as '{_EXAMPLE}', or an {_ANGLE} besides"
         )
-    return dict(zip(_SENSOR, words, strict=True))
+    return dict(zip((*_SENSOR, _ANGLE), words, strict=False))
 
 
 def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
@@ -132,7 +134,7 @@ def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
     lines += ["", "# Limits of vibration levels: docs/levels.md", "[levels]", f"zones = {zones}"]
     for channel in machine.sensors:
         told = channel.model_dump(mode="json")
-        lines += ["", "[[sensors]]", *(f"{key} = {json.dumps(told[key])}" for key in _SENSOR)]
+        lines += ["", "[[sensors]]", *(f"{key} = {json.dumps(told[key])}" for key in (*_SENSOR, _ANGLE) if key in told)]
     return "\n".join(lines) + "\n"
 
 

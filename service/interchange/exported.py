@@ -121,7 +121,7 @@ def stream_table(selection: Selection) -> Table:
         factors.append(channel.to_si if selection.si else 1.0)
         kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
         unit = _SI_UNITS[channel.quantity] if selection.si else channel.unit
-        place = f"{channel.quantity}, {channel.location}, {channel.direction}"
+        place = f"{channel.quantity}, {channel.location}, {channel.way}"
         fields.append(_field(channel.name, kind, unit, place))
     metadata = {
         "site": descriptor.site,

@@ -53,7 +53,7 @@ def _differences(announced: bytes, machine: MachineFile) -> list[str]:
     if len(found.channels) != len(expected.channels):
         differences.append(f"channels has {len(found.channels)} entries, expected {len(expected.channels)}")
     for number, (theirs, ours) in enumerate(zip(found.channels, expected.channels, strict=False)):
-        for field in ("name", "quantity", "location", "direction", "unit"):
+        for field in ("name", "quantity", "location", "direction", "unit", "angle_deg"):
             is_, should = str(getattr(theirs, field)), str(getattr(ours, field))
             if is_ != should:
                 differences.append(f"channels.{number}.{field} ({ours.name}) is {_shown(is_)}, expected {should!r}")

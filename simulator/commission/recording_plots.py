@@ -50,7 +50,7 @@ def portrait(number: int, recording: HealthyRecording) -> Portrait | None:
     hops = recording.hops
     if not hops:
         return None
-    statistics = window_statistics(recording.plan, hops, lagged=False)
+    statistics = window_statistics(recording.plan, hops, lagged=False).as_mounted
     n = len(recording.plan.states)
     power = np.mean([np.mean(np.abs(hop.segments[:, :, :n]) ** 2, axis=0) for hop in hops], axis=0)
     starts = np.array([hop.start_ns for hop in hops], dtype=np.int64)
@@ -74,8 +74,16 @@ def ordered(states: Iterable[str]) -> list[str]:
 
 def _rank(state: str) -> tuple[int, int, int]:
     place, _, ending = state.partition("_")
-    at = _PLACES.index(place)
+    at = _number(place)
     return at // 2, _ORDERS.index(f"_{ending}" if ending else ""), at % 2
+
+
+def _number(place: str) -> int:
+    """Place and plane; sensors at an angle stand where those in the nearer plane would."""
+    location, at, angle_deg = place.partition("@")
+    if not at:
+        return _PLACES.index(place)
+    return (0 if location == "bearing" else 2) + (float(angle_deg) % 180 >= 90)
 
 
 def draw_spectra(portraits: Sequence[Portrait]) -> Figure:
@@ -220,7 +228,7 @@ def _pieces(
 def _channel_line(state: str) -> dict[str, str | float]:
     place, _, ending = state.partition("_")
     return {
-        "color": COLOURS[_PLACES.index(place)],
+        "color": COLOURS[_number(place)],
         "linestyle": _STYLES[_ORDERS.index(f"_{ending}" if ending else "")],
         "marker": ".",
         "markersize": 3,

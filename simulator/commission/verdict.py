@@ -101,8 +101,13 @@ def channel_text(state: str) -> str:
     --------
     >>> channel_text("y1"), channel_text("z2_dot"), channel_text("psi_dot")
     ('bearing, horizontal, displacement', 'disc, vertical, velocity', 'disc tilt, horizontal, rate')
+    >>> channel_text("bearing@45_dot")
+    'bearing, at 45°, velocity'
     """
     place, _, ending = state.partition("_")
+    location, at, angle_deg = place.partition("@")
+    if at:
+        return f"{location}, at {angle_deg}°, {_ENDINGS[ending]}"
     if place == "theta" or place not in _PLACES:
         return _PLACES.get(place, state)
     return f"{_PLACES[place]}, {(_TILT_ENDINGS if place in ('psi', 'phi') else _ENDINGS)[ending]}"

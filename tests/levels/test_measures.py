@@ -10,7 +10,7 @@ from models.signals.channels import Channel, Quantity
 RATE_HZ = 25_600.0
 
 
-def channel(quantity: str, direction: str = "y", location: str = "bearing") -> Channel:
+def channel(quantity: str, direction: str = "y", location: str = "bearing", angle_deg: float | None = None) -> Channel:
     unit = {"displacement": "um", "velocity": "mm/s", "acceleration": "m/s2"}[quantity]
     return Channel.model_validate(
         {
@@ -19,6 +19,7 @@ def channel(quantity: str, direction: str = "y", location: str = "bearing") -> C
             "location": location,
             "direction": direction,
             "unit": unit,
+            "angle_deg": angle_deg,
         }
     )
 
@@ -163,3 +164,20 @@ def test_a_hop_goes_into_arrays_and_comes_back() -> None:
     np.testing.assert_array_equal(again.sums, hop.sums)
     np.testing.assert_array_equal(again.orders, hop.orders)
     assert again.n_samples == hop.n_samples
+
+
+@pytest.mark.parametrize(("angles", "location"), [((45, 135), "bearing"), ((20, 80), "DE"), ((-30, 190), "disc")])
+def test_the_largest_radius_is_the_same_for_probes_at_any_angle(angles: tuple[float, float], location: str) -> None:
+    t = times(5.0, 2000.0)
+    theta = 2 * np.pi * 20 * t
+    y, z = 30e-6 * np.cos(theta), 25e-6 * np.sin(theta + 0.4)
+    seen = [y * np.cos(at) + z * np.sin(at) for at in np.radians(angles)]
+    probes = [channel("displacement", way, location, at) for way, at in zip("XY", angles, strict=True)]
+    found = taken(level_plan(probes, 2000.0, (10.0, 1000.0)), np.column_stack(seen)).values
+    assert found["s_max"][0] == pytest.approx(np.hypot(y, z).max(), rel=1e-9)
+    assert found["overall"] == pytest.approx([np.ptp(one) for one in seen])  # each as it is mounted
+
+
+def test_probes_that_look_the_same_way_have_no_radius() -> None:
+    probes = [channel("displacement", way, "DE", at) for way, at in (("X", 0), ("Y", 15))]
+    assert level_plan(probes, 2000.0, (10.0, 1000.0)).pairs == ()

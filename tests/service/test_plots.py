@@ -92,7 +92,7 @@ def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_m
     H = H_matrix(rotor, W)
     dynamic = -(W**2) * M_matrix(rotor) + 1j * W * P_matrix(rotor, W) + Q_matrix(rotor)
     q_um = 1e6 * np.linalg.solve(dynamic, H[:, 0] - 1j * H[:, 1])  # rows y1, y2, psi, z1, z2, phi
-    assert [orbit.y.location for orbit in found.orbits] == ["bearing", "disc"]
+    assert [orbit.location for orbit in found.orbits] == ["bearing", "disc"]
     assert found.speed_rad_s == pytest.approx(W, rel=1e-4)
     assert found.end_ns - found.start_ns == pytest.approx(8 * 2e9 * np.pi / W, rel=1e-4)
     for orbit, y, z in zip(found.orbits, q_um[[0, 1]], q_um[[3, 4]], strict=True):

@@ -32,7 +32,7 @@ def sensor_findings(
         Empty if nothing was found. A channel that is stuck or clipped is not looked at further; where the shaft angle
         jumps, slips or jitters, channels are not compared: what turns with the shaft stays among what they share.
     """
-    naming = Naming(channels)
+    window, naming = window.as_mounted, Naming(channels)
     findings = [*stuck(window, naming), *clipped(window, naming)]
     findings += [found for found in offset(window, naming, reference) if not set(found.states) & implicated(findings)]
     bad = implicated(findings)

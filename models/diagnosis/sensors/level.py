@@ -6,6 +6,8 @@ angle and changes its length, its fluctuation changes by the same factor, and al
 or with the other channels moving too, cannot be told from the machine and is left to the misfit of its model.
 """
 
+import re
+
 import numpy as np
 
 from models.diagnosis.sensors.reference import Naming, SensorReference
@@ -165,7 +167,9 @@ def _largest_step(means: FloatArray) -> FloatArray:
 
 def _shaft(states: tuple[str, ...], column: int, changes: FloatArray) -> bool:
     """Whether a displacement's level changed together with another one's."""
-    places = [i for i, name in enumerate(states) if "_" not in name and name in ("y1", "y2", "z1", "z2")]
+    places = [
+        i for i, name in enumerate(states) if name in ("y1", "y2", "z1", "z2") or re.fullmatch(r"\w+@[\d.]+", name)
+    ]
     if column not in places:
         return False
     return any(abs(changes[i]) > _TOGETHER * abs(changes[column]) for i in places if i != column)

@@ -298,6 +298,7 @@ def learn_sensor_reference(windows: Sequence[WindowStatistics]) -> SensorReferen
     """
     if not windows:
         raise EstimationError("no healthy window to learn the sensors from")
+    windows = [window.as_mounted for window in windows]
     states = windows[0].states
     for window in windows:
         if window.states != states:

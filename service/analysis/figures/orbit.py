@@ -53,9 +53,9 @@ def _paint(found: Orbits, name: str, look: Look) -> Figure:
 def _raw(axes: Axes, orbit: Orbit) -> None:
     axes.plot(orbit.y_um, orbit.z_um, color=COLOURS[0], linewidth=0.8)
     axes.plot(*orbit.marks_um.T, "o", color=COLOURS[1], markersize=5, markeredgecolor="white", markeredgewidth=0.6)
-    axes.set_title(f"{orbit.y.location}, as measured", fontweight="bold")
-    across = (orbit.y, np.ptp(orbit.y_um)), (orbit.z, np.ptp(orbit.z_um))
-    _frame(axes, orbit, [f"{channel.name} {length:.4g} µm pp" for channel, length in across])
+    axes.set_title(f"{orbit.location}, as measured", fontweight="bold")
+    across = zip(orbit.names, (np.ptp(orbit.y_um), np.ptp(orbit.z_um)), strict=True)
+    _frame(axes, orbit, [f"{name} {length:.4g} µm pp" for name, length in across])
     _limit(axes, orbit.y_um, orbit.z_um)
 
 
@@ -75,10 +75,10 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
             (y[index], z[index]),
             arrowprops={"arrowstyle": "-|>", "color": COLOURS[0], "mutation_scale": 16},
         )
-    axes.set_title(f"{orbit.y.location}, 1× alone: {ellipse.precession} precession", fontweight="bold")
+    axes.set_title(f"{orbit.location}, 1× alone: {ellipse.precession} precession", fontweight="bold")
     lines = [
-        f"{channel.name} {2 * abs(q):.4g} µm pp ∠ {phase_lag_deg(q, found.direction):.0f}° lag"
-        for channel, q in ((orbit.y, ellipse.y), (orbit.z, ellipse.z))
+        f"{name} {2 * abs(q):.4g} µm pp ∠ {phase_lag_deg(q, found.direction):.0f}° lag"
+        for name, q in zip(orbit.names, (ellipse.y, ellipse.z), strict=True)
     ]
     _frame(axes, orbit, [*lines, f"ellipse {2 * ellipse.semi_major:.4g} × {2 * ellipse.semi_minor:.4g} µm"])
     _limit(axes, y, z)
@@ -87,8 +87,11 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
 def _frame(axes: Axes, orbit: Orbit, lines: list[str]) -> None:
     axes.axhline(0, color=GREY, linewidth=0.6)
     axes.axvline(0, color=GREY, linewidth=0.6)
-    axes.set_xlabel(f"y: {orbit.y.name}, µm")
-    axes.set_ylabel(f"z: {orbit.z.name}, µm")
+    x_label, y_label = (
+        f"{name}, µm" if " of " in name else f"{way}: {name}, µm" for way, name in zip("yz", orbit.names, strict=True)
+    )
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
     axes.text(
         0.02, 0.985, "\n".join(lines), transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, zorder=5
     )

@@ -268,7 +268,7 @@ def _order_lines(axes: Axes, found: Waterfall, rows: np.ndarray, *, over_speed: 
 
 
 def _place(channel: Channel) -> str:
-    return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.direction}"
+    return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
 
 
 def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:

@@ -7,7 +7,8 @@ import numpy.typing as npt
 
 from models.errors import RotorwatchError
 from models.machine import MachineFile
-from models.signals.channels import Channel, Quantity, state_name
+from models.signals.block import FloatArray
+from models.signals.channels import Channel, Quantity, parts_seen, state_name
 from rotorwatch.records.snapshots import Units
 
 MOST_PAIRS = 8
@@ -98,6 +99,18 @@ def chosen_pairs(
 def vibration_channels(machine: MachineFile) -> tuple[Channel, ...]:
     """All but the shaft angle, in the order of the stream."""
     return tuple(channel for channel in machine.sensors if state_name(channel) != "theta")
+
+
+def seen_by(channels: Sequence[Channel]) -> tuple[tuple[str, ...], FloatArray | None]:
+    """States of the model that channels see, and the parts of them that each sees, shape (n_channels, n_states).
+
+    Without parts each channel sees one state alone, in their order.
+    """
+    parts = [parts_seen(channel) for channel in channels]
+    states = tuple(dict.fromkeys(state for each in parts for state in each))
+    if all(len(each) == 1 for each in parts):
+        return states, None
+    return states, np.array([[each.get(state, 0.0) for state in states] for each in parts])
 
 
 def si_unit(channel: Channel) -> str:

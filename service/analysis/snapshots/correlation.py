@@ -9,7 +9,7 @@ from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
 from service.analysis.correlation import MeasuredCorrelations, measured_correlations
 from service.analysis.prediction import Prediction
-from service.analysis.snapshots.channels import chosen_pairs, figures, product_unit
+from service.analysis.snapshots.channels import chosen_pairs, figures, product_unit, seen_by
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 
 
@@ -38,7 +38,7 @@ def correlation_snapshot(
     SnapshotError
         If there is no such channel.
     """
-    machine, window = subject.machine, data.window
+    machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     pairs = chosen_pairs(machine, first, second)
     stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
     if window is None:
@@ -51,11 +51,12 @@ def correlation_snapshot(
             theory=stated,
             reason=no_window(machine, data),
         )
-    states = tuple(dict.fromkeys(state_name(channel) for pair in pairs for channel in pair))
+    used = tuple(dict.fromkeys(channel for pair in pairs for channel in pair))
+    states = tuple(map(state_name, used))
     columns = [window.states.index(state) for state in states]
     places = [(states.index(state_name(one)), states.index(state_name(other))) for one, other in pairs]
     measured = measured_correlations(machine, window, [(columns[i], columns[j]) for i, j in places])
-    nominal, estimated = prediction.correlations(states, places, measured.lags_s, measured.band_hz)
+    nominal, estimated = _predicted(prediction, used, places, measured)
     return CorrelationSnapshot(
         **heading(subject, data),
         lags_s=tuple(measured.lags_s.tolist()),
@@ -65,6 +66,23 @@ def correlation_snapshot(
         theory=stated,
         reason="",
     )
+
+
+def _predicted(
+    prediction: Prediction, channels: Sequence[Channel], places: list[tuple[int, int]], measured: MeasuredCorrelations
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """Theory for pairs of channels; those at an angle are sums over the states that they see."""
+    states, parts = seen_by(channels)
+    if parts is None:
+        return prediction.correlations(states, places, measured.lags_s, measured.band_hz)
+    n = len(states)
+    every = [(i, j) for i in range(n) for j in range(n)]
+    first, second = zip(*places, strict=True)
+    nominal, estimated = (
+        None if one is None else (parts @ one.reshape(-1, n, n) @ parts.T)[:, list(first), list(second)]
+        for one in prediction.correlations(states, every, measured.lags_s, measured.band_hz)
+    )
+    return nominal, estimated
 
 
 def _pair(

@@ -11,9 +11,9 @@ from models.machine import Machine, MachineFile
 from models.physics.response import synchronous_response
 from models.physics.rotor import STATE_INDEX, RotorParameters, changed
 from models.signals.block import SampleBlock
-from models.signals.channels import Channel, state_name
+from models.signals.channels import Channel
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
-from service.analysis.orbit import Ellipse, no_pair, orbit_pairs, phase_lag_deg
+from service.analysis.orbit import Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions, no_revolutions
 from service.analysis.snapshots.channels import SnapshotError, figures
@@ -111,11 +111,11 @@ def _place(
     path: PathSamples | None,
     units: Units,
 ) -> PlaceOrbit:
-    factor = 1.0 if units == "SI" else 1 / pair[0].to_si
+    factor, planes = 1.0 if units == "SI" else 1 / pair[0].to_si, planes_of(pair)
     y = z = ellipse = nominal = estimated = None
     if window is not None and vectors is not None:
-        at = [window.states.index(state_name(channel)) for channel in pair]
-        y, z = (_vector(channel, column, vectors, factor) for channel, column in zip(pair, at, strict=True))
+        at = [window.states.index(state) for state in _planes_at(pair[0].location)]
+        y, z = (_vector(name, column, vectors, factor) for name, column in zip(planes.names, at, strict=True))
         ellipse = _ellipse(factor * vectors.mean[at], vectors.direction, absolute=vectors.absolute)
         nominal, estimated = (
             None if known is None or rotor is None else _predicted(known, rotor, pair, window, vectors, factor)
@@ -133,7 +133,7 @@ def _place(
     )
 
 
-def _vector(channel: Channel, column: int, vectors: _Vectors, factor: float) -> RunningSpeedVector:
+def _vector(name: str, column: int, vectors: _Vectors, factor: float) -> RunningSpeedVector:
     q = complex(vectors.mean[column])
     hops = vectors.hops[:, column]
     count = hops.shape[0]
@@ -143,7 +143,7 @@ def _vector(channel: Channel, column: int, vectors: _Vectors, factor: float) -> 
         error = figures([factor * along.real.std(ddof=1) / np.sqrt(count)])[0]
         phase_error = figures([np.degrees(along.imag.std(ddof=1) / np.sqrt(count) / abs(q))])[0]
     return RunningSpeedVector(
-        channel=channel.name,
+        channel=name,
         amplitude=_rounded(factor * abs(q)),
         amplitude_error=error,
         phase_lag_deg=_rounded(phase_lag_deg(q, vectors.direction)) if vectors.absolute else None,
@@ -161,9 +161,14 @@ def _predicted(
 ) -> OrbitEllipse:
     """Orbit that the unbalance makes at the window's speed."""
     q1, q2 = synchronous_response(rotor, window.speed_rad_s)
-    rows = [STATE_INDEX[state_name(channel)] for channel in pair]
+    rows = [STATE_INDEX[state] for state in _planes_at(pair[0].location)]
     q = (q1 - 1j * q2)[rows] * np.exp(1j * known.operation.unbalance_phase_rad)
     return _ellipse(factor * q, vectors.direction, absolute=vectors.absolute)
+
+
+def _planes_at(location: str) -> tuple[str, str]:
+    """States of the displacements at a place."""
+    return ("y1", "z1") if location == "bearing" else ("y2", "z2")
 
 
 def _ellipse(vectors: ComplexArray, direction: int, *, absolute: bool) -> OrbitEllipse:
@@ -200,7 +205,8 @@ def _path(machine: MachineFile, path: Revolutions, pair: tuple[Channel, Channel]
         return None
     names = [channel.name for channel in machine.sensors]
     factor = 1.0 if units == "SI" else 1 / pair[0].to_si
-    y, z = (path.excerpt.samples[:, names.index(one.name)] * one.to_si * factor for one in pair)
+    samples = path.excerpt.samples
+    y, z = planes_of(pair).turned(np.stack([samples[:, names.index(one.name)] * one.to_si * factor for one in pair]))
     times_s = np.arange(y.size) / machine.rate_hz
     return PathSamples(
         times_s=tuple(one for one in figures(times_s) if one is not None),

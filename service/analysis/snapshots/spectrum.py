@@ -14,7 +14,14 @@ from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import ChannelDensity, CrossSpectrum, SpectrumSnapshot, Units
 from service.analysis.excitation import LEFT_OUT_BINS
 from service.analysis.prediction import Prediction
-from service.analysis.snapshots.channels import SnapshotError, chosen_channels, chosen_pairs, figures, product_unit
+from service.analysis.snapshots.channels import (
+    SnapshotError,
+    chosen_channels,
+    chosen_pairs,
+    figures,
+    product_unit,
+    seen_by,
+)
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 
 MOST_LINES = 1000
@@ -64,7 +71,7 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
     SnapshotError
         If there is no such channel, or the band holds no line.
     """
-    machine, window = subject.machine, data.window
+    machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     chosen = chosen_channels(machine, channels)
     pairs = chosen_pairs(machine, first, second) if first or second else ()
     within = _checked(machine, band_hz)
@@ -89,10 +96,15 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
     lines = (window.frequencies_hz >= within[0] - 1e-9) & (window.frequencies_hz <= within[1] + 1e-9)
     frequencies_hz = window.frequencies_hz[lines]
     spacing_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
-    states = tuple(dict.fromkeys(state_name(one) for one in (*chosen, *(one for pair in pairs for one in pair))))
+    used = tuple(dict.fromkeys((*chosen, *(one for pair in pairs for one in pair))))
+    states = tuple(map(state_name, used))
     columns = [window.states.index(state) for state in states]
     group = -(-frequencies_hz.size // MOST_LINES)
-    nominal, estimated = prediction.spectra(states, frequencies_hz)
+    of_theory, parts = seen_by(used)
+    nominal, estimated = (
+        one if one is None or parts is None else np.asarray(parts @ one @ parts.T, dtype=np.complex128)
+        for one in prediction.spectra(of_theory, frequencies_hz)
+    )
     spectra = _Spectra(
         _grouped(window.spectrum[lines][:, columns][:, :, columns], group),
         None if nominal is None else _grouped(nominal, group),

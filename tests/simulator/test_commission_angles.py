@@ -1,0 +1,63 @@
+"""A machine with probes at an angle is commissioned as one with probes in y and z, and its report names them."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from models.commissioning.commission import Commissioning
+from models.commissioning.healthy import HealthyRecording, healthy_from_blocks
+from models.machine import Machine, MachineFile
+from simulator.commission.page import JSON, write_report
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+from tests.commissioning.rotor_kit import LAB, commissioned
+
+PAIRS = {"y1": 45, "z1": 135, "y2": 45, "z2": 135, "y1_dot": 45, "z1_dot": 135, "y2_dot": 45, "z2_dot": 135}
+
+
+def _mounted() -> Machine:
+    fields = LAB.model_dump()
+    for sensor in fields["sensors"]:
+        if sensor["name"] in PAIRS:
+            sensor |= {"direction": "XY"[PAIRS[sensor["name"]] > 90], "angle_deg": PAIRS[sensor["name"]]}
+    return Machine.model_validate(fields)
+
+
+@cache
+def kit(*, mounted: bool, full: bool) -> tuple[Commissioning, HealthyRecording, MachineFile]:
+    machine: MachineFile = _mounted() if mounted else LAB
+    scenario, _ = load_scenario("healthy")
+    sensors = scenario.sensors.model_copy(update={"noise_relative": 1e-6})
+    scenario = scenario.model_copy(update={"duration_s": 370.0, "seed": 77_205, "sensors": sensors})
+    assert isinstance(machine, Machine)
+    stream = [(block, "") for block, _ in blocks(scenario, machine, 1.0)]
+    if not full:
+        without = machine.model_dump(exclude={"rotor", "operation", "condition"})
+        machine = MachineFile.model_validate(without)
+    recording = healthy_from_blocks("healthy.mcap", machine, stream)
+    return commissioned(machine, recording), recording, machine
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_probes_at_an_angle_are_commissioned_as_probes_in_y_and_z(full: bool, tmp_path: Path) -> None:
+    plain, *_ = kit(mounted=False, full=full)
+    turned, recording, machine = kit(mounted=True, full=full)
+    assert turned.report.verdict == plain.report.verdict != "refused"
+    for one, other in zip(plain.report.parameters, turned.report.parameters, strict=True):
+        assert other.name == one.name
+        if one.window_error is None:
+            assert other.window_error is None
+        else:
+            assert other.window_error == pytest.approx(one.window_error, rel=0.05)
+    assert turned.commissioned is not None
+    sensors = turned.commissioned.sensors
+    assert sensors is not None
+    assert {"bearing@45", "bearing@135_dot"} <= {one.state for one in sensors.channels}
+    assert {(one.first, one.second) for one in sensors.pairs} >= {("disc@45", "disc@45_dot")}
+    assert turned.commissioned.levels is not None
+    assert set(turned.commissioned.levels.states[0].levels) == {one.name for one in LAB.sensors[:-1]}
+    page = write_report(tmp_path, turned.report, [recording], machine=machine, commissioned=turned.commissioned)
+    assert json.loads((tmp_path / JSON).read_text())["verdict"] == turned.report.verdict
+    assert "bearing, at 135°, velocity" in page.read_text(encoding="utf-8")
