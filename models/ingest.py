@@ -58,6 +58,7 @@ class Admission:
     gap_s: float = 0.0  # seconds of data missing before an accepted block (0 = contiguous)
     clock_step_s: float = 0.0  # seconds by which the data's time is another one from this block on, either way
     new_run: bool = False  # whether that is because the publisher was started anew, and not because its clock was set
+    new_snapshot: bool = False  # whether it begins a snapshot, after a silence that was to be expected
 
     @property
     def accepted(self) -> bool:
@@ -112,6 +113,7 @@ class Gate:
         self._schema_hash = machine.descriptor.schema_hash
         self._most_samples = math.ceil(machine.ingest.block_to_s * machine.rate_hz * 1.1)
         self._tolerance_ns = round(machine.ingest.time_tolerance_s * 1e9)
+        self._schedule = machine.schedule
         self._expected: Course | None = None
         self._candidate: Course | None = None
         self._earlier: deque[Course] = deque(maxlen=EARLIER_COURSES)
@@ -249,6 +251,14 @@ class Gate:
             self._follow(block)
             return Admission(text=f"{self._name}: the publisher restarted") if restarted else Admission()
         late_s = late_ns / 1e9
+        schedule = self._schedule
+        if (
+            schedule is not None
+            and schedule.is_silence(late_s)
+            and (block.run != expected.run or block.sequence == expected.sequence)
+        ):
+            self._follow(block)
+            return Admission(new_snapshot=True)
         if late_ns < 0:
             same_run = block.run == expected.run
             if same_run and block.sequence < expected.sequence:
@@ -270,7 +280,8 @@ class Gate:
                 f"start_ns {block.start_ns} of block {block.sequence} lies {late_s:.6g} s ahead, expected at most "
                 f"{self._settings.max_jump_s:g} s; believed if the clock stays there",
             )
-        if block.run == expected.run and block.sequence == expected.sequence and late_s > _SURELY_S:
+        next_in_sequence = block.run == expected.run and block.sequence == expected.sequence
+        if next_in_sequence and late_s > _SURELY_S and schedule is None:
             return self._resynchronise(
                 block,
                 Reason.FUTURE,
@@ -281,6 +292,12 @@ class Gate:
         missed = block.sequence - expected.sequence if block.run == expected.run else 0
         blocks = f" ({missed} blocks)" if missed > 0 else ""
         self._follow(block)
+        if schedule is not None and late_s > schedule.silence_s:
+            gap_s = late_s - schedule.silence_s
+            count = max(1, round(gap_s / schedule.every_s))
+            missing = "a snapshot is missing" if count == 1 else f"{count} snapshots are missing"
+            text = f"{self._name}: {what}{missing}, {gap_s:.6g} s{blocks}"
+            return Admission(text=text, gap_s=gap_s, new_snapshot=True)
         return Admission(text=f"{self._name}: {what}{late_s:.6g} s of data are missing{blocks}", gap_s=late_s)
 
     def _resynchronise(self, block: SampleBlock, reason: Reason, text: str) -> Admission:

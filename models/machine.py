@@ -11,10 +11,11 @@ import hashlib
 import json
 import math
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.errors import MachineFileError
@@ -67,24 +68,80 @@ class ConditionRange(BaseModel, extra="forbid", frozen=True):
         return self
 
 
+class Schedule(BaseModel, extra="forbid", frozen=True):
+    """Snapshots: so many seconds of samples, again and again, and silence between them."""
+
+    on_s: float = Field(gt=0, le=600, description="length of a snapshot")
+    every_s: float = Field(gt=0, le=86400, description="from the start of a snapshot to that of the next one")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.on_s >= self.every_s:
+            raise ValueError(f"on_s {self.on_s:g} must be below every_s {self.every_s:g}: there is silence between")
+        return self
+
+    @property
+    def silence_s(self) -> float:
+        """Silence after a snapshot."""
+        return self.every_s - self.on_s
+
+    def is_silence(self, silence_s: float) -> bool:
+        """Whether nothing is missing where nothing came for so long: snapshots may come half a period late."""
+        return self.silence_s / 2 <= silence_s <= self.silence_s + self.every_s / 2
+
+    def window(self, rate_hz: float) -> dict[str, float]:
+        """Settings of the window where the machine file says nothing.
+
+        A hop is a snapshot, a window twelve of them. Seven half-overlapping segments or more go into a snapshot, and
+        the longest lag is a quarter of it.
+        """
+        segment_s = min(_SEGMENT_S, 2 * math.floor(self.on_s * rate_hz / 8) / rate_hz)
+        lag_to_s = min(_LAG_TO_S, math.floor(self.on_s * rate_hz / 4) / rate_hz)
+        return {
+            "length_s": 12 * self.every_s,
+            "hop_s": self.every_s,
+            "max_span_s": 18 * self.every_s,
+            "segment_s": max(segment_s, 2 / rate_hz),
+            "lag_to_s": max(lag_to_s, 2 / rate_hz),
+            "lag_from_s": min(_LAG_FROM_S, math.floor(lag_to_s * rate_hz / 8) / rate_hz),
+        }
+
+    def ingest(self) -> dict[str, float]:
+        """Settings of ingest where the machine file says nothing: a block may be a snapshot, two may fail to come."""
+        defaults = IngestSettings()
+        return {
+            "block_to_s": max(defaults.block_to_s, 1.05 * self.on_s),
+            "no_data_after_s": max(defaults.no_data_after_s, 2.5 * self.every_s),
+            "max_jump_s": max(defaults.max_jump_s, 10 * self.every_s),
+        }
+
+
+_SEGMENT_S, _LAG_FROM_S, _LAG_TO_S = 2.0, 0.01, 0.125
+_BINS = 20
+
+
 class WindowSettings(BaseModel, extra="forbid", frozen=True):
     """The sliding window: its length, how often it is evaluated, and what is computed in it."""
 
-    length_s: float = Field(default=60.0, gt=0, le=3600, description="window length")
-    hop_s: float = Field(default=5.0, gt=0, le=600, description="one report per hop; also the sub-block of the errors")
-    max_span_s: float = Field(default=90.0, gt=0, le=7200, description="oldest sample a window may hold, across gaps")
-    lag_from_s: float = Field(default=0.01, ge=0, le=10, description="shortest lag of the relation networks")
-    lag_to_s: float = Field(default=0.125, gt=0, le=10, description="longest lag of the correlation functions")
+    length_s: float = Field(default=60.0, gt=0, le=30 * 86400, description="window length")
+    hop_s: float = Field(
+        default=5.0, gt=0, le=86400, description="one report per hop; also the sub-block of the errors"
+    )
+    max_span_s: float = Field(
+        default=90.0, gt=0, le=60 * 86400, description="oldest sample a window may hold, across gaps"
+    )
+    lag_from_s: float = Field(default=_LAG_FROM_S, ge=0, le=10, description="shortest lag of the relation networks")
+    lag_to_s: float = Field(default=_LAG_TO_S, gt=0, le=10, description="longest lag of the correlation functions")
     lag_step_s: float = Field(default=0.001, gt=0, le=1, description="lag spacing of the relation networks")
-    segment_s: float = Field(default=2.0, gt=0, le=120, description="segment of the cross-spectra, half overlapped")
+    segment_s: float = Field(
+        default=_SEGMENT_S, gt=0, le=120, description="segment of the cross-spectra, half overlapped"
+    )
     band_hz: tuple[float, float] = Field(default=(3.0, 150.0), description="band of the likelihood, from and to")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         if not _whole(self.length_s / self.hop_s) or self.length_s < 4 * self.hop_s:
             raise ValueError(f"length_s {self.length_s} must be a multiple of hop_s {self.hop_s}, at least four hops")
-        if not _whole(2 * self.hop_s / self.segment_s):
-            raise ValueError(f"hop_s {self.hop_s} must be a multiple of half of segment_s {self.segment_s}")
         if self.lag_to_s >= self.hop_s:
             raise ValueError(f"lag_to_s {self.lag_to_s} must be below hop_s {self.hop_s}")
         if self.lag_from_s >= self.lag_to_s:
@@ -105,7 +162,7 @@ class IngestSettings(BaseModel, extra="forbid", frozen=True):
     """When a block is refused, and when silence is called missing data."""
 
     block_from_s: float = Field(default=0.001, gt=0, le=1, description="shortest accepted block")
-    block_to_s: float = Field(default=2.0, gt=0, le=60, description="longest accepted block")
+    block_to_s: float = Field(default=2.0, gt=0, le=630, description="longest accepted block")
     time_tolerance_s: float = Field(default=0.0002, gt=0, le=1, description="jitter of block times that is no gap")
     rate_tolerance: float = Field(default=1e-4, ge=0, lt=0.1, description="relative deviation of the sampling rate")
     max_jump_s: float = Field(default=3600.0, gt=0, description="a block further ahead than this is refused as future")
@@ -113,7 +170,7 @@ class IngestSettings(BaseModel, extra="forbid", frozen=True):
     reorder_blocks: int = Field(
         default=20, ge=0, le=1000, description="blocks that may wait for a missing one; 0 takes them as they arrive"
     )
-    no_data_after_s: float = Field(default=5.0, gt=0, le=3600, description="silence that is called no data")
+    no_data_after_s: float = Field(default=5.0, gt=0, le=30 * 86400, description="silence that is called no data")
 
     @model_validator(mode="after")
     def _blocks_are_no_silence(self) -> Self:
@@ -242,18 +299,25 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     ingest: IngestSettings = IngestSettings()
     alarms: AlarmSettings = AlarmSettings()
     levels: LevelSettings = LevelSettings()
+    # Left out of what identifies a machine where it is not given: identities stay as they were before it was there.
+    schedule: Schedule | None = Field(default=None, exclude_if=lambda schedule: schedule is None)
 
     @model_validator(mode="before")
     @classmethod
-    def _lag_step_of_the_rate(cls, fields: object) -> object:
-        """A lag spacing that is not given is the whole number of samples nearest to a millisecond."""
+    def _defaults_that_depend_on_others(cls, fields: object) -> object:
+        """What is not given: a lag spacing of whole samples near a millisecond, and what follows from a schedule."""
         if not isinstance(fields, dict) or not isinstance(fields.get("window", {}), dict):
             return fields
         window, rate_hz = fields.get("window", {}), fields.get("rate_hz")
-        if "lag_step_s" in window or not isinstance(rate_hz, int | float) or not 0 < rate_hz <= 1e6:
+        if not isinstance(rate_hz, int | float) or not 0 < rate_hz <= 1e6:
             return fields
+        if isinstance(fields.get("schedule"), dict) and isinstance(fields.get("ingest", {}), dict):
+            with suppress(ValidationError):  # told when the table itself is looked at
+                schedule = Schedule.model_validate(fields["schedule"])
+                window = schedule.window(rate_hz) | window
+                fields = fields | {"window": window, "ingest": schedule.ingest() | fields.get("ingest", {})}
         usual = WindowSettings.model_fields["lag_step_s"].default
-        if _whole(usual * rate_hz):
+        if "lag_step_s" in window or _whole(usual * rate_hz):
             return fields
         return fields | {"window": window | {"lag_step_s": max(1, round(usual * rate_hz)) / rate_hz}}
 
@@ -273,9 +337,10 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             raise ValueError(
                 f"window.segment_s {self.window.segment_s} is an odd number of samples, expected an even one"
             )
-        bins = (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s
-        if bins < 20:
-            raise ValueError(f"window.band_hz holds {bins:.0f} frequencies of segment_s, expected at least 20")
+        self._check_hops()
+        if self.schedule is None and not self.holds_band:
+            bins = (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s
+            raise ValueError(f"window.band_hz holds {bins:.0f} frequencies of segment_s, expected at least {_BINS}")
         if all(channel.quantity == "shaft_angle" for channel in self.sensors):
             raise ValueError("sensors: a shaft angle alone shows no vibration, expected a displacement or velocity too")
         if self.window.band_hz[1] >= self.rate_hz / 2:
@@ -289,6 +354,48 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 hint = did_you_mean(limit.channel, names)
                 raise ValueError(f"levels.limits: no channel {limit.channel!r}; there are {', '.join(names)}{hint}")
         return self
+
+    def _check_hops(self) -> None:
+        """Refuse segments and lags that do not go into a hop."""
+        window, schedule = self.window, self.schedule
+        if schedule is None:
+            if not _whole(2 * window.hop_s / window.segment_s):
+                raise ValueError(
+                    f"window.hop_s {window.hop_s} must be a multiple of half of segment_s {window.segment_s}"
+                )
+            return
+        if abs(window.hop_s - schedule.every_s) > 1e-9 * schedule.every_s:
+            raise ValueError(
+                f"window.hop_s is {window.hop_s:g}, but a hop is a snapshot, one every {schedule.every_s:g} s "
+                "([schedule] every_s): leave it out"
+            )
+        for field in ("segment_s", "lag_to_s"):
+            value = getattr(window, field)
+            if value > schedule.on_s / 2:
+                raise ValueError(
+                    f"window.{field} is {value:g}, expected at most half of a snapshot, {schedule.on_s / 2:g} "
+                    "([schedule] on_s)"
+                )
+        if self.ingest.no_data_after_s <= schedule.silence_s:
+            raise ValueError(
+                f"ingest.no_data_after_s is {self.ingest.no_data_after_s:g}, expected more than the silence between "
+                f"snapshots, {schedule.silence_s:g} s"
+            )
+
+    @property
+    def hop_data_s(self) -> float:
+        """Data in a hop, s."""
+        return self.window.hop_s if self.schedule is None else self.schedule.on_s
+
+    @property
+    def window_data_s(self) -> float:
+        """Data in a full window, s."""
+        return self.window.length_s if self.schedule is None else self.window.hops * self.schedule.on_s
+
+    @property
+    def holds_band(self) -> bool:
+        """Whether segments are long enough for spectra in the band; without them there are levels alone."""
+        return (self.window.band_hz[1] - self.window.band_hz[0]) * self.window.segment_s >= _BINS
 
     @property
     def keys(self) -> MachineKeys:
@@ -311,7 +418,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     @property
     def physics_hash(self) -> str:
         """Twelve hexadecimal digits that change with the rotor, its operation or condition range, rate or window."""
-        fields = {"rotor", "operation", "condition", "rate_hz", "window"}
+        fields = {"rotor", "operation", "condition", "rate_hz", "window", "schedule"}
         text = json.dumps(self.model_dump(mode="json", include=fields), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -140,12 +140,23 @@ def _cut(
     scenario: Scenario, machine: Machine, n_block: int, start_ns: int, run: int
 ) -> Iterator[tuple[SampleBlock, tuple[TruthRecord, ...]]]:
     simulation = _Simulation(scenario, machine, start_ns, run)
-    for sequence, first in enumerate(range(0, simulation.n_samples, n_block)):
-        last = min(first + n_block, simulation.n_samples)
+    for sequence, (first, last) in enumerate(_spans(machine, simulation.n_samples, n_block)):
+        simulation.skip(first)
         samples = simulation.take(last - first)
         truth = simulation.truth(last)
         start = simulation.time_ns(first)
         yield SampleBlock(start, sequence, run, machine.rate_hz, samples), truth
+
+
+def _spans(machine: MachineFile, n_samples: int, n_block: int) -> Iterator[tuple[int, int]]:
+    """First sample of each block and the one after its last; with a schedule, of snapshots alone."""
+    schedule, rate_hz = machine.schedule, machine.rate_hz
+    period = n_samples if schedule is None else round(schedule.every_s * rate_hz)
+    length = n_samples if schedule is None else round(schedule.on_s * rate_hz)
+    for start in range(0, n_samples, period):
+        end = min(start + length, n_samples)
+        for first in range(start, end, n_block):
+            yield first, min(first + n_block, end)
 
 
 class _Simulation:
@@ -172,11 +183,17 @@ class _Simulation:
             [np.random.default_rng(seed) for seed in sensor_seeds],
         )
         self._piece = max(1, round(_PIECE_S * machine.rate_hz))
-        self._made = 0
+        self._made = self._taken = 0
         self._rest = np.empty((0, len(machine.sensors)), dtype=machine.dtype)
+
+    def skip(self, first: int) -> None:
+        """Go on to a sample; the machine moves meanwhile."""
+        while self._taken < first:
+            self.take(min(self._piece, first - self._taken))
 
     def take(self, n_samples: int) -> npt.NDArray[np.float32] | FloatArray:
         """Next samples of all channels."""
+        self._taken += n_samples
         parts = [self._rest]
         held = len(self._rest)
         while held < n_samples:

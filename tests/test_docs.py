@@ -23,7 +23,7 @@ def fields_of(model: type[BaseModel]) -> set[str]:
 def test_every_field_of_the_machine_file_is_documented() -> None:
     page = (ROOT / "docs" / "machine-file.md").read_text(encoding="utf-8")
     structure = {"rotor", "operation", "condition", "sensors", "window", "ingest", "alarms", "limits", "parameters"}
-    structure |= {"levels", "suppress"}
+    structure |= {"levels", "schedule", "suppress"}
     for name in fields_of(Machine) - structure:
         assert f"`{name}`" in page, f"docs/machine-file.md does not mention {name}"
     for name in structure:

@@ -55,8 +55,8 @@ def check_data(machine: MachineFile, recordings: Sequence[HealthyRecording]) -> 
         lost += f", {sum(refused.values())} blocks refused (the latest: {last})"
     files = "one recording" if len(recordings) == 1 else f"{len(recordings)} recordings"
     found = f"{used_s:.4g} s of usable data in {files}; {lost}"
-    wanted_s = _FEW_WINDOWS * window.length_s
-    advice = f"record at least {wanted_s:g} s without interruption, in one or several files"
+    wanted_s = _FEW_WINDOWS * machine.window_data_s
+    advice = f"record at least {_FEW_WINDOWS * window.length_s:g} s without interruption, in one or several files"
     if hops < _FEWEST_HOPS:
         return told(verdict="refused", text=f"too short: {found}", advice=advice)
     span_s = sum((one.hops[-1].end_ns - one.hops[0].start_ns) / 1e9 for one in recordings if one.hops)

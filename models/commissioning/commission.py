@@ -139,7 +139,7 @@ def parameter_summaries(
             found.append(ParameterSummary(name=name, text=PARAMETER_TEXT[name], evaluable=False, reason=reason))
             continue
         own, shared = (float(np.median(part)) for part in zip(*known, strict=True))
-        own *= math.sqrt(window_s / machine.window.length_s)
+        own *= math.sqrt(window_s / machine.window_data_s)
         readings = _readings(name, compared)
         found.append(
             ParameterSummary(
@@ -156,7 +156,7 @@ def parameter_summaries(
                 detectable_gain=from_scale(name, threshold * math.hypot(own, shared)),
                 wished=wished,
                 readings=readings,
-                **_needed(name, wished, threshold, own, shared, healthy_s, machine.window.length_s),
+                **_needed(name, wished, threshold, own, shared, healthy_s, machine.window_data_s),
             )
         )
     return tuple(found)

@@ -155,7 +155,7 @@ def _rms(window: WindowStatistics) -> np.ndarray[tuple[int], np.dtype[np.float64
 
 FILE = "commissioned.json"
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
-_DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition"}
+_DESCRIBED = {"sensors", "rate_hz", "window", "rotor", "operation", "condition", "schedule"}
 
 
 class RecordingEntry(BaseModel, extra="forbid", frozen=True):
@@ -295,6 +295,8 @@ class Installed:
     @property
     def known(self) -> Machine | None:
         """The machine with all its parameters, given or identified; None where only a baseline is known."""
+        if not self.machine.holds_band:
+            return None
         if self.commissioned is not None:
             return self.commissioned.completed(self.machine)
         return self.machine if isinstance(self.machine, Machine) else None
@@ -302,7 +304,7 @@ class Installed:
     @property
     def watching(self) -> bool:
         """Whether nothing but levels can be watched: the machine is neither known nor commissioned."""
-        return self.commissioned is None and not isinstance(self.machine, Machine)
+        return self.commissioned is None and self.known is None
 
     @property
     def identity(self) -> str | None:

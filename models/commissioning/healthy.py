@@ -42,7 +42,7 @@ class HealthyRecording:
     @property
     def duration_s(self) -> float:
         """Usable data, s."""
-        return len(self.hops) * self.plan.hop / self.plan.rate_hz
+        return len(self.hops) * self.plan.fresh / self.plan.rate_hz
 
     def windows(self, hops: int | None = None) -> tuple[WindowStatistics, ...]:
         """Windows that do not overlap, gaps left out.
@@ -89,8 +89,9 @@ def healthy_from_blocks(
             continue
         if not verdict.continuous:
             gaps, missing_s = gaps + 1, missing_s + verdict.gap_s
-            window.gap()
             stretches.append([])
+        if not verdict.continuous or verdict.new_snapshot:
+            window.gap()
         for _ in window.feed(plan.to_si(block.samples), block.start_ns):
             hop = window.latest_hop
             if hop is not None:
@@ -124,7 +125,7 @@ def read_healthy(path: Path, machine: MachineFile, until_s: float | None = None)
     found = healthy_from_blocks(path.name, machine, _blocks(path, machine), until_s)
     if not found.hops and not found.refused:
         raise RecordingError(
-            f"{path}: no hop of {machine.window.hop_s:g} s of {machine.site}/{machine.name} in it; it holds "
+            f"{path}: no hop of {machine.hop_data_s:g} s of {machine.site}/{machine.name} in it; it holds "
             f"{', '.join(_streams(path)) or 'no stream'}"
         )
     return found

@@ -94,9 +94,7 @@ def _read_known(machine: Machine, pieces: Sequence[Piece], progress: Progress) -
     found = []
     for number, piece in enumerate(pieces):
         diagnosis = LikelihoodFit(machine).diagnose(piece.window)
-        found.append(
-            (piece.recording, piece.window.end_ns, determined(diagnosis, piece.window, machine.window.length_s))
-        )
+        found.append((piece.recording, piece.window.end_ns, determined(diagnosis, piece.window, machine.window_data_s)))
         progress("comparing with theory", number + 1, len(pieces))
     return tuple(found)
 
@@ -121,7 +119,7 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
     read = tuple(
         (piece.recording, piece.window.end_ns, with_shared_error(stated, identified.covariance))
         for piece, diagnosis in zip(pieces, identified.diagnoses, strict=True)
-        for stated in [determined(diagnosis, piece.window, machine.window.length_s)]
+        for stated in [determined(diagnosis, piece.window, machine.window_data_s)]
     )
     filled = identified.machine.model_dump(mode="json", include=set(_TABLES))
     record = IdentifiedRecord(
@@ -177,7 +175,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Pro
     for group, baseline in zip(groups, baselines, strict=True):
         diagnostician = BaselineDiagnostician(baseline)
         for piece in group:
-            stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window.length_s)
+            stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window_data_s)
             read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
         compared += _halves(group)

@@ -13,6 +13,7 @@ to the line. Then every hop has its own, and a segment of the spectra those betw
 Without a phase reference the angle begins anew in every hop, and each of its segments has its own hop's.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -41,6 +42,8 @@ class Plan:
     # Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
     # statistics' columns.
     states: tuple[str, ...]
+    # What each column of `states` is as mounted: `states` themselves, but for sensors at an angle (``bearing@45``).
+    mounted: tuple[str, ...]
     # Column of the stream, and factor to SI, for each of `states` and then for channels at other places, of which only
     # levels are taken.
     columns: npt.NDArray[np.intp]
@@ -54,15 +57,25 @@ class Plan:
     segment: int
     lags: npt.NDArray[np.intp]  # lags of the correlation functions, samples
     bins: npt.NDArray[np.intp]  # frequency bins of a segment's Fourier transform that are kept
+    # Samples from the start of a hop to the next one: more than it has where there is silence between snapshots.
+    stride: int
     hops: int  # hops in a full window
     max_span_ns: int  # oldest data a window may hold
     # Speed to look for where there is no shaft angle; None: the rotation is not looked for.
     speed_rad_s: float | None = None
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
     levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
-    # What each column of `states` is as mounted: `states` themselves, but for sensors at an angle (``bearing@45``).
-    mounted: tuple[str, ...] = ()
     turn: FloatArray | None = None  # (n, n), states = turn @ mounted; None where no sensor is at an angle
+
+    @property
+    def need(self) -> int:
+        """Samples that a hop is made of."""
+        return self.preamble + self.hop
+
+    @property
+    def fresh(self) -> int:
+        """How many of them, the last ones, no other hop has: of a snapshot all."""
+        return min(self.need, self.stride)
 
     @property
     def others(self) -> slice:
@@ -114,7 +127,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
     """
     window, rate_hz = machine.window, machine.rate_hz
     order = {name: column for column, name in enumerate(machine.descriptor.states)}
-    states = tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in order)
+    states = tuple(name for name in (*STATE_INDEX, *ACCELERATIONS) if name in order and machine.holds_band)
     others = tuple(name for name in order if name not in states and name != "theta")
     columns = np.array([order[name] for name in (*states, *others)], dtype=np.intp)
     channels = [machine.sensors[column] for column in columns]
@@ -126,17 +139,21 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
     lags = np.arange(0, round(window.lag_to_s * rate_hz) + 1, lag_step)
     longest = int(lags[-1])
     first, last = (round(edge * window.segment_s) for edge in window.band_hz)
+    preamble = max(longest, segment // 2)
+    # A snapshot has no history but its own beginning.
+    hop = math.floor(machine.hop_data_s * rate_hz + 1e-6) - (0 if machine.schedule is None else preamble)
     return Plan(
         rate_hz=rate_hz,
         states=states,
         columns=columns,
         scales=np.array([channel.to_si for channel in channels]),
         angle_column=order.get("theta"),
-        hop=round(window.hop_s * rate_hz),
-        preamble=max(longest, segment // 2),
+        hop=hop,
+        preamble=preamble,
         segment=segment,
         lags=lags if lagged else lags[:1],
         bins=np.arange(first, last + 1),
+        stride=round(window.hop_s * rate_hz),
         hops=window.hops,
         max_span_ns=round(window.max_span_s * 1e9),
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
@@ -238,17 +255,17 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         regressors += [np.cos(theta)[:, None], np.sin(theta)[:, None]]
     a = np.hstack(regressors)
     segments = _segment_spectra(a, plan)
-    own = samples[plan.preamble :]
+    own = samples[-plan.fresh :]
     waveform = waveform_of(own if n_states == plan.columns.size else np.delete(own, plan.others, axis=1))
     levels = None
     if plan.levels is not None:
-        turned = None if theta is None or (line is None and plan.angle_column is None) else theta[plan.preamble :]
+        turned = None if theta is None or (line is None and plan.angle_column is None) else theta[-plan.fresh :]
         levels = hop_levels(plan.levels, own[:, : plan.columns.size], turned)
     # The mean leaks from zero frequency into the lowest bins; the rotation obeys v = jωx and stays.
     level_left = (waveform.mean[:n_states] - level) * segments[:, :, n_states, None]
     return HopMoments(
         start_ns=start_ns,
-        end_ns=start_ns + round(plan.hop * 1e9 / plan.rate_hz),
+        end_ns=start_ns + round(own.shape[0] * 1e9 / plan.rate_hz),
         products=_lagged_products(a, plan),
         segments=segments,
         turned_rad=turned_rad,

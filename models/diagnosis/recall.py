@@ -111,6 +111,8 @@ class Recall:
         return self._samples(self.last)
 
     def _samples(self, piece: Piece) -> tuple[FloatArray, tuple[tuple[int, int], ...]] | None:
+        if not piece.rows:
+            return np.empty((0, self._plan.width)), ()
         starts = sorted(self._blocks)
         rows, blocks, samples = -piece.row, [], []
         for start_ns in starts[bisect_left(starts, piece.block_ns) :]:
@@ -121,6 +123,6 @@ class Recall:
             blocks.append((start_ns, len(samples[-1])))
             rows += len(samples[-1])
         if not samples:
-            return None if piece.rows else (np.empty((0, self._plan.width)), ())
+            return None
         found = np.concatenate(samples)[piece.row : piece.row + piece.rows]
         return (found, tuple(blocks)) if digest_of(found) == piece.digest else None

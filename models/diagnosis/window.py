@@ -289,24 +289,32 @@ class SlidingWindow:
         self._pending.append(np.ascontiguousarray(samples))
         self._pending_samples += samples.shape[0]
         self._blocks.append((start_ns, samples.shape[0]))
-        need = self.plan.preamble + self.plan.hop
-        while self._pending_samples >= need:
-            buffer = np.concatenate(self._pending)
-            first_ns, rest = self._pending_start_ns, buffer[self.plan.hop :]
-            self._pending = [rest]
-            self._pending_samples = rest.shape[0]
-            self._pending_start_ns += round(self.plan.hop * 1e9 / self.plan.rate_hz)
+        if self._pending_samples == samples.shape[0]:  # they may be what is to be left after a snapshot
+            self._pending = self._pending[-1:]
+            self._leave(self._row)
+        while self._pending_samples >= self.plan.need:
+            buffer, first_ns = np.concatenate(self._pending), self._pending_start_ns
             block_ns, row = self._blocks[0][0], self._row
-            self._row += self.plan.hop
-            while self._blocks and self._row >= self._blocks[0][1]:
-                self._row -= self._blocks.popleft()[1]
-            yield self._complete(buffer[:need], first_ns, block_ns, row)
+            self._pending, self._row = [buffer], self._row + self.plan.stride
+            self._leave(self.plan.stride)
+            yield self._complete(buffer[: self.plan.need], first_ns, block_ns, row)
+
+    def _leave(self, count: int) -> None:
+        """Go on so many samples after the first pending one; those that have not come yet are left when they come."""
+        if not count:
+            return
+        (pending,) = self._pending
+        rest = pending[count:]
+        self._pending, self._pending_samples = [rest], rest.shape[0]
+        self._pending_start_ns += round(count * 1e9 / self.plan.rate_hz)
+        while self._blocks and self._row >= self._blocks[0][1]:
+            self._row -= self._blocks.popleft()[1]
 
     def _complete(self, samples: FloatArray, first_ns: int, block_ns: int, row: int) -> int:
         if self._level is None or not self._hops:
             # The median: one wild sample must not become the level of everything that follows.
             self._level = np.median(samples[:, : len(self.plan.states)], axis=0)
-        start_ns = first_ns + round(self.plan.preamble * 1e9 / self.plan.rate_hz)
+        start_ns = first_ns + round((self.plan.need - self.plan.fresh) * 1e9 / self.plan.rate_hz)
         hop = hop_moments(self.plan, samples, self._level, start_ns)
         while self._hops and hop.end_ns - self._hops[0].start_ns > self.plan.max_span_ns:
             self._hops.popleft()

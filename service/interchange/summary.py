@@ -28,7 +28,7 @@ def summary_lines(done: Imported) -> list[str]:
     if written.too_short:
         lines.append(f"samples left out in stretches shorter than a block: {written.too_short}")
     length_s = written.samples / machine.rate_hz
-    if length_s < machine.window.length_s:
+    if length_s < machine.window_data_s:
         lines.append(
             f"note: {length_s:.6g} s of data do not fill one window of {machine.window.length_s:g} s; reports will be "
             "few or none"

@@ -305,7 +305,7 @@ class KnownMachineEvaluator:
             diagnosis = diagnose(window)
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{self._place}: {error} in this window") from error
-        stated = determined(diagnosis, window, self._machine.window.length_s)
+        stated = determined(diagnosis, window, self._machine.window_data_s)
         return stated if self._shared is None else with_shared_error(stated, self._shared)
 
 
@@ -323,7 +323,7 @@ class BaselineEvaluator(_Unremembering):
         self._place = f"{machine.site}/{machine.name}"
         self._conditions = commissioned.conditions
         self._shape = commissioned.shape
-        self._length_s = machine.window.length_s
+        self._length_s = machine.window_data_s
         settings = SequentialSettings.for_machine(machine, short=False)
         per_month = month_thresholds(settings.false_alarms_per_month, settings.hop_s, settings.window_hops, 1)
         self._shape_rate = 2 * float(ndtr(-per_month.first))

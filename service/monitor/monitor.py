@@ -228,9 +228,10 @@ class MachineMonitor:
     def _hops(self, block: SampleBlock, verdict: Admission, dropped: int) -> Iterable[int]:
         """Take an accepted block into the window; ends of the hops that it completes, each to be evaluated in turn."""
         self._not_recalled += self._window.give_up()
-        if not verdict.continuous:
+        joined = verdict.continuous and not verdict.new_snapshot
+        if not joined:
             self._window.gap()
-        self._newest.add(block, continuous=verdict.continuous and not verdict.clock_step_s)
+        self._newest.add(block, continuous=joined and not verdict.clock_step_s)
         if verdict.clock_step_s:
             self._window.clear()
             self._kept_is_valid = False  # hops may end at the same times as before

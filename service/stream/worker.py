@@ -159,7 +159,7 @@ class MachineWorker:
         reasons = [] if refused is None else [f"the history refuses what happens: {refused}"]
         if self.history.trouble:
             reasons.append(f"the history does not take what happens: {self.history.trouble}")
-        if self._unevaluated_s > 2 * self.machine.window.hop_s and not self._silent:
+        if self._unevaluated_s > 2 * self.machine.hop_data_s and not self._silent:
             why = self._snapshot.reason
             reasons.append(f"{self._unevaluated_s:.0f} s of data have come in and no window was evaluated: {why}")
         return "; ".join(reasons)

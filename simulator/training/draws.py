@@ -136,7 +136,7 @@ def draw_condition(draw: Draw, number: int) -> Scenario:
     events.append(Event(at_s=0, speed_rpm=speed_rpm))
     plan = plan_for(machine)
     realisation = _generator(draw, number, _REALISATION) if draw.fixed_condition else rng
-    duration_s = (plan.preamble + plan.hops * plan.hop) / machine.rate_hz
+    duration_s = (plan.preamble + plan.hops * plan.stride) / machine.rate_hz
     if draw.excitation is Excitation.DRIFT:
         sources, drift = _drifting(sources, duration_s, excitation_rng)
         events += drift

@@ -179,11 +179,13 @@ def plan(
     return Plan(
         rate_hz=RATE_HZ,
         states=states,
+        mounted=states,
         columns=np.array([COLUMNS.index(name) for name in states]),
         scales=np.ones(len(states)),
         angle_column=len(COLUMNS) if speed_rad_s is None else None,
         speed_rad_s=speed_rad_s,
         hop=segment,
+        stride=segment,
         preamble=max(int(lags[-1]), segment // 2),
         segment=segment,
         lags=lags,

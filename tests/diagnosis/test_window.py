@@ -25,10 +25,12 @@ def small_plan(*, angle: bool = True, hops: int = 4) -> Plan:
     return Plan(
         rate_hz=RATE,
         states=("y1", "y1_dot"),
+        mounted=("y1", "y1_dot"),
         columns=np.array([0, 1]),
         scales=np.array([1.0, 1.0]),
         angle_column=2 if angle else None,
         hop=100,
+        stride=100,
         preamble=50,
         segment=100,
         lags=np.arange(0, 21, 2),
@@ -93,7 +95,7 @@ def batch_correlation(plan: Plan, samples: FloatArray, end: int) -> FloatArray:
 @pytest.mark.parametrize("hop", [100, 306, 307, 2000])
 def test_products_are_their_definition_whatever_the_hop(hop: int) -> None:
     """Shorter and longer than a block of the transform, with channels six orders of magnitude apart."""
-    plan = replace(small_plan(), hop=hop)
+    plan = replace(small_plan(), hop=hop, stride=hop)
     samples = signal(plan.preamble + hop, 31)
     samples[:, 1] *= 1e6
     products = hop_moments(plan, samples, np.zeros(2), 0).products
@@ -130,10 +132,12 @@ def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -
     plan = Plan(
         rate_hz=1e4,
         states=("y1", "y1_dot"),
+        mounted=("y1", "y1_dot"),
         columns=np.array([0, 1]),
         scales=np.ones(2),
         angle_column=None,
         hop=25_000,
+        stride=25_000,
         preamble=50,
         segment=100,
         lags=np.array([0, 5, 20]),
@@ -366,7 +370,9 @@ def test_hop_by_hop_any_splitting_gives_identical_statistics(cuts: list[int], an
     theta = 2 * np.pi * (9.0 * t + 0.015 * t**2)
     samples = np.column_stack([signal(2450, 8, angle=False), np.mod(theta, 2 * np.pi)])
     samples[:, :2] += 20 * np.outer(np.cos(theta), [1.0, 2.0])
-    plan = replace(small_plan(angle=angle, hops=6), hop=300, speed_rad_s=2 * np.pi * 10, speed_tolerance=0.3)
+    plan = replace(
+        small_plan(angle=angle, hops=6), hop=300, stride=300, speed_rad_s=2 * np.pi * 10, speed_tolerance=0.3
+    )
     samples = samples if angle else samples[:, :2]
     whole, window, split = feed(SlidingWindow(plan), samples), SlidingWindow(plan), []
     for begin, end in pairwise([0, *sorted(set(cuts)), 2450]):

@@ -32,7 +32,7 @@ _FEWEST_HOPS, _FEWEST_SIDE = 6, 3
 _ALIKE = 0.25
 _STAY = 3.0
 _LENGTH = 0.15  # relative change of the vectors' common length that still counts as none
-_LINE_BINS, _AROUND_BINS = 1, 12
+_LINE_BINS, _AROUND_BINS, _FEWEST_AROUND, _AROUND_HZ = 1, 12, 4, 6.0
 _LINE_STRENGTH = 15.0  # a line is one where the channels' mean power stands out by this factor
 # The rotation is gone below this part of its healthy amplitude, and is elsewhere within this factor of it.
 _GONE, _THERE = 1 / 3, 3.0
@@ -106,11 +106,12 @@ def _lost(window: WindowStatistics, name: str) -> SensorFault | None:
 def _surroundings(window: WindowStatistics, columns: Sequence[int], at: int) -> tuple[FloatArray, FloatArray]:
     """Power of a line's bins beyond their surroundings, mean square; and the surroundings' density."""
     power = np.einsum("fii->fi", window.spectrum).real[:, list(columns)]
-    low, high = max(0, at - _AROUND_BINS), min(power.shape[0], at + _AROUND_BINS + 1)
-    near = np.arange(low, high)
+    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
+    # Where bins are wide, as many would reach over a resonance, whose flank is no line.
+    around = min(_AROUND_BINS, max(_FEWEST_AROUND, round(_AROUND_HZ / step_hz)))
+    near = np.arange(max(0, at - around), min(power.shape[0], at + around + 1))
     beside = np.maximum(np.median(power[near[np.abs(near - at) > _LINE_BINS + 1]], axis=0), np.finfo(float).tiny)
     bins = power[max(0, at - _LINE_BINS) : at + _LINE_BINS + 1]
-    step_hz = window.frequencies_hz[1] - window.frequencies_hz[0]
     return np.asarray(2 * step_hz * (bins - beside).sum(axis=0)), np.asarray(beside)
 
 
