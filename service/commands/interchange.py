@@ -21,7 +21,10 @@ def register(app: typer.Typer) -> None:
 def import_(
     source: Annotated[
         Path,
-        typer.Argument(metavar="SOURCE", help="CSV, Parquet, NumPy .npz, MATLAB .mat, WAV, UFF 58, TDMS or MF4 file."),
+        typer.Argument(
+            metavar="SOURCE",
+            help="CSV, Parquet, NumPy .npz, MATLAB .mat, WAV, UFF 58, TDMS or MF4 file, or a folder of such files.",
+        ),
     ],
     mapping: Annotated[
         Path, typer.Option("--mapping", metavar="FILE", help="Which column is which channel, in which unit (TOML).")
@@ -32,7 +35,9 @@ def import_(
 ) -> None:
     """Turn measurements from another program into a recording.
 
-    Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps.
+    Units, rate and time are checked; what is wrong is named with row and column. Gaps stay gaps. The files of a folder,
+    such as snapshots, are joined in the order of their times, which are in their names (20260131T120000), in the files,
+    or follow from the mapping's start and the machine's schedule.
 
     [bold]Example[/bold]
 

@@ -90,6 +90,16 @@ class BlockMaker:
         for rows in np.array_split(np.arange(time_ns.size), parts):
             yield from self._block(time_ns[rows], samples[rows])
 
+    def _missing(self, silence_s: float) -> int:
+        """Blocks that would have filled a gap: they are missing in the count, too. Between snapshots there are none."""
+        schedule = self._machine.schedule
+        if schedule is not None:
+            if schedule.is_silence(silence_s):
+                return 0
+            if silence_s > schedule.silence_s:
+                silence_s = (silence_s - schedule.silence_s) * schedule.on_s / schedule.every_s
+        return max(1, round(silence_s * self._machine.rate_hz / self._length))
+
     def _block(self, time_ns: FloatArray, samples: FloatArray) -> Iterator[RecordedMessage]:
         keys, rate_hz = self._machine.keys, self._machine.rate_hz
         since_ns = float(np.mean(time_ns - np.arange(time_ns.size) * (1e9 / rate_hz)))
@@ -98,8 +108,8 @@ class BlockMaker:
             self.written.start_ns = block_ns
             descriptor = self._machine.descriptor.model_dump_json().encode()
             yield RecordedMessage(keys.descriptor, descriptor, b"", "application/json", block_ns, block_ns)
-        elif self._new:  # the blocks that would have filled the gap are missing in the count too
-            self._sequence += max(1, round((since_ns - self._expected_ns) * rate_hz / 1e9 / self._length))
+        elif self._new:
+            self._sequence += self._missing((since_ns - self._expected_ns) / 1e9)
         if self._new:
             self.written.stretches += 1
         self._expected_ns = since_ns + time_ns.size * 1e9 / rate_hz

@@ -66,8 +66,15 @@ class Clock:
         return np.asarray(entries.astype(np.float64) * unit_ns - zero)
 
 
-def clock_for(source: Source, columns: list[Reference], base: TimeBase, machine: MachineFile) -> Clock:
+def clock_for(
+    source: Source, columns: list[Reference], base: TimeBase, machine: MachineFile, start_ns: int | None = None
+) -> Clock:
     """Find out how fast the rows come, and check it against the machine.
+
+    Parameters
+    ----------
+    start_ns : int, optional
+        Start of the rows, where neither the file nor the mapping tells it.
 
     Raises
     ------
@@ -81,7 +88,7 @@ def clock_for(source: Source, columns: list[Reference], base: TimeBase, machine:
         if declared is None:
             raise SourceError(f"{path}: nothing tells the rate; give time.column or time.rate_hz in the mapping")
         first, measured, tolerance = np.zeros(1), declared, 0.0
-        origin_ns = _start_ns(path, base, timing)
+        origin_ns = _start_ns(path, base, timing, start_ns)
     else:
         entries = _first_times(source, column, columns)
         first = entries[:1]
@@ -89,7 +96,7 @@ def clock_for(source: Source, columns: list[Reference], base: TimeBase, machine:
         if first.dtype.kind == "M":
             origin_ns = int(first.astype("datetime64[ns]").astype(np.int64)[0])
         else:
-            origin_ns = _start_ns(path, base, timing) + _nanoseconds(first[0], unit_ns)
+            origin_ns = _start_ns(path, base, timing, start_ns) + _nanoseconds(first[0], unit_ns)
     tolerance += machine.ingest.rate_tolerance
     if declared is not None and abs(measured / declared - 1) > tolerance:
         raise SourceError(
@@ -125,8 +132,9 @@ def _declared_rate(source: Source, base: TimeBase, timing: Timing) -> float | No
     return told if told is not None else timing.rate_hz
 
 
-def _start_ns(path: Path, base: TimeBase, timing: Timing) -> int:
-    start_ns = base.start_ns if base.start_ns is not None else timing.start_ns
+def _start_ns(path: Path, base: TimeBase, timing: Timing, known_ns: int | None) -> int:
+    told = (found for found in (known_ns, base.start_ns, timing.start_ns) if found is not None)
+    start_ns = next(told, None)
     if start_ns is None:
         raise SourceError(
             f"{path}: nothing tells when the first row was sampled; give time.start in the mapping, such as "

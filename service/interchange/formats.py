@@ -23,6 +23,12 @@ _SOURCES: dict[Format, tuple[str, tuple[str, ...]]] = {
 """Class in this package, imported when it is needed with the library that only it needs, and how files are named."""
 
 
+def format_of(path: Path, mapping: "Mapping") -> Format | None:
+    """Format that the mapping or the end of a file's name says; None if neither does."""
+    suffixes = {suffix: kind for kind, (_, those) in _SOURCES.items() for suffix in those}
+    return mapping.format or suffixes.get(path.suffix.lower())
+
+
 def open_source(path: Path, mapping: "Mapping") -> Source:
     """Open a file by the format that the mapping or the end of its name says.
 
@@ -33,9 +39,9 @@ def open_source(path: Path, mapping: "Mapping") -> Source:
     """
     if not path.is_file():
         raise SourceError(f"{path}: no such file")
-    suffixes = {suffix: kind for kind, (_, those) in _SOURCES.items() for suffix in those}
-    kind = mapping.format or suffixes.get(path.suffix.lower())
+    kind = format_of(path, mapping)
     if kind is None:
+        suffixes = [suffix for _, those in _SOURCES.values() for suffix in those]
         raise SourceError(
             f"{path}: format {path.suffix or 'without a suffix'!r} is not known; say format = ... in the mapping, or "
             f"name the file {', '.join(suffixes)}"

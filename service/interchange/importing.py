@@ -17,6 +17,7 @@ from models.signals.recording import RecordingWriter
 from service.interchange.angle import AngleColumn, read_pulses
 from service.interchange.blocks import BlockMaker, Written
 from service.interchange.clock import Clock, clock_for
+from service.interchange.folder import SnapshotFile, joined, snapshot_files
 from service.interchange.formats import open_source
 from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
@@ -55,12 +56,12 @@ class Imported:
 def import_file(
     path: Path, mapping: Mapping, machine: MachineFile, recording: Path, *, overwrite: bool = False
 ) -> Imported:
-    """Import a file.
+    """Import a file, or a folder of files that follow each other.
 
     Parameters
     ----------
     path : Path
-        CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4.
+        CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4; or a folder of such files.
     mapping : Mapping
         Which column is which channel.
     machine : MachineFile
@@ -77,16 +78,21 @@ def import_file(
     RecordingError
         If the recording cannot be written.
     """
-    with open_source(path, mapping) as source:
+    if mapping.keyphasor is not None and path.is_dir():
+        raise SourceError(f"{path}: [keyphasor] cannot be used with a folder, expected one file")
+    files = snapshot_files(path, mapping, machine) if path.is_dir() else (SnapshotFile(path, None),)
+    with open_source(files[0].path, mapping) as source:
         signals = signals_of(source, mapping, machine)
         columns = [signal.reference for signal in signals]
         keyphasor = mapping.keyphasor
         if keyphasor is not None and keyphasor.column is not None:
             columns = [*columns, *_sampled(keyphasor.column, keyphasor.index, columns)]
-        clock = clock_for(source, columns, mapping.time, machine)
+        clock = clock_for(source, columns, mapping.time, machine, files[0].start_ns)
         pulses = None if keyphasor is None else read_pulses(source, keyphasor, clock, mapping)
         read = Read()
         parts: Iterator[Piece] = pieces(source, signals, clock, mapping, read)
+        if len(files) > 1:
+            parts = joined(parts, files[1:], clock, mapping, machine, read)
         overlaps = []
         if mapping.acceleration is not None:
             overlaps.append(Overlap(Integration(signals, clock.rate_hz, mapping.acceleration.high_pass_hz)))

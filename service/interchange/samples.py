@@ -72,14 +72,16 @@ class Read:
 
     Attributes
     ----------
+    files : int
     rows : int
-        Rows of the file.
+        Of all files together.
     filled : int
         Rows that were put into short gaps.
     left_out : int
         Rows left out for an empty cell, NaN or infinity.
     """
 
+    files: int = 1
     rows: int = 0
     gaps: list[Gap] = field(default_factory=list)
     filled: int = 0

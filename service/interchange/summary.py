@@ -14,8 +14,9 @@ _LISTED = 10
 def summary_lines(done: Imported) -> list[str]:
     """Describe an import; every gap, filled row, cut end and limit of validity is stated."""
     machine, read, written = done.machine, done.read, done.written
+    several = f"{read.files} files, " if read.files > 1 else ""
     lines = [
-        f"{done.source}: {read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
+        f"{done.source}: {several}{read.rows} rows at {done.clock.rate_hz:.9g} Hz, "
         f"{len(machine.sensors)} channels of {machine.site}/{machine.name}",
         f"{done.recording}: {written.samples} samples in {written.blocks} blocks, {_when(written.start_ns)} to "
         f"{_when(written.end_ns)}",
@@ -37,7 +38,10 @@ def summary_lines(done: Imported) -> list[str]:
 
 
 def _gap_lines(done: Imported) -> list[str]:
+    schedule = done.machine.schedule
     gaps = done.read.gaps
+    if schedule is not None:
+        gaps = [gap for gap in gaps if not schedule.is_silence((gap.to_ns - gap.from_ns) / 1e9)]
     total_s = sum(gap.to_ns - gap.from_ns for gap in gaps) / 1e9
     lines = [f"gaps: {len(gaps)}, {total_s:.6g} s in all, kept as gaps" if gaps else "gaps: none"]
     lines += [f"  {_gap_text(done, gap)}" for gap in gaps[:_LISTED]]

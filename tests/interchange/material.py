@@ -66,7 +66,7 @@ def stretches(recording: Path, described: MachineFile | None = None) -> list[Str
         assert message.log_time_ns == block.end_ns
         verdict = gate.judge(block, schema_hash)
         assert verdict.accepted, verdict.text
-        if not found or not verdict.continuous:
+        if not found or verdict.new_snapshot or not verdict.continuous:
             found.append((block.start_ns, []))
         found[-1][1].append(np.asarray(block.samples, dtype=np.float64))
     return [Stretch(start_ns, np.concatenate(blocks)) for start_ns, blocks in found]

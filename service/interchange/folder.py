@@ -1,0 +1,157 @@
+"""A folder of files, each a snapshot or a stretch of one: in the order of their times, as if they were one file."""
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from models.machine import MachineFile
+from service.interchange.clock import Clock, clock_for
+from service.interchange.formats import format_of, open_source
+from service.interchange.mapping import Mapping
+from service.interchange.samples import Gap, Piece, Read, pieces, signals_of
+from service.interchange.source import SourceError
+
+_DATE = re.compile(
+    r"(?<!\d)(\d{4})[-_. ]?(\d{2})[-_. ]?(\d{2})"  # day
+    r"[-_. T]*(\d{2})[-_.:h ]?(\d{2})(?:[-_.:m ]?(\d{2})(?:[.,_-](\d{1,9}))?)?(?!\d)"  # time of day
+)
+_UNIX = re.compile(r"(?<!\d)(\d{10})(\d{3}|\d{6}|\d{9})?(?!\d)")
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotFile:
+    """A file of a folder.
+
+    Attributes
+    ----------
+    start_ns : int or None
+        Time of its first row, nanoseconds since 1970-01-01 UTC, where its name or its place among the others tells;
+        None where the file itself does.
+    """
+
+    path: Path
+    start_ns: int | None
+
+
+def time_in_name(name: str) -> int | None:
+    """Time that the name of a file holds, UTC: a date with a time of day, or seconds and so on since 1970.
+
+    Examples
+    --------
+    >>> time_in_name("2003.10.22.12.06.24")
+    1066824384000000000
+    >>> time_in_name("pump7_20260131T120000.250.csv")
+    1769860800250000000
+    >>> time_in_name("acc_00017.csv") is None
+    True
+    """
+    found = _DATE.search(name)
+    if found is not None:
+        fields = [int(part) for part in found.groups("0")[:6]]
+        try:
+            seconds = int(datetime(*fields, tzinfo=UTC).timestamp())  # type: ignore[arg-type, misc]  # six of them
+        except ValueError:  # digits that are no date
+            return None
+        return seconds * 10**9 + int((found.group(7) or "0").ljust(9, "0"))
+    since = _UNIX.search(name)
+    if since is None:
+        return None
+    return int(since.group(1)) * 10**9 + int((since.group(2) or "0").ljust(9, "0"))
+
+
+def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tuple[SnapshotFile, ...]:
+    """Files of a folder in the order of their times, or of the numbers in their names.
+
+    Their times are counted from ``time.start`` of the mapping by the machine's schedule, or are in their names, or in
+    the files. Files of formats that are not known are left out, unless the mapping says the format.
+
+    Raises
+    ------
+    SourceError
+        If there is none, or a start is given and no schedule.
+    """
+    paths = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
+    paths = sorted((path for path in paths if format_of(path, mapping) is not None), key=_natural)
+    if not paths:
+        raise SourceError(f"{folder}: no file of a known format in it; say format = ... in the mapping")
+    base, schedule = mapping.time, machine.schedule
+    if base.is_datetime or base.start == "unix":
+        return tuple(SnapshotFile(path, None) for path in paths)
+    if base.start_ns is not None:
+        if schedule is None:
+            raise SourceError(
+                f"{folder}: time.start is that of the first file; expected [schedule] every_s in the machine file, "
+                "from which the times of the others follow"
+            )
+        period_ns = round(schedule.every_s * 1e9)
+        return tuple(SnapshotFile(path, base.start_ns + number * period_ns) for number, path in enumerate(paths))
+    files = [SnapshotFile(path, time_in_name(path.name)) for path in paths]
+    return tuple(sorted(files, key=lambda one: one.start_ns or 0))  # those without a time keep their order
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    """Key that sorts 2 before 10."""
+    return [(int(part) if part.isdigit() else -1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def joined(
+    begun: Iterator[Piece],
+    files: Sequence[SnapshotFile],
+    first: Clock,
+    mapping: Mapping,
+    machine: MachineFile,
+    read: Read,
+) -> Iterator[Piece]:
+    """Pieces of a first file, and then those of others, on its clock.
+
+    Parameters
+    ----------
+    begun : iterator of Piece
+        Of the first file.
+    files : sequence of SnapshotFile
+        The others.
+    first : Clock
+        Of the first file.
+    read : Read
+        What was met, all files together; is kept up to date.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be used, has another rate, or begins before the one before it has ended.
+    """
+    end_ns, before, step_ns = 0.0, first.path, 1e9 / first.rate_hz
+    for piece in begun:
+        end_ns = float(piece.time_ns[-1]) + step_ns
+        yield piece
+    for file in files:
+        own = Read()
+        with open_source(file.path, mapping) as source:
+            signals = signals_of(source, mapping, machine)
+            clock = clock_for(source, [one.reference for one in signals], mapping.time, machine, file.start_ns)
+            if clock.ratio != first.ratio:
+                raise SourceError(
+                    f"{file.path}: has {clock.rate_hz:.9g} samples per second, {first.path.name} has "
+                    f"{first.rate_hz:.9g}; expected the same in all files of a folder"
+                )
+            offset_ns = float(clock.origin_ns - first.origin_ns)
+            if offset_ns < end_ns - step_ns / 2:
+                raise SourceError(
+                    f"{file.path}: begins {(end_ns - offset_ns) / 1e9:.6g} s before the end of {before.name}, expected "
+                    "the files of a folder one after the other"
+                )
+            if offset_ns > end_ns + step_ns / 2:
+                read.gaps.append(Gap(end_ns, offset_ns, 0))
+            for piece in pieces(source, signals, clock, mapping, own):
+                time_ns = piece.time_ns + offset_ns
+                goes_on = abs(time_ns[0] - end_ns) <= step_ns / 2
+                end_ns = float(time_ns[-1]) + step_ns
+                yield replace(piece, time_ns=time_ns, begins=piece.begins and not goes_on)
+        before = file.path
+        read.files += 1
+        read.rows += own.rows
+        read.filled += own.filled
+        read.left_out += own.left_out
+        read.gaps += [replace(gap, from_ns=gap.from_ns + offset_ns, to_ns=gap.to_ns + offset_ns) for gap in own.gaps]

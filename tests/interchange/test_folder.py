@@ -1,0 +1,102 @@
+"""A folder of snapshot files comes in as one recording, in the order of the files' times."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.interchange.source import SourceError
+from service.interchange.summary import summary_lines
+from tests.interchange.material import RATE_HZ, START_NS, imported, machine, signals, stretches
+
+ON_S, EVERY_S, FILES = 2.0, 20.0, 12
+COUNT = round(ON_S * RATE_HZ)
+KIT = machine(schedule={"on_s": ON_S, "every_s": EVERY_S}, window={}, ingest={})
+BEGIN = datetime(2026, 1, 31, 12, tzinfo=UTC)
+NAMED = """
+[time]
+rate_hz = 2000.0
+
+[channels]
+y1 = { column = "x", unit = "um" }
+y1_dot = { column = "v", unit = "mm/s" }
+theta = { column = "a", unit = "rad" }
+"""
+NUMBERED = NAMED.replace("rate_hz", 'start = "2026-01-31T12:00:00Z"\nrate_hz')
+DATED = NAMED.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"\nstart = "unix"')
+WITH_PULSES = f"{NAMED}\n[keyphasor]\npulse_times = 'a'\n".replace("theta =", "# =")
+_TIME, *_COLUMNS = signals(COUNT * FILES)
+
+
+def by_date(number: int) -> str:
+    return f"pump {BEGIN + timedelta(seconds=number * EVERY_S):%Y-%m-%d %H.%M.%S}.npz"
+
+
+def by_number(number: int) -> str:
+    return f"acc_{number + 1}.npz"  # acc_10 comes before acc_2 in the alphabet
+
+
+def write(folder: Path, name: Callable[[int], str], numbers: range = range(FILES), every_s: float = EVERY_S) -> Path:
+    """Snapshots of one motion, the newest written first."""
+    folder.mkdir()
+    (folder / "notes.docx").write_bytes(b"not a measurement")
+    for number in reversed(numbers):
+        rows = slice(number * COUNT, (number + 1) * COUNT)
+        x, v, a = (column[rows] for column in _COLUMNS)
+        t = START_NS + round(number * every_s * 1e9) + np.arange(COUNT) * 500_000
+        np.savez(folder / name(number), x=x, v=v, a=a, t=t)
+    return folder
+
+
+@pytest.mark.parametrize(("name", "mapping"), [(by_date, NAMED), (by_number, NUMBERED), (by_number, DATED)])
+def test_snapshots_come_in_with_their_times_and_none_is_lost(
+    tmp_path: Path, name: Callable[[int], str], mapping: str
+) -> None:
+    done, recording = imported(tmp_path, write(tmp_path / "files", name), mapping, KIT)
+    found = stretches(recording, KIT)
+    assert [one.start_ns for one in found] == [START_NS + round(n * EVERY_S * 1e9) for n in range(FILES)]
+    np.testing.assert_allclose(np.concatenate([one.samples[:, 0] for one in found]), _COLUMNS[0], atol=1e-9)
+    assert (done.read.files, done.read.rows) == (FILES, FILES * COUNT)
+    told = "\n".join(summary_lines(done))
+    assert f"files: {FILES} files, {FILES * COUNT} rows at 2000 Hz" in told
+    assert "gaps: none" in told
+
+
+def test_a_snapshot_that_is_missing_is_told(tmp_path: Path) -> None:
+    folder = write(tmp_path / "files", by_date)
+    (folder / by_date(5)).unlink()
+    done, _ = imported(tmp_path, folder, NAMED, KIT)
+    told = "\n".join(summary_lines(done))
+    assert "gaps: 1, 38 s in all" in told
+
+
+def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
+    folder = write(tmp_path / "files", by_number, range(4), ON_S)
+    _, recording = imported(tmp_path, folder, DATED)
+    (found,) = stretches(recording)
+    np.testing.assert_allclose(found.samples[:, 0], _COLUMNS[0][: 4 * COUNT], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("mapping", "every_s", "says"),
+    [
+        (NAMED, EVERY_S, "acc_1.npz: nothing tells when the first row was sampled"),
+        (DATED, 1.0, "acc_2.npz: begins 1 s before the end of acc_1.npz"),
+        (WITH_PULSES, EVERY_S, "cannot be used with a folder"),
+        (f'format = "tdms"\n{NAMED}', EVERY_S, "not a TDMS file, or damaged"),
+    ],
+)
+def test_what_is_wrong_with_a_folder_is_told(tmp_path: Path, mapping: str, every_s: float, says: str) -> None:
+    folder = write(tmp_path / "files", by_number, range(3), every_s)
+    with pytest.raises(SourceError, match=says):
+        imported(tmp_path, folder, mapping, KIT)
+
+
+def test_a_start_alone_needs_a_schedule_and_a_folder_needs_files(tmp_path: Path) -> None:
+    with pytest.raises(SourceError, match=r"time\.start is that of the first file; expected \[schedule\] every_s"):
+        imported(tmp_path, write(tmp_path / "files", by_number, range(3)), NUMBERED)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(SourceError, match="empty: no file of a known format in it"):
+        imported(tmp_path, tmp_path / "empty", NAMED)
