@@ -42,8 +42,6 @@ class Plan:
     # Measured state variables (``y1`` … ``phi_dot``), then accelerations (``y1_ddot`` …), in the order of the
     # statistics' columns.
     states: tuple[str, ...]
-    # What each column of `states` is as mounted: `states` themselves, but for sensors at an angle (``bearing@45``).
-    mounted: tuple[str, ...]
     # Column of the stream, and factor to SI, for each of `states` and then for channels at other places, of which only
     # levels are taken.
     columns: npt.NDArray[np.intp]
@@ -65,7 +63,10 @@ class Plan:
     speed_rad_s: float | None = None
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
     levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
-    turn: FloatArray | None = None  # (n, n), states = turn @ mounted; None where no sensor is at an angle
+    # Where sensors are at an angle: what each column of `states` is as mounted (``bearing@45``), and the matrix that
+    # turns those, shape (n, n), states = turn @ mounted.
+    angled: tuple[str, ...] = ()
+    turn: FloatArray | None = None
 
     @property
     def need(self) -> int:
@@ -96,6 +97,11 @@ class Plan:
     def frequencies_hz(self) -> FloatArray:
         """Frequencies of the kept bins."""
         return np.asarray(self.bins * (self.rate_hz / self.segment), dtype=np.float64)
+
+    @property
+    def mounted(self) -> tuple[str, ...]:
+        """What each column of `states` is as mounted."""
+        return self.states if self.turn is None else self.angled
 
     @property
     def pairs(self) -> tuple[MotionPair, ...]:
@@ -159,7 +165,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
         levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm)) if levels else None,
-        mounted=tuple(state_name(one) for one in channels[: len(states)]),
+        angled=tuple(state_name(one) for one in channels[: len(states)]),
         turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),
     )
 

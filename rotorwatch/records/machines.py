@@ -61,7 +61,18 @@ class MachineDescription(BaseModel):
     rate_hz: float = Field(description="samples per second and channel", examples=[2000.0])
     channels: tuple[Channel, ...] = Field(
         description="columns of the stream",
-        examples=[({"name": "y1", "quantity": "displacement", "location": "bearing", "direction": "y", "unit": "um"},)],
+        examples=[
+            (
+                {
+                    "name": "y1",
+                    "quantity": "displacement",
+                    "location": "bearing",
+                    "direction": "y",
+                    "unit": "um",
+                    "angle_deg": None,
+                },
+            )
+        ],
     )
     window_length_s: float = Field(description="length of the sliding window", examples=[60.0])
     window_hop_s: float = Field(description="data time between reports", examples=[5.0])

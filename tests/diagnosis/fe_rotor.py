@@ -179,7 +179,6 @@ def plan(
     return Plan(
         rate_hz=RATE_HZ,
         states=states,
-        mounted=states,
         columns=np.array([COLUMNS.index(name) for name in states]),
         scales=np.ones(len(states)),
         angle_column=len(COLUMNS) if speed_rad_s is None else None,

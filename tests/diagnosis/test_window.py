@@ -25,7 +25,6 @@ def small_plan(*, angle: bool = True, hops: int = 4) -> Plan:
     return Plan(
         rate_hz=RATE,
         states=("y1", "y1_dot"),
-        mounted=("y1", "y1_dot"),
         columns=np.array([0, 1]),
         scales=np.array([1.0, 1.0]),
         angle_column=2 if angle else None,
@@ -132,7 +131,6 @@ def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -
     plan = Plan(
         rate_hz=1e4,
         states=("y1", "y1_dot"),
-        mounted=("y1", "y1_dot"),
         columns=np.array([0, 1]),
         scales=np.ones(2),
         angle_column=None,

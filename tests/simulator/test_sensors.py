@@ -32,7 +32,7 @@ def _bank(
     machine: Machine, sensors: Sensors, faults: dict[str, list[tuple[int, SensorFaults]]] | None = None
 ) -> SensorBank:
     rngs = [np.random.default_rng(seed) for seed in range(len(machine.sensors))]
-    return SensorBank(machine, sensors, np.full(12, 1e-5), faults or {}, rngs)
+    return SensorBank(machine, sensors, np.eye(12) * 1e-10, faults or {}, rngs)
 
 
 def _plant(n_samples: int = 50) -> PlantSamples:
