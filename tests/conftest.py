@@ -7,9 +7,12 @@ import os
 import signal
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
+import httpx
 import hypothesis
 import pytest
 import structlog
@@ -33,6 +36,38 @@ structlog.configure(
         structlog.dev.ConsoleRenderer(colors=False, exception_formatter=structlog.dev.plain_traceback),
     ]
 )
+# A client reads all the certificates this computer trusts, 20 ms of computing, before it knows that it asks over HTTP.
+httpx._transports.default.create_ssl_context = cache(httpx.create_ssl_context)  # type: ignore[attr-defined]
+
+_LONGEST = (
+    "test_window_again",
+    "test_commission_cli",
+    "test_demo",
+    "test_training",
+    "test_conditions",
+    "test_restart",
+    "test_interleaving",
+    "test_commission_page",
+    "test_scenarios",
+    "test_http_campaign",
+    "test_late_joiner",
+    "test_wire_fuzz",
+    "test_tutorial",
+    "test_pins",
+    "test_survives",
+    "test_paper_training",
+    "test_correlation_theory",
+    "test_replay_identity",
+)
+"""Modules that take long for the number of their tests, longest first."""
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put first what takes longest, so that nobody waits for it alone at the end; then the modules with many tests."""
+    tests = Counter(item.path for item in items)
+    ranks = {name: rank for rank, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: (ranks.get(item.path.stem, len(ranks)), -tests[item.path]))
 
 
 @pytest.fixture(autouse=True, scope="session")

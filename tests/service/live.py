@@ -68,10 +68,11 @@ when it is busy."""
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> None:
     """Wait for a condition; a deadline ends a wait that would be in vain."""
-    deadline = time.monotonic() + timeout_s
+    deadline, pause_s = time.monotonic() + timeout_s, 0.005
     while not condition():
         assert time.monotonic() < deadline, f"no {what} within {timeout_s} s"
-        time.sleep(0.01)
+        time.sleep(pause_s)
+        pause_s = min(1.2 * pause_s, 0.05)  # what is asked over HTTP keeps two programs busy
 
 
 def until_subscribed(session: zenoh.Session, key: str) -> None:
