@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from models.errors import MachineFileError, RotorwatchError
+from models.levels.measures import level_plan
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, turned_pairs
 from service.analysis.recorded import Recorded
@@ -15,6 +16,8 @@ from service.analysis.revolutions import Excerpt, newest_revolutions, pulses
 from service.analysis.vectors import vectors_of
 
 _Value = TypeVar("_Value", np.float64, np.complex128)
+MODELLED = ("bearing", "disc")
+"""Places of the model of the rotor."""
 _UM = 1e6
 _LONGEST_S = 3600.0
 _AT_1X = 1
@@ -137,15 +140,12 @@ class Orbits:
 
 
 def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
-    """Displacements in y and z, or at an angle and to be turned to them, at each place where both are measured."""
+    """Displacements in y and z, or at an angle and to be turned to them, at each place; those of the model first."""
     known = [one for one in channels if one.quantity is Quantity.DISPLACEMENT]
-    angled = {known[first].location: (known[first], known[second]) for first, second in turned_pairs(known)}
-    found = {(one.location, one.direction): one for one in known if one.angle_deg is None}
-    return [
-        angled.get(place) or (found[place, "y"], found[place, "z"])
-        for place in ("bearing", "disc")
-        if place in angled or ((place, "y") in found and (place, "z") in found)
-    ]
+    turned = {known[first].location: (known[first], known[second]) for first, second in turned_pairs(known)}
+    pairs = [(known[first], known[second]) for first, second in level_plan(known, 1.0, (0.0, 1.0)).pairs]
+    pairs = [turned.get(pair[0].location, pair) for pair in pairs]
+    return sorted(pairs, key=lambda pair: MODELLED.index(pair[0].location) if pair[0].location in MODELLED else 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +178,46 @@ def planes_of(pair: tuple[Channel, Channel]) -> Planes:
     return Planes((f"y of {both}", f"z of {both}"), np.linalg.inv(seen))
 
 
+def in_planes(samples: FloatArray, pairs: Iterable[tuple[Channel, Channel]]) -> tuple[FloatArray, FloatArray]:
+    """Motion in y and in z, µm, shape (n_samples, n_pairs) each.
+
+    Parameters
+    ----------
+    samples : ndarray, shape (n_samples, 2 n_pairs)
+        Of the channels of `pairs`, one pair after the other.
+    """
+    found = [
+        planes_of(pair).turned(samples[:, 2 * at : 2 * at + 2].T * _UM * np.array([[one.to_si] for one in pair]))
+        for at, pair in enumerate(pairs)
+    ]
+    y, z = np.stack(found, axis=-1)
+    return y, z
+
+
 def no_pair(channels: Iterable[Channel]) -> str:
     """What is said where `orbit_pairs` finds none."""
     there = ", ".join(channel.name for channel in channels if channel.quantity is Quantity.DISPLACEMENT) or "none"
     return f"an orbit needs the displacements in y and z at one place; measured displacements: {there}"
+
+
+def recorded_pairs(data: Recorded, place: str | None = None) -> list[tuple[Channel, Channel]]:
+    """Pairs of the recorded channels, all or those at one place.
+
+    Raises
+    ------
+    MachineFileError
+        If there are none.
+    """
+    pairs = orbit_pairs(data.descriptor.channels)
+    if not pairs:
+        raise MachineFileError(f"{data.place}, {data.name}: {no_pair(data.descriptor.channels)}")
+    there = [pair[0].location for pair in pairs]
+    if place is not None and place not in there:
+        raise MachineFileError(
+            f"--place is {place!r}, where {data.name} has no displacements in y and z; expected one of "
+            f"{', '.join(there)}"
+        )
+    return [pair for pair in pairs if place in (None, pair[0].location)]
 
 
 def read_orbits(data: Recorded, revolutions: int) -> Orbits:
@@ -199,9 +235,7 @@ def read_orbits(data: Recorded, revolutions: int) -> Orbits:
             f"{data.place}: {data.name} has no channel with the shaft angle (keyphasor), and an orbit is seen "
             "against it"
         )
-    pairs = orbit_pairs(data.descriptor.channels)
-    if not pairs:
-        raise MachineFileError(f"{data.place}, {data.name}: {no_pair(data.descriptor.channels)}")
+    pairs = recorded_pairs(data)
     channels = [channel for pair in pairs for channel in pair]
     length_s = 2.0
     while True:

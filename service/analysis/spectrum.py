@@ -1,5 +1,6 @@
 """Spectra of a recorded data: of its latest seconds, and over time or speed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,12 +11,14 @@ from scipy.signal import welch
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
+from service.analysis.orbit import in_planes
 from service.analysis.recorded import Recorded, begins_again
 from service.analysis.revolutions import Excerpt
 
 _MOST_SPECTRA = 400
 _MOST_SPEEDS = 120
 _STEADY = 0.02
+_STANDS_HZ = 0.5
 _NYQUIST_OVER_SHOWN = 1.28
 """Analysers show spectra up to the sampling rate over 2.56."""
 
@@ -36,13 +39,18 @@ _HIGHEST_ORDER = 4
 _ROUND = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 
 
+def unit_shown(channel: Channel) -> tuple[str, float]:
+    """Unit in which values of a channel are shown, and the factor from its own."""
+    return _SHOWN.get(channel.unit, (channel.unit, 1.0))
+
+
 def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
     """How values of a spectrum are stated, and the factor on a peak amplitude or a density in the channel's unit.
 
     Amplitudes of displacement and tilt are peak to peak (ISO 20816-1: S_p-p), those of velocity, tilt rate and
     acceleration root mean square.
     """
-    unit, factor = _SHOWN.get(channel.unit, (channel.unit, 1.0))
+    unit, factor = unit_shown(channel)
     if scaling == "density":
         return (f"({unit})²/Hz" if "/" in unit or "²" in unit else f"{unit}²/Hz"), factor**2
     if channel.quantity in _SWINGS:
@@ -88,6 +96,43 @@ class Spectrum:
 
 
 @dataclass(frozen=True, slots=True)
+class FullSpectrum:
+    """Circles that add up to the motion of the shaft at some places.
+
+    y + jz is a sum of F e^{jωt}, which goes round from y to z, and R e^{-jωt}, which goes from z to y: the one with the
+    rotation is forward precession, the other reverse. Together they make an ellipse with the axes 2(|F| + |R|) and
+    2||F| - |R|| (D. E. Bently, C. T. Hatch, "Fundamentals of Rotating Machinery Diagnostics", full spectrum).
+
+    Attributes
+    ----------
+    lines : ndarray, shape (n_lines,)
+        Frequencies, Hz, or orders: positive ones are forward, or from y to z where the rotation is not known.
+    values_um : ndarray, shape (n_pairs, n_lines)
+        Diameter of each circle: peak to peak.
+    speed_rad_s : float
+        Mean speed; nan without a shaft angle.
+    """
+
+    start_ns: int
+    end_ns: int
+    pairs: tuple[tuple[Channel, Channel], ...]
+    lines: FloatArray
+    values_um: FloatArray
+    orders: bool
+    resolution: float
+    averages: int
+    speed_rad_s: float
+
+    @property
+    def useful(self) -> float:
+        """Up to which line, on either side, there is something to be seen."""
+        ahead = self.lines[self.lines >= 0]
+        both = [np.hypot(*(np.interp(one, self.lines, row) for one in (ahead, -ahead))) for row in self.values_um]
+        speed_rad_s = 2 * np.pi if self.orders else self.speed_rad_s
+        return max(_useful_hz(ahead, one, "amplitude", speed_rad_s) for one in both)
+
+
+@dataclass(frozen=True, slots=True)
 class Waterfall:
     """Spectra of one channel, one after the other.
 
@@ -130,12 +175,9 @@ class Waterfall:
         speed = np.abs(self.speed_rad_s)
         if not np.isfinite(speed).all():
             raise RotorwatchError("--axis speed needs the shaft angle (keyphasor), which is not measured")
+        if text := steady(speed):
+            raise RotorwatchError(f"--axis speed needs a run-up or coast-down: {text}; --axis time shows it")
         slowest, fastest = float(speed.min()), float(speed.max())
-        if fastest - slowest < _STEADY * max(fastest, 1e-9):
-            raise RotorwatchError(
-                f"--axis speed needs a run-up or coast-down: the speed stays between {slowest * 30 / np.pi:.4g} and "
-                f"{fastest * 30 / np.pi:.4g} rpm; --axis time shows it"
-            )
         count = min(_MOST_SPEEDS, max(2, speed.size // 2))
         edges = np.linspace(slowest, fastest, count + 1)
         place = np.clip(np.searchsorted(edges, speed, side="right") - 1, 0, count - 1)
@@ -145,6 +187,14 @@ class Waterfall:
                 of = self.values[place == number]
                 mean[number] = of.mean(axis=0) if self.scaling == "density" else np.sqrt(np.mean(of**2, axis=0))
         return edges, mean
+
+
+def steady(speed_rad_s: FloatArray) -> str:
+    """What is said of speeds that are nearly the same; nothing if they are not."""
+    slowest, fastest = (float(one(np.abs(speed_rad_s))) for one in (np.min, np.max))
+    if fastest - slowest >= _STEADY * max(fastest, 1e-9):
+        return ""
+    return f"the speed stays between {slowest * 30 / np.pi:.4g} and {fastest * 30 / np.pi:.4g} rpm"
 
 
 def read_spectrum(
@@ -160,20 +210,11 @@ def read_spectrum(
         If there is no stretch so long without a gap.
     """
     segment = _segment(data, window_s, resolution_hz)
-    found = data.latest(channels, window_s)
-    used = [stretch for stretch in found if stretch.samples.shape[0] >= segment]
-    if not used:
-        longest_s = max((stretch.length_s for stretch in found), default=0.0)
-        raise RotorwatchError(
-            f"{data.place}: a spectrum with --resolution {resolution_hz:g} Hz needs {1 / resolution_hz:g} s without "
-            f"a gap, the longest stretch of {data.name} in the last {window_s:g} s is {longest_s:.3g} s"
-        )
+    used, speed_rad_s = _used(data, channels, window_s, segment)
     total, averages = np.zeros((len(channels), segment // 2 + 1)), 0
     for stretch in used:
-        power, count = summed_power(stretch, segment, scaling)
+        power, count = summed_power(stretch.samples, stretch.rate_hz, segment, scaling)
         total, averages = total + power, averages + count
-    lengths = np.array([stretch.length_s for stretch in used])
-    speeds = np.array([stretch.speed_rad_s for stretch in used])
     rate_hz = data.descriptor.rate_hz
     return Spectrum(
         start_ns=used[0].start_ns,
@@ -184,8 +225,88 @@ def read_spectrum(
         scaling=scaling,
         resolution_hz=rate_hz / segment,
         averages=averages,
-        speed_rad_s=float(np.sum(speeds * lengths) / np.sum(lengths)),
+        speed_rad_s=speed_rad_s,
     )
+
+
+def _used(data: Recorded, channels: Sequence[Channel], window_s: float, segment: int) -> tuple[list[Excerpt], float]:
+    """Stretches of the latest `window_s` that hold a segment, and their mean speed."""
+    found = data.latest(channels, window_s)
+    used = [stretch for stretch in found if stretch.samples.shape[0] >= segment]
+    if not used:
+        longest_s = max((stretch.length_s for stretch in found), default=0.0)
+        needed_s = segment / data.descriptor.rate_hz
+        raise RotorwatchError(
+            f"{data.place}: a spectrum with --resolution {1 / needed_s:g} Hz needs {needed_s:g} s without a gap, the "
+            f"longest stretch of {data.name} in the last {window_s:g} s is {longest_s:.3g} s"
+        )
+    lengths = np.array([stretch.length_s for stretch in used])
+    speeds = np.array([stretch.speed_rad_s for stretch in used])
+    return used, float(np.sum(speeds * lengths) / np.sum(lengths))
+
+
+def read_full_spectrum(
+    data: Recorded, pairs: Sequence[tuple[Channel, Channel]], window_s: float, resolution_hz: float, *, orders: bool
+) -> FullSpectrum:
+    """Full spectra of the latest `window_s` that were recorded; segments never reach across a gap.
+
+    Parameters
+    ----------
+    orders : bool
+        Over multiples of running speed: samples are taken anew at equal angles of the shaft, so that a speed that
+        changes does not smear the lines.
+
+    Raises
+    ------
+    MachineFileError
+        If the window is shorter than one segment, or `orders` are asked for without a shaft angle.
+    RotorwatchError
+        If there is no stretch so long without a gap, or the shaft does not turn.
+    """
+    if orders and not data.has_angle:
+        raise MachineFileError(f"{data.place}: --axis orders needs the shaft angle (keyphasor), which is not measured")
+    segment = _segment(data, window_s, resolution_hz)
+    used, speed_rad_s = _used(data, [channel for pair in pairs for channel in pair], window_s, segment)
+    start_ns, end_ns = used[0].start_ns, used[-1].end_ns
+    if orders:
+        turns_hz = abs(speed_rad_s) / (2 * np.pi)
+        if turns_hz < _STANDS_HZ:
+            raise RotorwatchError(f"{data.place}: --axis orders needs a shaft that turns, and it stands still")
+        each = int(np.ceil(data.descriptor.rate_hz / turns_hz))
+        used = [_at_equal_angles(stretch, each) for stretch in used]
+        segment = 2 * round(each * max(1, round(turns_hz / resolution_hz)) / 2)
+        used = [stretch for stretch in used if stretch.samples.shape[0] >= segment]
+        if not used:
+            raise RotorwatchError(f"{data.place}: the shaft does not turn {segment / each:.0f} times in any stretch")
+    total, averages = np.zeros((len(pairs), segment)), 0
+    for stretch in used:
+        y, z = in_planes(stretch.samples, pairs)
+        power, count = summed_power(y + 1j * z, stretch.rate_hz, segment, "amplitude")
+        total, averages = total + power, averages + count
+    rate_hz = used[0].rate_hz
+    lines = np.asarray((-1 if speed_rad_s < 0 else 1) * np.fft.fftfreq(segment, 1 / rate_hz), dtype=np.float64)
+    order = np.argsort(lines)
+    return FullSpectrum(
+        start_ns=start_ns,
+        end_ns=end_ns,
+        pairs=tuple(pairs),
+        lines=lines[order],
+        values_um=2 * np.sqrt(total[:, order] / averages),
+        orders=orders,
+        resolution=rate_hz / segment,
+        averages=averages,
+        speed_rad_s=speed_rad_s,
+    )
+
+
+def _at_equal_angles(stretch: Excerpt, each: int) -> Excerpt:
+    """So many samples a revolution, as if they were per second."""
+    assert stretch.angle_rad is not None  # noqa: S101  # it was asked whether there is one
+    turns = np.unwrap(stretch.angle_rad) / (2 * np.pi)
+    turned = np.maximum.accumulate(turns if turns[-1] >= turns[0] else -turns)
+    at = np.arange(np.ceil(turned[0] * each), np.floor(turned[-1] * each) + 1) / each
+    samples = np.stack([np.interp(at, turned, column) for column in stretch.samples.T], axis=1)
+    return Excerpt(stretch.start_ns, float(each), samples, None)
 
 
 def read_waterfall(
@@ -208,7 +329,7 @@ def read_waterfall(
             continue
         while rows and begins_again(rows[-1][1], stretch.start_ns):
             rows.pop()  # of several runs at the same time the one that was recorded last is shown
-        power, count = summed_power(stretch, segment, scaling)
+        power, count = summed_power(stretch.samples, stretch.rate_hz, segment, scaling)
         rows.append(
             (stretch.start_ns, stretch.end_ns, stretch.speed_rad_s, _values(power[0] / count, channel, scaling))
         )
@@ -231,12 +352,14 @@ def read_waterfall(
     )
 
 
-def summed_power(stretch: Excerpt, segment: int, scaling: Scaling) -> tuple[FloatArray, int]:
+def summed_power(
+    samples: npt.NDArray[np.inexact], rate_hz: float, segment: int, scaling: Scaling
+) -> tuple[FloatArray, int]:
     """Power of Hann-windowed segments that overlap by half, each about its mean, summed.
 
     Parameters
     ----------
-    stretch : Excerpt
+    samples : ndarray, shape (n_samples, n_channels)
         At least one segment long.
     segment : int
         Samples of a segment.
@@ -246,22 +369,23 @@ def summed_power(stretch: Excerpt, segment: int, scaling: Scaling) -> tuple[Floa
     Returns
     -------
     ndarray, shape (n_channels, segment // 2 + 1)
-        Sum over the segments.
+        Sum over the segments; of complex samples, shape (n_channels, segment), in the order of `numpy.fft.fft`.
     int
         How many segments.
     """
     overlap = segment // 2
-    count = (stretch.samples.shape[0] - overlap) // (segment - overlap)
+    count = (samples.shape[0] - overlap) // (segment - overlap)
     _, mean = welch(
-        stretch.samples,
-        stretch.rate_hz,
+        samples,
+        rate_hz,
         window="hann",
         nperseg=segment,
         noverlap=overlap,
         scaling="spectrum" if scaling == "amplitude" else "density",
         axis=0,
     )
-    factor = 2.0 if scaling == "amplitude" else 1.0  # the spectrum is that of rms values
+    # The one-sided spectrum is that of rms values; of complex samples it is two-sided, and that of circles.
+    factor = 2.0 if scaling == "amplitude" and not np.iscomplexobj(samples) else 1.0
     return np.asarray(mean.T * factor * count, dtype=np.float64), count
 
 

@@ -1,16 +1,26 @@
 """Vectors at orders of running speed, and mean positions, of whole revolutions one after the other."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.rotation import rotation_line
+from models.errors import MachineFileError, RotorwatchError
 from models.levels.measures import ORDERS, hop_levels, level_plan
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
+from service.analysis.recorded import Recorded, begins_again
 from service.analysis.revolutions import Excerpt, pulses
+
+_LONGEST_S = 20.0
+_ESTIMATED_S = 2.0
+_STANDS_OUT = 15.0
+"""Times the surroundings: what noise has in 2 s is 3 to 8 times, see `models.diagnosis.rotation`."""
+_FOLLOWS, _FOLLOWS_S = 0.05, 2.5 * _ESTIMATED_S
+"""How far lines of one shaft may be apart, relative and in time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +47,7 @@ class Vectors:
 
 
 def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) -> Vectors:
-    """Vectors of every so many revolutions; fewer at the end are a piece as well.
+    """Vectors of every so many revolutions, as nearly as whole pieces allow.
 
     Parameters
     ----------
@@ -47,7 +57,8 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
     plan = level_plan(channels, excerpt.rate_hz, (0.0, excerpt.rate_hz))
     si = excerpt.samples * np.array([channel.to_si for channel in channels])
     direction, at = pulses(excerpt.angle_rad)
-    edges = np.array([*range(0, at.size - 1, revolutions), at.size - 1] if at.size > 1 else [], dtype=np.int64)
+    whole = max(0, at.size - 1)
+    edges = np.unique(np.linspace(0, whole, max(1, round(whole / revolutions)) + 1).round().astype(np.int64))
     found = []
     for first, last in pairwise(edges):
         rows = slice(int(np.floor(at[first])), int(np.ceil(at[last])) + 1)
@@ -66,3 +77,88 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
         np.array([orders for orders, _ in found], dtype=np.complex128).reshape(-1, len(ORDERS), len(channels)),
         np.array([mean for _, mean in found]).reshape(-1, len(channels)),
     )
+
+
+def read_vectors(data: Recorded, channels: Sequence[Channel], revolutions: int) -> Vectors:
+    """Vectors of everything that was recorded, each of so many revolutions.
+
+    Raises
+    ------
+    MachineFileError
+        If the shaft angle is not measured.
+    RotorwatchError
+        If the shaft does not turn in any stretch.
+    """
+    if not data.has_angle:
+        raise MachineFileError(
+            f"{data.place}: {data.name} has no channel with the shaft angle (keyphasor): without it vibration has no "
+            "phase, and the speed is not known. rotorwatch plot bode --speeds RPM-RPM looks for the speed in the "
+            "vibration, and shows amplitudes"
+        )
+    found = _one_after_the_other(
+        (stretch, vectors_of(stretch, channels, revolutions)) for stretch in data.stretches(channels, _LONGEST_S)
+    )
+    if found is None:
+        raise RotorwatchError(f"{data.place}: the shaft of {data.name} does not turn in this stretch of time")
+    return found
+
+
+def estimated_vectors(data: Recorded, channels: Sequence[Channel], between_rad_s: tuple[float, float]) -> Vectors:
+    """Vectors against an angle that is found in the vibration itself: their phase means nothing.
+
+    Only where the strongest line between two speeds stands out clearly, and follows from the one before or goes on in
+    the next, is it taken for the rotation: random vibration, at a resonance for instance, has no such line. It must be
+    that of 1×.
+
+    Raises
+    ------
+    RotorwatchError
+        If no line stands out.
+    """
+    low, high = between_rad_s
+    found = _one_after_the_other(
+        (stretch, _estimated(stretch, channels, (low + high) / 2, (high - low) / (high + low)))
+        for stretch in data.stretches(channels, _ESTIMATED_S)
+    )
+    if found is not None:
+        near = (np.diff(found.time_ns) < _FOLLOWS_S * 1e9) & (
+            np.abs(np.diff(found.speed_rad_s)) < _FOLLOWS * found.speed_rad_s[1:]
+        )
+        follows = np.append(near, False) | np.insert(near, 0, False)
+        found = Vectors(*(getattr(found, field.name)[follows] for field in fields(Vectors))) if follows.any() else None
+    if found is None:
+        raise RotorwatchError(
+            f"{data.place}: no line between {low * 30 / np.pi:g} and {high * 30 / np.pi:g} rpm stands out of the "
+            f"vibration of {data.name} as that of its rotation would"
+        )
+    return found
+
+
+def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float, tolerance: float) -> Vectors:
+    si = stretch.samples * np.array([channel.to_si for channel in channels])
+    line = rotation_line(si, stretch.rate_hz, speed_rad_s, tolerance)
+    there = line is not None and line.strength > _STANDS_OUT
+    orders, means, speeds = [], [], []
+    if line is not None and there:
+        t_s = np.asarray((np.arange(len(si)) - (len(si) - 1) / 2) / stretch.rate_hz, dtype=np.float64)
+        levels = hop_levels(level_plan(channels, stretch.rate_hz, (0.0, stretch.rate_hz)), si, line.angle(t_s))
+        orders, means, speeds = [levels.orders], [levels.sums[0]], [line.speed_rad_s]
+    return Vectors(
+        np.array([(stretch.start_ns + stretch.end_ns) // 2] * len(speeds), dtype=np.int64),
+        np.array(speeds, dtype=np.float64),
+        np.array([round(stretch.length_s * speed / (2 * np.pi)) for speed in speeds], dtype=np.int64),
+        np.array(orders, dtype=np.complex128).reshape(-1, len(ORDERS), len(channels)),
+        np.array(means).reshape(-1, len(channels)),
+    )
+
+
+def _one_after_the_other(pieces: Iterable[tuple[Excerpt, Vectors]]) -> Vectors | None:
+    found: list[Vectors] = []
+    for stretch, vectors in pieces:
+        while found and begins_again(int(found[-1].time_ns[-1]), stretch.start_ns):
+            found.pop()  # of several runs at the same time the one that was recorded last is shown
+        if vectors.time_ns.size:
+            found.append(vectors)
+    if not found:
+        return None
+    return Vectors(*(np.concatenate([getattr(one, field.name) for one in found]) for field in fields(Vectors)))

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from service.analysis.recorded import Recorded
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
+_SPEEDS = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)")
 _plots = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode="rich")
 
 _AtOption = Annotated[
@@ -32,6 +33,18 @@ _ToHzOption = Annotated[
     typer.Option(
         "--to-hz", metavar="HZ", help="Highest frequency shown. Else as far as there is anything, 4× at least."
     ),
+]
+_ChannelsOption = Annotated[
+    list[str] | None, typer.Option("--channel", metavar="NAME", help="Repeatable; all displacements if left out.")
+]
+_PlaceOption = Annotated[
+    str | None, typer.Option("--place", metavar="NAME", help="Where the probes are; all places if left out.")
+]
+_OrderOption = Annotated[int, typer.Option("--order", min=1, max=3, help="Multiple of running speed: 1, 2 or 3.")]
+_EachOption = Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many each point is taken of.")]
+_SlowRollOption = Annotated[
+    float | None,
+    typer.Option("--slow-roll", metavar="RPM", help="Take away the mean vector up to this speed, which is runout."),
 ]
 
 
@@ -129,7 +142,7 @@ def _kind(paint: Callable[..., "Paint"]) -> None:
     (files, out, *others), (_, *own) = shared.values(), signature(paint).parameters.values()
     options = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in (files, out, *own, *others)]
     command.__signature__ = signature(command).replace(parameters=options)  # type: ignore[attr-defined]  # typer's view
-    _plots.command(paint.__name__, help=paint.__doc__)(command)
+    _plots.command(paint.__name__.replace("_", "-"), help=paint.__doc__)(command)
 
 
 @_kind
@@ -190,9 +203,7 @@ def orbit(
 def spectrum(
     picture: _Picture,
     at: _AtOption = None,
-    channel: Annotated[
-        list[str] | None, typer.Option("--channel", metavar="NAME", help="Repeatable; all displacements if left out.")
-    ] = None,
+    channel: _ChannelsOption = None,
     window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")] = 20.0,
     resolution: _ResolutionOption = 0.5,
     density: _DensityOption = False,
@@ -233,10 +244,111 @@ def waterfall(
     return read(picture.recorded(), channel or (), lines, over_speed=axis == "speed", cascade=cascade)
 
 
+@_kind
+def waveform(
+    picture: _Picture,
+    at: _AtOption = None,
+    channel: _ChannelsOption = None,
+    window: Annotated[
+        float | None, typer.Option("--window", metavar="S", help="Seconds shown; as long as 8 revolutions if left out.")
+    ] = None,
+) -> "Paint":
+    """Samples of channels over time, with the keyphasor's pulses."""
+    from service.analysis.figures.waveform import waveform as read  # noqa: PLC0415
+
+    _positive("--window", window)
+    return read(picture.recorded(at), channel or (), window)
+
+
+@_kind
+def full_spectrum(
+    picture: _Picture,
+    at: _AtOption = None,
+    place: _PlaceOption = None,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")] = 20.0,
+    resolution: _ResolutionOption = 0.5,
+    scale: Annotated[Literal["log", "linear"], typer.Option("--scale", help="Of amplitudes.")] = "linear",
+    to_hz: _ToHzOption = None,
+    axis: Annotated[
+        Literal["hz", "orders"], typer.Option("--axis", help="Frequencies, or multiples of running speed.")
+    ] = "hz",
+) -> "Paint":
+    """Forward and reverse precession of the shaft at a place, from its displacements in y and z."""
+    from service.analysis.figures.full_spectrum import full_spectrum as read  # noqa: PLC0415
+
+    lines = _lines(window, resolution, to_hz, density=False, log=scale == "log")
+    return read(picture.recorded(at), place, lines, orders=axis == "orders")
+
+
+@_kind
+def centreline(
+    picture: _Picture,
+    place: _PlaceOption = None,
+    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds that each mean is of.")] = 1.0,
+    clearance: Annotated[
+        float | None,
+        typer.Option("--clearance", metavar="UM", help="Diametral clearance, µm: its circle, the start at the bottom."),
+    ] = None,
+) -> "Paint":
+    """Mean position of the shaft across the bearing, from gaps in y and z, over speed or time."""
+    from service.analysis.figures.centreline import centreline as read  # noqa: PLC0415
+
+    _positive("--window", window)
+    _positive("--clearance", clearance)
+    return read(picture.recorded(), place, window, clearance)
+
+
+@_kind
+def bode(
+    picture: _Picture,
+    channel: _ChannelsOption = None,
+    order: _OrderOption = 1,
+    revolutions: _EachOption = 16,
+    slow_roll: _SlowRollOption = None,
+    speeds: Annotated[
+        str | None,
+        typer.Option(
+            "--speeds", metavar="RPM-RPM", help="Without a keyphasor: where to look for the speed. There is no phase."
+        ),
+    ] = None,
+) -> "Paint":
+    """Amplitude and phase lag of 1x over the speed, from a run-up or coast-down."""
+    from service.analysis.figures.bode import bode as read  # noqa: PLC0415
+
+    return read(picture.recorded(), channel or (), order, revolutions, slow_roll, _speeds(speeds))
+
+
+@_kind
+def polar(
+    picture: _Picture,
+    channel: _ChannelsOption = None,
+    order: _OrderOption = 1,
+    revolutions: _EachOption = 16,
+    slow_roll: _SlowRollOption = None,
+) -> "Paint":
+    """The same as vectors in their plane, with speeds at points; the lag goes against the rotation."""
+    from service.analysis.figures.bode import polar as read  # noqa: PLC0415
+
+    return read(picture.recorded(), channel or (), order, revolutions, slow_roll)
+
+
 def _lines(window_s: float, resolution_hz: float, to_hz: float | None, *, density: bool, log: bool) -> "Lines":
     from service.analysis.figures.spectrum import Lines  # noqa: PLC0415
 
     for name, number in (("--window", window_s), ("--resolution", resolution_hz), ("--to-hz", to_hz)):
-        if number is not None and not 0 < number < 1e9:
-            raise MachineFileError(f"{name} is {number:g}, expected a number above 0")
+        _positive(name, number)
     return Lines(window_s, resolution_hz, "density" if density else "amplitude", log, to_hz)
+
+
+def _speeds(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    found = _SPEEDS.fullmatch(text)
+    if not found or not 0 < float(found[1]) < float(found[2]):
+        raise MachineFileError(f"--speeds is {text!r}, expected the slowest and the fastest, rpm, such as 600-3000")
+    return float(found[1]), float(found[2])
+
+
+def _positive(name: str, number: float | None) -> None:
+    if number is not None and not 0 < number < 1e9:
+        raise MachineFileError(f"{name} is {number:g}, expected a number above 0")

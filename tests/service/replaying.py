@@ -2,17 +2,24 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from models.alarm_names import STREAM_LOST
 from models.machine import Machine
-from models.signals.block import SampleBlock
+from models.signals.block import FloatArray, SampleBlock
 from models.signals.recording import RecordedMessage, RecordingWriter, read_recording
+from service.analysis.recorded import Recorded
+from service.recordings.replay.source import RecordingSource
 from service.stream.worker import MachineWorker
 from simulator.recorder import record
-from tests.service.live import LAB
+from tests.service.live import LAB, START_NS
+
+NAMES = [channel.name for channel in LAB.sensors]
+S = 10**9
 
 
 def recording(path: Path, stream: Sequence[SampleBlock], machine: Machine = LAB) -> Path:
@@ -62,3 +69,28 @@ def lines_of(worker: MachineWorker) -> list[str]:
 def digest_of(worker: MachineWorker) -> str:
     """SHA-256 of these lines."""
     return hashlib.sha256("".join(line + "\n" for line in lines_of(worker)).encode()).hexdigest()
+
+
+def machine_blocks(
+    signals: dict[str, Callable[[FloatArray], FloatArray]], seconds: float, without: Sequence[int] = ()
+) -> list[SampleBlock]:
+    """Blocks of 0.1 s with these signals, in the units of the channels; some blocks may be missing."""
+    size = round(0.1 * LAB.rate_hz)
+    time_s = np.arange(round(seconds * LAB.rate_hz)) / LAB.rate_hz
+    samples = np.zeros((time_s.size, len(NAMES)))
+    for name, signal in signals.items():
+        samples[:, NAMES.index(name)] = signal(time_s)
+    return [
+        SampleBlock(START_NS + round(k * 0.1 * S), k, 1, LAB.rate_hz, samples[k * size : (k + 1) * size])
+        for k in range(time_s.size // size)
+        if k not in without
+    ]
+
+
+def recorded(path: Path, seconds: tuple[float, float] | None = None) -> Recorded:
+    """What the rotor kit's recording has, all or between two times."""
+    source = RecordingSource([path])
+    from_ns, to_ns = source.start_ns, source.end_ns + 1
+    if seconds is not None:
+        from_ns, to_ns = (START_NS + round(limit * S) for limit in seconds)
+    return Recorded(source, LAB.keys, from_ns, to_ns)

@@ -1,7 +1,6 @@
 """What pictures of recordings show: orbits, spectra, correlations and trends, before anything is drawn."""
 
 import json
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,8 @@ import pytest
 from models.commissioning.commissioned import install
 from models.diagnosis.networks.bundle import load_bundle
 from models.errors import MachineFileError, RotorwatchError
-from models.machine import Machine
 from models.physics.rotor import H_matrix, M_matrix, P_matrix, Q_matrix
-from models.signals.block import FloatArray, SampleBlock
+from models.signals.block import FloatArray
 from models.signals.recording import RecordedMessage
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
@@ -29,34 +27,7 @@ from service.recordings.replay.source import RecordingSource
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import blocks
 from tests.service.live import LAB, START_NS, scenario_blocks
-from tests.service.replaying import recording, write
-
-NAMES = [channel.name for channel in LAB.sensors]
-S = 10**9
-
-
-def machine_blocks(
-    signals: dict[str, Callable[[FloatArray], FloatArray]], seconds: float, without: Sequence[int] = ()
-) -> list[SampleBlock]:
-    """Blocks of 0.1 s with these signals, in the units of the channels; some blocks may be missing."""
-    size = round(0.1 * LAB.rate_hz)
-    time_s = np.arange(round(seconds * LAB.rate_hz)) / LAB.rate_hz
-    samples = np.zeros((time_s.size, len(NAMES)))
-    for name, signal in signals.items():
-        samples[:, NAMES.index(name)] = signal(time_s)
-    return [
-        SampleBlock(START_NS + round(k * 0.1 * S), k, 1, LAB.rate_hz, samples[k * size : (k + 1) * size])
-        for k in range(time_s.size // size)
-        if k not in without
-    ]
-
-
-def stream_of(path: Path, machine: Machine = LAB, seconds: tuple[float, float] | None = None) -> Recorded:
-    source = RecordingSource([path])
-    from_ns, to_ns = source.start_ns, source.end_ns + 1
-    if seconds is not None:
-        from_ns, to_ns = (START_NS + round(limit * S) for limit in seconds)
-    return Recorded(source, machine.keys, from_ns, to_ns)
+from tests.service.replaying import S, machine_blocks, recorded, recording, write
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +57,7 @@ def test_the_orbit_of_a_simulated_unbalance_is_the_ellipse_of_the_equations_of_m
         update={"sources": (), "sensors": type(scenario.sensors)(), "duration_s": 12.0}
     )  # nothing but unbalance
     path = recording(tmp_path / "unbalance.mcap", [block for block, _ in blocks(quiet, machine, start_ns=START_NS)])
-    found = read_orbits(stream_of(path), 8)
+    found = read_orbits(recorded(path), 8)
 
     W, rotor = machine.operation.speed_rad_s, machine.rotor
     H = H_matrix(rotor, W)
@@ -122,7 +93,7 @@ def test_a_shaft_that_turns_backwards(tmp_path: Path) -> None:
             3.0,
         ),
     )
-    found = read_orbits(stream_of(path), 5)
+    found = read_orbits(recorded(path), 5)
     bearing = found.orbits[0]
     assert found.direction == -1
     assert found.speed_rad_s == pytest.approx(-turn, rel=1e-3)
@@ -142,9 +113,9 @@ def test_orbits_need_so_many_revolutions_without_a_gap(tmp_path: Path) -> None:
             {"theta": lambda t: (2 * np.pi * 20.0 * t + 1) % (2 * np.pi), "y1": lambda t: t}, 4.0, without=[34]
         ),
     )
-    assert read_orbits(stream_of(path), 9).revolutions == 9
+    assert read_orbits(recorded(path), 9).revolutions == 9
     with pytest.raises(RotorwatchError, match=r"--revolutions is 10, but only 9 whole revolutions"):
-        read_orbits(stream_of(path), 10)
+        read_orbits(recorded(path), 10)
 
 
 @pytest.mark.parametrize("off_line", [0.0, 0.25, 0.5])
@@ -157,7 +128,7 @@ def test_a_sine_reads_as_its_quantity_is_stated_within_the_scalloping_of_the_win
     path = recording(
         tmp_path / "sine.mcap", machine_blocks({name: lambda t: amplitude * np.sin(2 * np.pi * hz * t) + 900}, 21.0)
     )
-    stream = stream_of(path)
+    stream = recorded(path)
     found = read_spectrum(stream, stream.channels([name]), 20.0, 0.5, "amplitude")
     scalloping = abs(np.sinc(off_line) / (1 - off_line**2))  # of the Hann window
     assert found.values[0].max() == pytest.approx(factor * amplitude * scalloping, rel=1e-3)
@@ -190,7 +161,7 @@ def test_frequencies_and_heights_that_are_shown(tmp_path: Path) -> None:
         "theta": lambda t: (2 * np.pi * 20.0 * t) % (2 * np.pi),
         "y1": lambda t: 3000 * np.sin(0.3 * t) + 10 * np.sin(2 * np.pi * 20.0 * t) + 4 * np.sin(2 * np.pi * 40.0 * t),
     }
-    stream = stream_of(recording(tmp_path / "drift.mcap", machine_blocks(signals, 30.0)))
+    stream = recorded(recording(tmp_path / "drift.mcap", machine_blocks(signals, 30.0)))
     found = read_spectrum(stream, stream.channels(["y1"]), 20.0, 0.5, "amplitude")
     fall = read_waterfall(stream, stream.channels(["y1"])[0], 4.0, 0.5, "amplitude")
     for log in (False, True):
@@ -212,7 +183,7 @@ def test_spectra_do_not_reach_across_gaps(tmp_path: Path) -> None:
     path = recording(
         tmp_path / "step.mcap", machine_blocks({"y1": lambda t: np.where(t > 4.05, 1000.0, 0.0)}, 10.0, without=[40])
     )
-    stream = stream_of(path)
+    stream = recorded(path)
     found = read_spectrum(stream, stream.channels(["y1"]), 10.0, 1.0, "amplitude")
     assert found.values.max() < 1e-9
     assert found.averages == 7 + 10  # 4.0 s and 5.9 s in halves of a second
@@ -235,7 +206,7 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
             without=range(300, 330),
         ),
     )
-    stream = stream_of(path)
+    stream = recorded(path)
     found = read_waterfall(stream, stream.channels(["y1"])[0], 2.0, 0.5, "amplitude")
     assert found.values.shape[0] == 15 + 13  # 3 s are missing, and what is left before the end is no segment
     strongest_hz = found.frequencies_hz[found.values.argmax(axis=1)]
@@ -251,7 +222,7 @@ def test_a_waterfall_follows_a_run_up_over_time_and_speed(tmp_path: Path) -> Non
 
 
 def test_a_speed_axis_needs_a_speed_that_changes(faulty: Path) -> None:
-    stream = stream_of(faulty, seconds=(0, 20))
+    stream = recorded(faulty, seconds=(0, 20))
     found = read_waterfall(stream, stream.displacements[0], 4.0, 0.5, "amplitude")
     assert found.values.shape[0] == 5
     with pytest.raises(RotorwatchError, match=r"the speed stays between 1320 and 1320 rpm"):

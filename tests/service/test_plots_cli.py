@@ -12,16 +12,23 @@ from typer.testing import CliRunner
 from models.signals.recording import RecordedMessage, read_recording
 from service.rotorwatch import app
 from simulator.recorder import record
-from simulator.scenario import parse_fault
+from simulator.scenario import Event, parse_fault
 from tests.service.live import LAB, ROOT, START_NS, scenario_blocks
 from tests.service.replaying import recording, write
 
-KINDS = ["trend", "correlation", "orbit", "spectrum", "waterfall"]
+KINDS = ["trend", "correlation", "orbit", "spectrum", "waterfall", "waveform", "full-spectrum", "centreline", "polar"]
 
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return recording(tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(80.0, parse_fault("c_bz=0.5@0")))
+
+
+@pytest.fixture(scope="module")
+def run_up(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The simulated machine from 900 to 2400 rpm, through its resonances."""
+    ramp = (Event(at_s=0.5, speed_rpm=900.0), Event(at_s=2.0, speed_rpm=2400.0, ramp_s=26.0))
+    return recording(tmp_path_factory.mktemp("plots") / "runup.mcap", scenario_blocks(30.0, *ramp))
 
 
 @pytest.fixture(scope="module")
@@ -64,6 +71,25 @@ def test_every_kind_as_png_and_svg(faulty: Path, tmp_path: Path, kind: str) -> N
     assert sum(1 for _ in root.iter("{http://www.w3.org/2000/svg}path")) > 20
 
 
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("bode", ("--channel", "y2", "--revolutions", "8")),
+        ("bode", ("--order", "2", "--slow-roll", "1000")),
+        ("polar", ("--channel", "y1", "--channel", "z1")),
+        ("centreline", ("--place", "disc", "--clearance", "200", "--window", "0.5")),
+        ("full-spectrum", ("--axis", "orders", "--window", "5", "--scale", "log", "--to-hz", "100")),
+        ("waveform", ("--channel", "y2_dot", "--window", "2.5")),
+    ],
+)
+def test_a_run_up_of_the_simulator(run_up: Path, tmp_path: Path, kind: str, options: tuple[str, ...]) -> None:
+    for out in (tmp_path / "one.png", tmp_path / "other.png"):
+        code, said = run(kind, run_up, "--from", "1", *options, "--out", out, "--size", "8x6", "--dpi", "50")
+        assert (code, said.strip()) == (0, str(out)), said
+    assert pixels(tmp_path / "one.png") == (400, 300)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "other.png").read_bytes()
+
+
 @pytest.mark.parametrize("suffix", ["png", "svg"])
 def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffix: str) -> None:
     """In another process, with another matplotlibrc."""
@@ -99,6 +125,18 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffi
         (("orbit", "--from", "500"), "nothing was recorded in between"),
         (("orbit", "--from", "79.9", "--revolutions", "9"), "--revolutions is 9, but only"),
         (("orbit", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
+        (("bode",), "a Bode plot needs a run-up or coast-down: the speed stays between 1320 and 1320 rpm"),
+        (("bode", "--order", "4"), "Invalid value for '--order'"),
+        (("bode", "--slow-roll", "500"), "--slow-roll is 500 rpm, but the slowest is 1320 rpm"),
+        (("bode", "--speeds", "fast"), "--speeds is 'fast', expected the slowest and the fastest, rpm"),
+        (("bode", "--speeds", "900-600"), "--speeds is '900-600', expected the slowest and the fastest, rpm"),
+        (("bode", "--speeds", "600-900"), "--speeds: demo/lab measures the shaft angle"),
+        (("polar", "--channel", "theta"), "--channel is 'theta', which is the shaft angle"),
+        (("waveform", "--window", "0"), "--window is 0, expected a number above 0"),
+        (("full-spectrum", "--place", "DE"), "--place is 'DE', where demo/lab has no displacements in y and z"),
+        (("full-spectrum", "--to-hz", "1"), "--to-hz is 1, expected at least four lines"),
+        (("centreline", "--window", "60"), "expected at least 2 for a centreline; a shorter --window may do"),
+        (("centreline", "--clearance", "-1"), "--clearance is -1, expected a number above 0"),
         (("orbit", "--size", "big"), "--size is 'big', expected width x height in inches"),
     ],
 )
@@ -133,8 +171,16 @@ def test_without_a_keyphasor_there_are_spectra_but_no_orbits(without_angle: Path
     assert (code, "has no channel with the shaft angle (keyphasor)" in said) == (2, True)
     code, said = run("waterfall", without_angle, "--axis", "speed", "--window", "2", "--out", tmp_path / "w.png")
     assert (code, "--axis speed needs the shaft angle" in said) == (1, True)
-    for kind in ("spectrum", "waterfall"):
+    for kind in ("bode", "polar"):
+        code, said = run(kind, without_angle, "--out", tmp_path / f"{kind}.png")
+        assert (code, "without it vibration has no phase, and the speed is not known" in said) == (2, True)
+    code, said = run("full-spectrum", without_angle, "--window", "2", "--axis", "orders", "--out", tmp_path / "f.png")
+    assert (code, "--axis orders needs the shaft angle" in said) == (2, True)
+    for kind in ("spectrum", "waterfall", "full-spectrum"):
         code, said = run(kind, without_angle, "--window", "2", "--out", tmp_path / f"{kind}.png")
+        assert code == 0, said
+    for kind in ("waveform", "centreline"):
+        code, said = run(kind, without_angle, "--out", tmp_path / f"{kind}.png")
         assert code == 0, said
 
 

@@ -7,7 +7,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from service.analysis.figures.style import COLOURS, GREY, INK, Look, Paint, heading, rpm, stretch_text
+from service.analysis.figures.style import (
+    COLOURS,
+    GREY,
+    INK,
+    Look,
+    Paint,
+    heading,
+    plane_labels,
+    rotation_text,
+    rpm,
+    stretch_text,
+)
 from service.analysis.orbit import Orbit, Orbits, phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 
@@ -40,12 +51,11 @@ def _paint(found: Orbits, name: str, look: Look) -> Figure:
         ],
         loc="outside lower center",
     )
-    sense = "y to z, counter-clockwise here ↺" if found.direction > 0 else "z to y, clockwise here ↻"
     heading(
         figure,
         look,
         f"{name}: orbits of {found.revolutions} revolutions",
-        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), f"rotation {sense}"),
+        (stretch_text(found.start_ns, found.end_ns), rpm(found.speed_rad_s), rotation_text(found.direction)),
     )
     return figure
 
@@ -87,11 +97,9 @@ def _running_speed(axes: Axes, orbit: Orbit, found: Orbits) -> None:
 def _frame(axes: Axes, orbit: Orbit, lines: list[str]) -> None:
     axes.axhline(0, color=GREY, linewidth=0.6)
     axes.axvline(0, color=GREY, linewidth=0.6)
-    x_label, y_label = (
-        f"{name}, µm" if " of " in name else f"{way}: {name}, µm" for way, name in zip("yz", orbit.names, strict=True)
-    )
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
+    across, up = plane_labels(orbit.names)
+    axes.set_xlabel(f"{across}, µm")
+    axes.set_ylabel(f"{up}, µm")
     axes.text(
         0.02, 0.985, "\n".join(lines), transform=axes.transAxes, ha="left", va="top", fontsize=8, color=INK, zorder=5
     )

@@ -21,7 +21,9 @@ from service.analysis.figures.style import (
     alarm_lines,
     as_dates,
     heading,
+    place_text,
     rpm,
+    speeds_text,
     stretch_text,
     time_axis,
 )
@@ -85,7 +87,7 @@ def paint_spectrum(found: Spectrum, name: str, look: Look, lines: Lines) -> Figu
     frequency = found.frequencies_hz[shown]
     for axes, channel, values in zip(panels, found.channels, found.values[:, shown], strict=True):
         axes.plot(frequency, values, color=COLOURS[0], linewidth=0.9)
-        axes.set_title(f"{channel.name}   {_place(channel)}", fontweight="bold")
+        axes.set_title(f"{channel.name}   {place_text(channel)}", fontweight="bold")
         axes.set_ylabel(shown_as(channel, found.scaling)[0])
         top = float(values.max()) or 1.0
         if lines.log:
@@ -201,15 +203,13 @@ def _cascade(axes: Axes, found: Waterfall, shown: npt.NDArray[np.bool_], *, over
 
 
 def _waterfall_heading(figure: Figure, look: Look, found: Waterfall, name: str) -> None:
-    low, high = float(np.min(np.abs(found.speed_rad_s))), float(np.max(np.abs(found.speed_rad_s)))
-    steady = not np.isfinite(low) or high - low < 0.005 * high
     heading(
         figure,
         look,
-        f"{name}: spectra of {found.channel.name}, {_place(found.channel)}",
+        f"{name}: spectra of {found.channel.name}, {place_text(found.channel)}",
         (
             stretch_text(int(found.start_ns[0]), int(found.end_ns[-1])),
-            rpm(low) if steady else f"{rpm(low)} to {rpm(high)}",
+            speeds_text(found.speed_rad_s),
             f"{found.values.shape[0]} spectra, {found.resolution_hz:.3g} Hz, Hann",
         ),
     )
@@ -265,10 +265,6 @@ def _order_lines(axes: Axes, found: Waterfall, rows: np.ndarray, *, over_speed: 
             f"{order}×", (place[-1], at[-1]), xytext=(4, -3), textcoords="offset points", ha="left", va="top",
             fontsize=9, color="white", annotation_clip=True,
         )  # fmt: skip
-
-
-def _place(channel: Channel) -> str:
-    return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
 
 
 def _shown(found: Spectrum | Waterfall, to_hz: float | None) -> tuple[tuple[float, float], npt.NDArray[np.bool_]]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from models.errors import RotorwatchError
 from models.signals.block import FloatArray
+from models.signals.channels import Channel
 from rotorwatch.records.alarms import AlarmEventData
 from service.recordings.replay.source import clock
 
@@ -35,6 +37,9 @@ STATE_COLOURS = {
 SEVERITY_COLOURS = {"alert": "#E69F00", "danger": "#D55E00"}
 PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 """Behind a text that stands on lines or colours."""
+
+_ROUND = tuple(step * 10.0**power for power in range(-3, 9) for step in (1, 2, 5))
+_MOST_MARKS = 30
 
 _STYLE = {
     "font.size": 9.0,
@@ -121,11 +126,53 @@ def heading(figure: Figure, look: Look, title: str, details: Iterable[str]) -> N
         engine.set(rect=(0.006, 0.006, 0.988, 1 - 0.48 / height - 0.006))
 
 
+def place_text(channel: Channel) -> str:
+    """What a channel measures, and where."""
+    return f"{channel.quantity.replace('_', ' ')}, {channel.location}, {channel.way}"
+
+
+def plane_labels(names: tuple[str, str]) -> tuple[str, str]:
+    """What stands at the axes y and z: sensors in them, or what two others are turned to."""
+    y, z = (name if " of " in name else f"{way}: {name}" for way, name in zip("yz", names, strict=True))
+    return y, z
+
+
+def rotation_text(direction: int) -> str:
+    """Which way the shaft turns, with y to the right and z up."""
+    return "rotation " + ("y to z, counter-clockwise here ↺" if direction > 0 else "z to y, clockwise here ↻")
+
+
 def rpm(speed_rad_s: float) -> str:
     """Speed in words; nothing if it is not known."""
     if not np.isfinite(speed_rad_s):
         return "speed not measured"
     return f"{abs(speed_rad_s) * 30 / np.pi:.0f} rpm"
+
+
+def speeds_text(speed_rad_s: FloatArray) -> str:
+    """From which speed to which."""
+    low, high = float(np.min(np.abs(speed_rad_s))), float(np.max(np.abs(speed_rad_s)))
+    return rpm(low) if not np.isfinite(low) or high - low < 0.005 * high else f"{rpm(low)} to {rpm(high)}"
+
+
+def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> list[int]:
+    """Points of a path to be labelled: the ends, and those near round numbers that are as far from each other.
+
+    Parameters
+    ----------
+    along : ndarray, shape (n,)
+        Numbers on the labels.
+    places : ndarray of complex, shape (n,)
+        Where the points are on the picture.
+    """
+    step = next(one for one in _ROUND if np.ptp(along) / one <= _MOST_MARKS)
+    off = np.abs(along - step * np.round(along / step))
+    passed = [int(at) for at in np.flatnonzero(np.diff(np.floor(along / step)))]
+    chosen: list[int] = []
+    for at in (0, along.size - 1, *(at + int(np.argmin(off[at : at + 2])) for at in passed)):
+        if all(abs(places[at] - places[one]) > apart for one in chosen):
+            chosen.append(at)
+    return chosen
 
 
 def stretch_text(start_ns: int, end_ns: int) -> str:

@@ -13,7 +13,7 @@ from models.physics.rotor import STATE_INDEX, RotorParameters, changed
 from models.signals.block import SampleBlock
 from models.signals.channels import Channel
 from rotorwatch.records.snapshots import OrbitEllipse, OrbitSnapshot, PathSamples, PlaceOrbit, RunningSpeedVector, Units
-from service.analysis.orbit import Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
+from service.analysis.orbit import MODELLED, Ellipse, no_pair, orbit_pairs, phase_lag_deg, planes_of
 from service.analysis.prediction import NO_PARAMETERS, NOTHING_READ, read_changes
 from service.analysis.revolutions import Excerpt, Revolutions, newest_revolutions, no_revolutions
 from service.analysis.snapshots.channels import SnapshotError, figures
@@ -61,7 +61,7 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
         If `revolutions` is negative or too large.
     """
     machine, known, window = subject.machine, subject.known, data.window
-    places = orbit_pairs(machine.sensors)
+    places = [pair for pair in orbit_pairs(machine.sensors) if pair[0].location in MODELLED]
     path = _newest_path(machine, data.blocks, revolutions, None if window is None else window.speed_rad_s)
     changes = read_changes(data.parameters)
     lacking = NO_PARAMETERS if known is None else ""

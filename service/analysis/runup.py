@@ -1,0 +1,121 @@
+"""A run-up or coast-down: vectors at one order over the speed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from models.errors import MachineFileError, RotorwatchError
+from models.levels.measures import ORDERS
+from models.signals.block import FloatArray
+from models.signals.channels import Channel
+from service.analysis.recorded import Recorded
+from service.analysis.spectrum import shown_as, steady
+from service.analysis.vectors import estimated_vectors, read_vectors
+
+
+@dataclass(frozen=True, slots=True)
+class RunUp:
+    """Vectors of some channels, in order of time.
+
+    Attributes
+    ----------
+    time_ns : ndarray of int, shape (n,)
+    speed_rad_s : ndarray, shape (n,)
+        Negative where the shaft turns from z to y.
+    amplitude, lag_deg : ndarray, shape (n, n_channels)
+        In `units`, and 0 to 360°.
+    slow_roll_rpm : float or None
+        The mean vector up to this speed was taken away.
+    estimated : bool
+        Whether the speed was found in the vibration, so that there is no phase.
+    """
+
+    channels: tuple[Channel, ...]
+    units: tuple[str, ...]
+    order: int
+    revolutions: int
+    time_ns: npt.NDArray[np.int64]
+    speed_rad_s: FloatArray
+    amplitude: FloatArray
+    lag_deg: FloatArray
+    slow_roll_rpm: float | None
+    estimated: bool
+
+    @property
+    def direction(self) -> int:
+        """1 if the shaft turns from y to z, -1 if from z to y."""
+        return 1 if np.median(self.speed_rad_s) >= 0 else -1
+
+    def check_speeds(self, what: str) -> None:
+        """Refuse speeds that are all the same.
+
+        Raises
+        ------
+        RotorwatchError
+            Naming them.
+        """
+        if text := steady(self.speed_rad_s):
+            raise RotorwatchError(f"{what} needs a run-up or coast-down: {text}")
+
+
+def read_run_up(
+    data: Recorded,
+    channels: tuple[Channel, ...],
+    order: int,
+    revolutions: int,
+    slow_roll_rpm: float | None = None,
+    between_rpm: tuple[float, float] | None = None,
+) -> RunUp:
+    """Vectors of everything that was recorded.
+
+    Parameters
+    ----------
+    order : int
+        Multiple of running speed: 1, 2 or 3.
+    revolutions : int
+        How many each vector is taken of.
+    slow_roll_rpm : float, optional
+        The mean vector up to this speed is taken away: it is runout, not vibration (API 670, slow-roll compensation).
+    between_rpm : (float, float), optional
+        Where the speed is looked for in the vibration, if there is no shaft angle.
+
+    Raises
+    ------
+    MachineFileError
+        If the shaft angle is not measured, and no speeds are named; or it is, and they are.
+    RotorwatchError
+        If the shaft does not turn, or never as slowly as that.
+    """
+    if between_rpm is not None and data.has_angle:
+        raise MachineFileError(f"--speeds: {data.name} measures the shaft angle, so its speed is known")
+    if between_rpm is not None and slow_roll_rpm is not None:
+        raise MachineFileError("--slow-roll needs phases, which --speeds does not find")
+    if between_rpm is None:
+        vectors = read_vectors(data, channels, revolutions)
+    else:
+        low, high = (rpm * np.pi / 30 for rpm in between_rpm)
+        vectors = estimated_vectors(data, channels, (low, high))
+    q = vectors.orders[:, list(ORDERS.values()).index(order)]
+    known = np.isfinite(q).all(axis=1)
+    q, speed = q[known], vectors.speed_rad_s[known]
+    rpm = np.abs(speed) * 30 / np.pi
+    if slow_roll_rpm is not None:
+        slow = rpm <= slow_roll_rpm
+        if not slow.any():
+            raise RotorwatchError(f"--slow-roll is {slow_roll_rpm:g} rpm, but the slowest is {rpm.min():.4g} rpm")
+        q = q - q[slow].mean(axis=0)
+    shown = [shown_as(channel, "amplitude") for channel in channels]
+    factors = np.array([factor / channel.to_si for channel, (_, factor) in zip(channels, shown, strict=True)])
+    return RunUp(
+        channels=channels,
+        units=tuple(unit for unit, _ in shown),
+        order=order,
+        revolutions=revolutions,
+        time_ns=vectors.time_ns[known],
+        speed_rad_s=speed,
+        amplitude=np.abs(q) * factors,
+        lag_deg=np.degrees(-np.angle(q) * np.sign(speed)[:, None]) % 360,
+        slow_roll_rpm=slow_roll_rpm,
+        estimated=between_rpm is not None,
+    )
