@@ -22,7 +22,7 @@ from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
 from models.mistakes import checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
-from models.signals.channels import Channel, ChannelDescriptor
+from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor
 from models.signals.keys import MachineKeys
 
 _SHIPPED = Path(__file__).parent / "machines"
@@ -294,7 +294,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
     condition: ConditionRange | None = None
     rate_hz: float = Field(gt=0, le=1e6, description="samples per second and channel")
     dtype: Literal["float32", "float64"] = "float32"
-    sensors: tuple[Channel, ...] = Field(min_length=1)
+    sensors: tuple[Sensor, ...] = Field(min_length=1)
     window: WindowSettings = WindowSettings()
     ingest: IngestSettings = IngestSettings()
     alarms: AlarmSettings = AlarmSettings()
@@ -343,6 +343,12 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
             raise ValueError(f"window.band_hz holds {bins:.0f} frequencies of segment_s, expected at least {_BINS}")
         if all(channel.quantity == "shaft_angle" for channel in self.sensors):
             raise ValueError("sensors: a shaft angle alone shows no vibration, expected a displacement or velocity too")
+        slow = [sensor.name for sensor in self.sensors if sensor.slow_roll_um_pp is not None]
+        if slow and all(sensor.quantity is not Quantity.SHAFT_ANGLE for sensor in self.sensors):
+            raise ValueError(
+                f"sensors: {slow[0]} has a slow-roll vector, and no sensor measures the shaft angle: without a phase "
+                "reference there is no vector at running speed that it could be taken from"
+            )
         if self.window.band_hz[1] >= self.rate_hz / 2:
             raise ValueError(
                 f"window.band_hz ends at {self.window.band_hz[1]} Hz, above half of rate_hz {self.rate_hz}"
@@ -411,7 +417,7 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
                 "machine": self.name,
                 "rate_hz": self.rate_hz,
                 "dtype": self.dtype,
-                "channels": self.sensors,
+                "channels": [sensor.model_dump(include=set(Channel.model_fields)) for sensor in self.sensors],
             }
         )
 

@@ -67,6 +67,9 @@ class Plan:
     # turns those, shape (n, n), states = turn @ mounted.
     angled: tuple[str, ...] = ()
     turn: FloatArray | None = None
+    # What each sensor of `states` shows at running speed without a vibration: q of x = Re{q e^{jθ}} for an angle that
+    # grows; None where none is known.
+    runout: ComplexArray | None = None
 
     @property
     def need(self) -> int:
@@ -139,6 +142,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
     channels = [machine.sensors[column] for column in columns]
     rows = [[parts_seen(one).get(name, 0.0) for name in states] for one in channels[: len(states)]]
     seen = np.array(rows).reshape(len(states), len(states))
+    runout = np.array([one.runout for one in channels], dtype=np.complex128)
     speed_rpm = None if machine.operation is None else machine.operation.speed_rpm
     segment = round(window.segment_s * rate_hz)
     lag_step = round(window.lag_step_s * rate_hz)
@@ -164,9 +168,10 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
         max_span_ns=round(window.max_span_s * 1e9),
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
-        levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm)) if levels else None,
+        levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm), runout) if levels else None,
         angled=tuple(state_name(one) for one in channels[: len(states)]),
         turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),
+        runout=runout[: len(states)] if np.any(runout[: len(states)]) else None,
     )
 
 

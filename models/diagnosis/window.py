@@ -71,8 +71,8 @@ class WindowStatistics:
     waveforms: tuple[Waveform, ...]
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`)
     pair_powers: tuple[ComplexArray, ...]
-    # The same window of the sensors as they are mounted, where some of them are at an angle. `waveforms` and
-    # `pair_powers` are those of mounted sensors in either.
+    # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
+    # slow-roll vector. `waveforms` and `pair_powers` are those of mounted sensors in either.
     mounted: "WindowStatistics | None" = None
 
     @property
@@ -172,7 +172,19 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         waveforms=tuple(hop.waveform for hop in hops),
         pair_powers=tuple(hop.pair_powers for hop in hops),
     )
-    return found if plan.turn is None else _turned(found, plan.states, plan.turn)
+    shaft = found if plan.runout is None else _without(found, plan.runout)
+    return shaft if plan.turn is None else _turned(shaft, plan.states, plan.turn)
+
+
+def _without(window: WindowStatistics, runout: ComplexArray) -> WindowStatistics:
+    """The window without what sensors show at running speed although nothing vibrates."""
+    known = runout if window.speed_rad_s >= 0 else runout.conj()
+    return replace(
+        window,
+        synchronous=None if window.synchronous is None else window.synchronous - known,
+        hop_synchronous=None if window.hop_synchronous is None else window.hop_synchronous - known,
+        mounted=window,
+    )
 
 
 def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray) -> WindowStatistics:
@@ -195,7 +207,7 @@ def _turned(window: WindowStatistics, states: tuple[str, ...], turn: FloatArray)
         hop_synchronous=vectors(window.hop_synchronous),
         relative_synchronous=relative,
         zero_angle_state=zero_angle_state,
-        mounted=window,
+        mounted=window.as_mounted,
     )
 
 

@@ -69,6 +69,8 @@ class LevelPlan:
         Columns of two displacements of one place.
     skew : tuple of float
         Cosine of the angle between their axes: 0 at right angles, as nearly all are.
+    runout : ndarray of complex, shape (n,), or None
+        What is taken out of 1x: q of x = Re{q e^{jθ}} at slow roll, for an angle that grows.
     """
 
     rate_hz: float
@@ -76,6 +78,7 @@ class LevelPlan:
     band_hz: tuple[float, float]
     pairs: tuple[tuple[int, int], ...]
     skew: tuple[float, ...]
+    runout: _ComplexArray | None = None
 
     @property
     def high_hz(self) -> tuple[float, float] | None:
@@ -88,7 +91,9 @@ class LevelPlan:
         return np.array([at for at, one in enumerate(self.quantities) if one in quantities], dtype=np.intp)
 
 
-def level_plan(channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float, float]) -> LevelPlan:
+def level_plan(
+    channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float, float], runout: _ComplexArray | None = None
+) -> LevelPlan:
     """Plan the levels of a machine.
 
     Parameters
@@ -97,6 +102,8 @@ def level_plan(channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float
         In the order of the columns; none of them a shaft angle.
     band_hz : tuple of float
         Of velocities; cut off where the sampling rate ends it.
+    runout : ndarray of complex, optional
+        See `LevelPlan`.
     """
     shaft = [(n, one) for n, one in enumerate(channels) if one.quantity is Quantity.DISPLACEMENT]
     at = {(one.location, one.direction): n for n, one in shaft if one.angle_deg is None}
@@ -112,6 +119,7 @@ def level_plan(channels: Sequence[Channel], rate_hz: float, band_hz: tuple[float
         (low, min(high, _NYQUIST_PART * rate_hz / 2)),
         tuple(pairs),
         tuple(_skew(channels[first], channels[second]) for first, second in pairs),
+        runout if runout is not None and np.any(runout) else None,
     )
 
 
@@ -327,6 +335,12 @@ def window_levels(
     turning = np.abs(np.nan_to_num(speeds_rad_s)) > _STANDS
     orders = np.stack([hop.orders for hop in hops])[turning]
     amplitudes, scatter, vectors = _amplitudes(orders, phase_reference=phase_reference)
+    measured_1x = amplitudes[1]
+    speed_rad_s = float(speeds_rad_s[turning].mean()) if turning.any() else None
+    if plan.runout is not None and vectors is not None and speed_rad_s is not None:
+        vectors, amplitudes = vectors.copy(), amplitudes.copy()
+        vectors[1] -= plan.runout if speed_rad_s >= 0 else plan.runout.conj()
+        amplitudes[1] = np.where(plan.runout == 0, amplitudes[1], np.abs(vectors[1]))
     shown = np.where(displacements, 2.0, np.sqrt(0.5))
     by_hop = {
         "overall": np.where(displacements, sums[:, 3], np.where(accelerations, hop_rms, velocity)),
@@ -351,14 +365,13 @@ def window_levels(
         values = taken | {
             **{name: shown * amplitudes[number] for number, name in enumerate(ORDERS)},
             "peak": peak,
-            "not_x1": np.sqrt(np.maximum(square - amplitudes[1] ** 2 / 2, 0.0)),
+            "not_x1": np.sqrt(np.maximum(square - measured_1x**2 / 2, 0.0)),
             "mean": np.where(displacements, mean, np.nan),
             "crest": peak / rms,
             "kurtosis": sums[:, 4].mean(axis=0) / sums[:, 1].mean(axis=0) ** 2,
         }
     errors = {name: each.std(axis=0) / np.sqrt(max(1, count - 1)) for name, each in by_hop.items()}
     errors |= {name: shown * scatter[number] for number, name in enumerate(ORDERS) if name in COMPARED}
-    speed_rad_s = float(speeds_rad_s[turning].mean()) if turning.any() else None
     return WindowLevels(values, errors, vectors, speed_rad_s, count)
 
 

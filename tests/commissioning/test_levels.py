@@ -20,6 +20,7 @@ from models.commissioning.commissioned import (
     load_commissioned,
 )
 from models.errors import BundleError
+from models.machine import MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
@@ -149,3 +150,15 @@ def test_the_valid_band_of_what_is_derived_is_stated() -> None:
     deeper = re.search(r"up to (\d) derivatives", less)
     assert deeper is not None
     assert int(deeper[1]) > int(found[1])
+
+
+def test_a_commissioning_holds_for_the_slow_roll_vectors_it_was_made_with(tmp_path: Path) -> None:
+    made = commissioned(NOTHING, healthy(NOTHING, 200, 5_402)).commissioned
+    assert made is not None
+    (tmp_path / FILE).write_text(made.model_dump_json(), encoding="utf-8")
+    assert load_commissioned(tmp_path, NOTHING).identity == made.identity
+    fields = NOTHING.model_dump()
+    first, *others = fields["sensors"]
+    fields["sensors"] = [first | {"slow_roll_um_pp": 5.0, "slow_roll_phase_lag_deg": 40.0}, *others]
+    with pytest.raises(BundleError, match="sensors"):
+        load_commissioned(tmp_path, MachineFile.model_validate(fields))

@@ -1,0 +1,183 @@
+"""Run-out, as the vector that a probe shows at slow roll, is taken out of 1x: of its level and of the diagnosis."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from models.diagnosis.likelihood.fit import LikelihoodFit
+from models.diagnosis.moments import plan_for
+from models.diagnosis.sensors.check import sensor_findings
+from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.levels.judgement import LevelJudge
+from models.levels.measures import WindowLevels
+from models.machine import Machine, MachineFile, load_machine, load_machine_file
+from models.signals.block import FloatArray
+from rotorwatch.records.levels import ChannelLevels
+from simulator.scenario import load_scenario
+from simulator.stream import blocks
+
+PROBE = {"quantity": "displacement", "location": "DE", "unit": "mm"}
+RUNOUT = {"slow_roll_um_pp": 12.0, "slow_roll_phase_lag_deg": 250.0}
+PUMP: dict[str, Any] = {
+    "site": "s", "name": "pump", "rate_hz": 1024.0, "dtype": "float64",
+    "window": {"length_s": 16.0, "hop_s": 4.0, "segment_s": 2.0, "max_span_s": 20.0, "lag_step_s": 1 / 1024},
+    "sensors": [
+        PROBE | {"name": "VE-1X", "direction": "X", **RUNOUT},
+        PROBE | {"name": "VE-1Y", "direction": "Y"},
+        {"name": "KPH", "quantity": "shaft_angle", "location": "shaft", "direction": "rotation", "unit": "rad"},
+    ],
+}  # fmt: skip
+
+
+def at_1x(um_pp: float, lag_deg: float, theta: FloatArray, turned: int) -> FloatArray:
+    """Displacement in mm whose positive peak comes when the shaft has turned by the lag."""
+    return np.asarray(um_pp / 2000 * np.cos(theta - turned * np.radians(lag_deg)))
+
+
+def window_of(machine: MachineFile, samples: FloatArray) -> SlidingWindow:
+    window = SlidingWindow(plan_for(machine, levels=True, lagged=False))
+    for _ in window.feed(window.plan.to_si(samples), 0):
+        pass
+    return window
+
+
+def levels(machine: MachineFile, samples: FloatArray) -> tuple[WindowLevels, tuple[ChannelLevels, ...]]:
+    window = window_of(machine, samples)
+    found, plan = window.levels(), window.plan
+    assert found is not None
+    assert plan.levels is not None
+    channels = [machine.sensors[column] for column in plan.columns]
+    return found, LevelJudge(plan.levels, channels, machine.levels).judge(found, None)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+@pytest.mark.parametrize("lag_deg", [0.0, 30.0, 120.0, 250.0, 300.0])
+def test_the_vector_sum_of_a_run_out_and_a_vibration_gives_back_the_vibration(turned: int, lag_deg: float) -> None:
+    machine = MachineFile.model_validate(PUMP)
+    theta = turned * 2 * np.pi * 25 * np.arange(20 * 1024) / 1024
+    both = at_1x(40, lag_deg, theta, turned) + at_1x(12, 250, theta, turned)
+    rest = 0.003 * np.cos(3.7 * theta)
+    _, (x, y) = levels(machine, np.column_stack([both + rest, both + rest, theta % (2 * np.pi)]))
+    assert x.x1 == pytest.approx(40e-3, rel=1e-3)
+    assert x.x1_phase_lag_deg is not None
+    assert (x.x1_phase_lag_deg - lag_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.1)
+    vector = 40 * np.exp(-1j * np.radians(lag_deg)) + 12 * np.exp(-1j * np.radians(250))
+    assert y.x1 == pytest.approx(abs(vector) / 1000, rel=1e-3)  # no slow roll is given for it
+    assert y.x1_phase_lag_deg == pytest.approx(-np.degrees(np.angle(vector)) % 360, abs=0.1)
+    # What is no vector at running speed is as it was measured, and so is what is left without it.
+    for measure in ("overall", "peak", "not_x1", "x2", "crest"):
+        assert getattr(x, measure) == getattr(y, measure)
+    assert x.not_x1 == pytest.approx(0.003 / np.sqrt(2), rel=0.01)
+
+
+def test_at_slow_roll_nothing_is_left() -> None:
+    machine = MachineFile.model_validate(PUMP)
+    theta = 2 * np.pi * 5 * np.arange(20 * 1024) / 1024
+    _, (x, _) = levels(machine, np.column_stack([at_1x(12, 250, theta, 1)] * 2 + [theta % (2 * np.pi)]))
+    assert x.x1 == pytest.approx(0, abs=1e-6)
+
+
+@cache
+def simulated() -> tuple[Machine, FloatArray]:
+    machine = load_machine("lab").model_copy(update={"dtype": "float64"})
+    scenario, _ = load_scenario("healthy")
+    scenario = scenario.model_copy(update={"duration_s": 64.0, "seed": 31_207})
+    return machine, np.concatenate([block.samples for block, _ in blocks(scenario, machine, 1.0)])
+
+
+def with_slow_roll(machine: Machine, **more: dict[str, object]) -> Machine:
+    fields = machine.model_dump()
+    for sensor in fields["sensors"]:
+        if sensor["name"] == "y1":
+            sensor |= {"slow_roll_um_pp": 16.0, "slow_roll_phase_lag_deg": 75.0}
+        sensor.update(more.get(sensor["name"], {}))
+    return Machine.model_validate(fields)
+
+
+def statistics(machine: Machine, samples: FloatArray) -> WindowStatistics:
+    found = window_of(machine, samples).statistics()
+    assert found is not None
+    return found
+
+
+def with_run_out(samples: FloatArray) -> FloatArray:
+    seen = samples.copy()
+    seen[:, 0] += 1000 * at_1x(16, 75, samples[:, -1], 1)
+    return seen
+
+
+def test_the_unbalance_is_read_without_the_run_out() -> None:
+    machine, samples = simulated()
+
+    def unbalance(of: Machine, seen: FloatArray) -> float:
+        (found,) = [one for one in LikelihoodFit(of).diagnose(statistics(of, seen)).parameters if one.name == "e"]
+        assert found.relative_change is not None
+        return found.relative_change
+
+    true = unbalance(machine, samples)
+    assert abs(unbalance(machine, with_run_out(samples)) - true) > 0.1
+    assert unbalance(with_slow_roll(machine), with_run_out(samples)) == pytest.approx(true, abs=1e-3)
+
+
+def test_sensors_are_judged_by_what_they_gave() -> None:
+    machine, samples = simulated()
+    compensated, measured = (statistics(one, with_run_out(samples)) for one in (with_slow_roll(machine), machine))
+    assert compensated.synchronous is not None
+    assert measured.synchronous is not None
+    assert abs(compensated.synchronous[0] - measured.synchronous[0]) == pytest.approx(8e-6)
+    assert np.array_equal(compensated.spectrum, measured.spectrum)
+    assert compensated.as_mounted.synchronous is not None
+    assert np.array_equal(compensated.as_mounted.synchronous, measured.synchronous)
+    assert sensor_findings(compensated, None, machine.sensors) == sensor_findings(measured, None, machine.sensors)
+
+
+def test_run_out_of_probes_at_an_angle_is_taken_out_as_they_are_mounted() -> None:
+    machine, samples = simulated()
+    angles: dict[str, dict[str, object]] = {
+        "y1": {"angle_deg": 45.0, "direction": "X"},
+        "z1": {"angle_deg": 135.0, "direction": "Y"},
+    }
+    turned, seen = with_slow_roll(machine, **angles), samples.copy()
+    seen[:, 0], seen[:, 1] = (samples[:, 0] + samples[:, 1]) / 2**0.5, (samples[:, 1] - samples[:, 0]) / 2**0.5
+    expected, found = statistics(machine, samples).synchronous, statistics(turned, with_run_out(seen)).synchronous
+    assert expected is not None
+    assert found is not None
+    assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
+
+
+def test_the_stream_is_the_same_with_and_without() -> None:
+    machine, _ = simulated()
+    compensated = with_slow_roll(machine)
+    assert compensated.descriptor == machine.descriptor
+    assert compensated.descriptor.schema_hash == machine.descriptor.schema_hash
+    assert load_machine("lab").model_dump() == load_machine_file("lab").model_dump()
+    assert "slow_roll" not in machine.model_dump_json()
+    assert Machine.model_validate(compensated.model_dump()) == compensated
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"slow_roll_um_pp": 5.0}, "VE-1X: slow_roll_um_pp is given without slow_roll_phase_lag_deg"),
+        ({"slow_roll_phase_lag_deg": 5.0}, "VE-1X: slow_roll_phase_lag_deg is given without slow_roll_um_pp"),
+        (
+            RUNOUT | {"quantity": "velocity", "unit": "mm/s"},
+            "VE-1X: slow_roll_um_pp is 12, but run-out is that of a displacement, and this measures velocity",
+        ),
+        (RUNOUT | {"slow_roll_um_pp": -1.0}, "slow_roll_um_pp"),
+        (RUNOUT | {"slow_roll_phase_lag_deg": 400.0}, "slow_roll_phase_lag_deg"),
+    ],
+)
+def test_what_is_no_slow_roll_vector_is_refused(fields: dict[str, object], says: str) -> None:
+    probe = {"name": "VE-1X", "direction": "X"} | PROBE | fields
+    with pytest.raises(ValidationError, match=says):
+        MachineFile.model_validate(PUMP | {"sensors": [probe, *PUMP["sensors"][1:]]})
+
+
+def test_without_a_phase_reference_there_is_nothing_to_take_a_vector_from() -> None:
+    says = "VE-1X has a slow-roll vector, and no sensor measures the shaft angle: without a phase reference"
+    with pytest.raises(ValidationError, match=says):
+        MachineFile.model_validate(PUMP | {"sensors": PUMP["sensors"][:2]})
