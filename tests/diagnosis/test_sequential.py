@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats.qmc import MultivariateNormalQMC
 
 from models.diagnosis.verdict.calibration import (
     MONTH_S,
@@ -86,10 +87,11 @@ def test_an_error_that_all_windows_share_is_not_averaged_away() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_hops", [2_500, pytest.param(10_000, marks=pytest.mark.long)])
-def test_false_alarms_come_at_the_declared_rate(n_hops: int) -> None:
-    """Hours of a healthy machine at 4000 declared false alarms per month: 19 are expected in 2500 hops."""
-    declared = 4000.0
+@pytest.mark.parametrize(
+    ("n_hops", "declared"), [(1_250, 8000.0), pytest.param(10_000, 4000.0, marks=pytest.mark.long)]
+)
+def test_false_alarms_come_at_the_declared_rate(n_hops: int, declared: float) -> None:
+    """Hours of a healthy machine: 19 false alarms are expected in 1250 hops, 77 in the longer run."""
     settings = replace(SETTINGS, false_alarms_per_month=declared, systematic=0.0)
     verdicts = play(SequentialTest(settings), gaussian(SEED, settings), (n_hops, true()))
     last, count = -1000, 0
@@ -297,14 +299,14 @@ def healthy(seed: int) -> Stretch:
 
 
 def power(cov: FloatArray, name: str, seed: int) -> list[float]:
-    """Share of 1200 windows in which the minimum detectable loss and gain are named."""
-    rng, thresholds, shares = np.random.default_rng(seed), window_thresholds(0.01, 6), []
+    """Share of windows in which the minimum detectable loss and gain are named: 256, spread as evenly as can be."""
+    thresholds, shares, scatter = window_thresholds(0.01, 6), [], MultivariateNormalQMC(np.zeros(6), cov, rng=seed)
     stretch = stretch_of(window(np.zeros(6), cov), 0, 60_000_000_000)
     (found,) = (one for one in detectable_changes(stretch, thresholds, 60.0) if one.name == name)
     for change in (found.loss, found.gain):
         true = np.zeros(6)
         true[PARAMETERS.index(name)] = to_scale(name, change)
-        values = rng.multivariate_normal(true, cov, size=1200)
+        values = true + scatter.random(256)
         shares.append(
             float(
                 np.mean([name in isolate(stretch_of(window(value, cov), 0, 1), thresholds).changed for value in values])

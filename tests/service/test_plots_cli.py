@@ -21,7 +21,7 @@ KINDS = ["trend", "correlation", "orbit", "spectrum", "waterfall", "waveform", "
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recording(tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(80.0, parse_fault("c_bz=0.5@0")))
+    return recording(tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(66.0, parse_fault("c_bz=0.5@0")))
 
 
 @pytest.fixture(scope="module")
@@ -90,18 +90,22 @@ def test_a_run_up_of_the_simulator(run_up: Path, tmp_path: Path, kind: str, opti
     assert (tmp_path / "one.png").read_bytes() == (tmp_path / "other.png").read_bytes()
 
 
-@pytest.mark.parametrize("suffix", ["png", "svg"])
-def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffix: str) -> None:
+def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> None:
     """In another process, with another matplotlibrc."""
-    one, other = tmp_path / f"one.{suffix}", tmp_path / f"other.{suffix}"
-    arguments = ["--from", "10", "--to", "30", "--cascade", "--size", "4x3"]
-    assert run("waterfall", faulty, *arguments, "--out", one)[0] == 0
+    arguments = ["waterfall", str(faulty), "--from", "10", "--to", "30", "--cascade", "--size", "4x3", "--out"]
+    ours, theirs = ([str(tmp_path / f"{whose}.{suffix}") for suffix in ("png", "svg")] for whose in ("one", "other"))
+    for out in ours:
+        assert run(*arguments, out)[0] == 0
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: yellow\nfont.size: 20\n", encoding="utf-8")
     environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7"}
-    command = [sys.executable, "-m", "service.rotorwatch", "plot", "waterfall", str(faulty), *arguments]
-    command += ["--out", str(other)]
+    code = f"""from service.rotorwatch import app
+for out in {theirs}:
+    app(["plot", *{arguments}, out], standalone_mode=False)
+"""
+    command = [sys.executable, "-c", code]
     subprocess.run(command, check=True, cwd=ROOT, env=environment, timeout=300, capture_output=True)
-    assert one.read_bytes() == other.read_bytes()
+    for out, other in zip(ours, theirs, strict=True):
+        assert Path(out).read_bytes() == Path(other).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -123,7 +127,7 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path, suffi
         (("correlation", "--at", "soon"), "--at is 'soon', expected seconds after the start"),
         (("orbit", "--from", "20", "--at", "20"), "--at 20: nothing was recorded before that"),
         (("orbit", "--from", "500"), "nothing was recorded in between"),
-        (("orbit", "--from", "79.9", "--revolutions", "9"), "--revolutions is 9, but only"),
+        (("orbit", "--from", "65.9", "--revolutions", "9"), "--revolutions is 9, but only"),
         (("orbit", "--key", "demo/fan"), "machines with sample blocks: demo/lab"),
         (("bode",), "a Bode plot needs a run-up or coast-down: the speed stays between 1320 and 1320 rpm"),
         (("bode", "--order", "4"), "Invalid value for '--order'"),

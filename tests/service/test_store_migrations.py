@@ -173,14 +173,17 @@ def test_readings_and_buckets_of_rows_are_those_that_were_there(
 
 
 def test_a_large_history_says_how_far_it_is_brought_up_to_date(url: str) -> None:
-    many = [{"number": number, "value": number / 7} for number in range(1, 40_004)]
+    numbers = "WITH RECURSIVE n (k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 40003) "
     engine = engine_for(url)
     with engine.begin() as connection, capture_logs() as lines:
         migrate(connection, "0003")
         connection.execute(text("INSERT INTO machines VALUES (1, 'demo', 'lab', '', 9, 0, 40003)"))
         connection.execute(text("INSERT INTO series VALUES (1, 1, 'parameter', 'e', -1)"))
-        connection.execute(text("INSERT INTO evaluations VALUES (1, :number, :number, 1)"), many)
-        connection.execute(text("INSERT INTO readings VALUES (1, :number, 1, :value, NULL)"), many)
+        for inserted in (
+            "INSERT INTO evaluations SELECT 1, k, k, 1 FROM n",
+            "INSERT INTO readings SELECT 1, k, 1, CAST(k AS DOUBLE PRECISION) / 7, NULL FROM n",
+        ):
+            connection.execute(text(numbers + inserted))
         migrate(connection)
     engine.dispose()
     told = [(line["table"], line["rows"]) for line in lines if line["event"] == "the history is brought up to date"]
@@ -191,7 +194,7 @@ def test_a_large_history_says_how_far_it_is_brought_up_to_date(url: str) -> None
         found = store.machine("demo", "lab").readings(quantity="parameter", name="e", limit=50_000)
     finally:
         store.close()
-    assert [(one.number, one.value) for one in found] == [(one["number"], one["value"]) for one in many]
+    assert [(one.number, one.value) for one in found] == [(number, number / 7) for number in range(1, 40_004)]
 
 
 @pytest.mark.parametrize(

@@ -356,7 +356,8 @@ def test_recordings_and_conditions(folder: Path) -> None:
     assert "speed 1320 rpm" in seen
 
 
-def test_a_page_says_what_it_replaces(tmp_path: Path) -> None:
+def test_a_page_says_what_it_replaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they take long
     made, _, machine = case("no phase reference")
     assert made.commissioned is not None
     before = made.commissioned

@@ -143,8 +143,8 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
     from models.diagnosis.networks.training import calibrate, train_network  # noqa: PLC0415
 
     equation = EQUATIONS[0]
-    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 24, equation.kept_nominal), SHORT, SEED)
-    trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 10, equation.kept_nominal), SHORT)
+    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 16, equation.kept_nominal), SHORT, SEED)
+    trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 8, equation.kept_nominal), SHORT)
     draw = Draw(SHORT, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
     readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(8)]
     k_by = np.array([reading[0].relative_change for reading in readings], dtype=np.float64)
