@@ -76,8 +76,8 @@ class _Case:
 
 def with_hop(machine: Machine, hop_s: float) -> Machine:
     """The machine with another hop; a ValueError if its window cannot be cut so."""
-    window = type(machine.window).model_validate(machine.window.model_dump() | {"hop_s": hop_s})
-    return machine.model_copy(update={"window": window})
+    fields = machine.model_dump()
+    return type(machine).model_validate(fields | {"window": fields["window"] | {"hop_s": hop_s}})
 
 
 def bound_time_s(error: float, duration_s: float, parameter: str, change: float, threshold: float) -> float:

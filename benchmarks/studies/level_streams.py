@@ -43,6 +43,8 @@ class Kind:
     rate_hz: float
     rotation: str
     """How the running speed is known: ``phase reference``, ``nominal`` or not at all."""
+    schedule: tuple[float, float] | None = None
+    """Length of snapshots and their period, s; none where samples come all the time."""
 
 
 KINDS = {
@@ -110,13 +112,14 @@ class Scene:
 
     def blocks(self, rng: np.random.Generator, seconds: float, course: Course) -> Iterator[SampleBlock]:
         """The stream, from its first sample on."""
-        rate_hz, size = self.kind.rate_hz, round(BLOCK_S * self.kind.rate_hz)
+        block_s, period_s = self.kind.schedule or (BLOCK_S, BLOCK_S)
+        rate_hz, size = self.kind.rate_hz, round(block_s * self.kind.rate_hz)
         kept = [np.zeros(1) for _ in self.poles]
         bearing = None if self.defect is None else _Impacts(self.defect, rate_hz, rng)
         healthy = np.sqrt((self.lines**2).sum(axis=0) / 2 + self.noise**2)
         start_rad = float(rng.uniform(0, 2 * np.pi))
-        for number in range(round(seconds / BLOCK_S)):
-            t = number * BLOCK_S + np.arange(size) / rate_hz
+        for number in range(round(seconds / period_s)):
+            t = number * period_s + np.arange(size) / rate_hz
             theta = start_rad + 2 * np.pi * self.speed_hz * t
             gains = course(t)
             columns = []
@@ -134,7 +137,7 @@ class Scene:
             yield SampleBlock(
                 run=1,
                 sequence=number,
-                start_ns=DEFAULT_START_NS + round(number * BLOCK_S * 1e9),
+                start_ns=DEFAULT_START_NS + round(number * period_s * 1e9),
                 rate_hz=rate_hz,
                 samples=np.column_stack(columns).astype(np.float32),
             )
@@ -156,6 +159,8 @@ class _Impacts:
     def response(self, t: FloatArray) -> FloatArray:
         """At the times of the next samples."""
         impacts = np.zeros(t.size)
+        silence = t[0] - 0.5 / self._rate_hz - self._next_s
+        self._next_s += max(0.0, np.ceil(silence * self._defect.rolling_hz)) / self._defect.rolling_hz
         while self._next_s < t[0] + t.size / self._rate_hz - 0.5 / self._rate_hz:
             impacts[min(t.size - 1, max(0, round((self._next_s - t[0]) * self._rate_hz)))] += self._scale
             self._next_s += (1 + 0.01 * float(self._rng.standard_normal())) / self._defect.rolling_hz
@@ -174,7 +179,11 @@ def _file(kind: Kind, speed_rpm: float) -> MachineFile:
     if kind.rotation == "phase reference":
         angle = {"name": "theta", "quantity": "shaft_angle", "location": "shaft", "direction": "rotation"}
         sensors.append(angle | {"unit": "rad"})
-    content = {"site": "study", "name": "machine", "rate_hz": kind.rate_hz, "sensors": sensors, "window": WINDOW}
+    content = {"site": "study", "name": "machine", "rate_hz": kind.rate_hz, "sensors": sensors}
+    if kind.schedule is None:
+        content["window"] = WINDOW
+    else:
+        content["schedule"] = {"on_s": kind.schedule[0], "every_s": kind.schedule[1]}
     if kind.rotation == "nominal":
         content["operation"] = {"speed_rpm": speed_rpm}
     return MachineFile.model_validate(content)

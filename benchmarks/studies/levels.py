@@ -38,7 +38,7 @@ _KITS = ("rotor kit, commissioned at level full", "rotor kit, commissioned at le
 _REFERENCES = ("first windows", "commissioned")
 _SPREADS, _DRAWN = (0.1, 0.2), ("inside the reference's range", "same distribution")
 _VARYING = "velocity sensors, speed in the machine file"
-_BEARING = "accelerometers, 12.8 kHz"
+_BEARING, _IN_SNAPSHOTS = "accelerometers, 12.8 kHz", "accelerometers, 12.8 kHz, 0.1 s every 10 s"
 _KIT_BLOCK_S = 0.5
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -229,20 +229,24 @@ def _levelled(levels: FloatArray, t: FloatArray) -> Gains:
 # A rolling bearing
 
 
-def _bearing(options: Options, case: int, number: int) -> Iterator[dict[str, Value]]:
+def _bearing(options: Options, case: int, machine: str, number: int) -> Iterator[dict[str, Value]]:
     """A defect that grows until the first alarm, or until its impacts have twenty times the healthy rms."""
     rng = generator(options.seed, case, number, At.CONDITION)
     kind = replace(KINDS["accelerometers, speed in the machine file"], rate_hz=12800.0)
+    if machine == _IN_SNAPSHOTS:
+        kind = replace(kind, schedule=(0.1, 10.0))
     scene = drawn(kind, rng)
+    # Everything goes on so many times more slowly where windows are longer.
+    slower = scene.machine.window.length_s / _LENGTH_S
     defect = Defect(
-        begins_s=_FIRST_S + float(rng.uniform(1, 2)) * (3 if options.small else 10) * _LENGTH_S,
-        growth_s=60.0 if options.small else 600.0,
+        begins_s=slower * (_FIRST_S + float(rng.uniform(1, 2)) * (3 if options.small else 10) * _LENGTH_S),
+        growth_s=slower * (60.0 if options.small else 600.0),
         rolling_hz=scene.speed_hz * float(rng.uniform(3, 6)),
         resonance_hz=float(rng.uniform(3000, 5000)),
         damping=float(rng.uniform(0.01, 0.05)),
     )
     own = generator(options.seed, case, number, At.EVALUATION)
-    stream = replace(scene, defect=defect).blocks(own, defect.begins_s + defect.growth_s + _LENGTH_S, _steady)
+    stream = replace(scene, defect=defect).blocks(own, defect.begins_s + defect.growth_s + slower * _LENGTH_S, _steady)
     raised = next(_raised(MachineMonitor(Installed(scene.machine)), stream), None)
     early = raised is not None and raised.at_s <= defect.begins_s
     ratio = None if raised is None or early else defect.overall(raised.at_s)
@@ -270,7 +274,7 @@ def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[st
             return list(measured(options, case, machine, number))
         case "varying":
             return list(_varying(options, case, machine, varied, number))
-    return list(_bearing(options, case, number))
+    return list(_bearing(options, case, machine, number))
 
 
 def _of(topic: str) -> Callable[[Sequence[Record]], list[Record]]:
@@ -347,8 +351,8 @@ def levels(options: Options) -> Study:
     plan: list[tuple[str, str, str, float]] = [
         *(("doubling", machine, "", 2.0) for machine in KINDS),
         *(("doubling", machine, "", 1.0) for machine in _KITS),
-        ("bearing", _BEARING, "", 2.0),
-        *(("varying", of, f"{spread:g}, {how}", 1.0) for of in _REFERENCES for spread in _SPREADS for how in _DRAWN),
+        *(("bearing", machine, "", 3.6) for machine in (_BEARING, _IN_SNAPSHOTS)),
+        *(("varying", of, f"{spread:g}, {how}", 0.5) for of in _REFERENCES for spread in _SPREADS for how in _DRAWN),
     ]
     cells = tuple(
         Cell(

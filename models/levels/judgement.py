@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from models.levels.bands import Growth, growth
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, ReferenceLevel
 from models.levels.settings import LevelSettings
@@ -26,7 +27,7 @@ _PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
 _WORDS = {
     "overall": "overall", "velocity": "velocity", "s_max": "S_max", "x_half": "0.5x", "x1": "1x", "x2": "2x",
     "x3": "3x", "not_x1": "not 1x", "high": "high frequency", "peak": "peak", "mean": "gap", "envelope": "envelope",
-    "crest": "crest factor", "kurtosis": "kurtosis",
+    "crest": "crest factor", "kurtosis": "kurtosis", "growth": "growth",
 }  # fmt: skip
 
 
@@ -62,7 +63,13 @@ class LevelJudge:
 
     def _channel(self, column: int, levels: WindowLevels, reference: LevelReference | None) -> ChannelLevels:
         channel, speed_rad_s = self._channels[column], levels.speed_rad_s
-        values = {name: _shown(channel, name, float(levels.values[name][column])) for name in LEVEL_MEASURES}
+        values = {
+            name: _shown(channel, name, float(levels.values[name][column]))
+            for name in LEVEL_MEASURES
+            if name != "growth"
+        }
+        grown = None if reference is None else self._grown(column, levels, reference)
+        values["growth"] = math.nan if grown is None else grown.ratio
         zone, limits = "", dict[str, list[_Limit]]()
         for own in self._settings.limits:
             if own.channel == channel.name:
@@ -75,6 +82,10 @@ class LevelJudge:
         if reference is not None:
             for measure, limit in self._relative(column, levels, reference):
                 limits.setdefault(measure, []).append(limit)
+        words = dict(_WORDS)
+        if grown is not None and reference is not None:
+            limits["growth"] = [_Limit(reference.source, False, grown.limit)]
+            words["growth"] = f"{grown.band_hz[0]:.3g} to {grown.band_hz[1]:.3g} Hz"
         vectors = levels.vectors
         lags = {}
         if vectors is not None and speed_rad_s is not None:
@@ -91,7 +102,9 @@ class LevelJudge:
             band_hz=self._plan.band_hz if casing else None,
             **{name: _rounded(value) for name, value in (values | lags).items()},
             zone=zone,
-            limits=tuple(self._limited(channel, name, values[name], found) for name, found in limits.items()),
+            limits=tuple(
+                self._limited(channel, name, values[name], found, words[name]) for name, found in limits.items()
+            ),
         )
 
     def _standard(
@@ -129,6 +142,15 @@ class LevelJudge:
             if seen and name == "x1" and one.vector is not None and levels.vectors is not None:
                 yield from self._turned(channel, one, complex(levels.vectors[1, column]), alert, spread)
 
+    def _grown(self, column: int, levels: WindowLevels, reference: LevelReference) -> Growth | None:
+        """The band that stands out most; nothing at a speed that was never seen, at which lines are elsewhere."""
+        state, seen = reference.at(levels.speed_rad_s)
+        own = state.bands.get(self._channels[column].name)
+        if own is None or levels.bands is None or not seen:
+            return None
+        shorter = math.sqrt(max(1.0, state.hops / levels.hops))  # while the window fills
+        return growth(levels.bands, column, own, self._settings.alert_ratio, _BEYOND_RANGE, _ERRORS * shorter)
+
     def _turned(
         self, channel: Channel, one: ReferenceLevel, now: complex, alert: float, spread: float
     ) -> Iterator[tuple[str, _Limit]]:
@@ -139,13 +161,13 @@ class LevelJudge:
         if abs(now - complex(*one.vector)) > radius:
             yield "x1", _Limit("1x vector", False, alert=_shown(channel, "x1", min(abs(now) * of_amplitude, alert)))
 
-    def _limited(self, channel: Channel, name: str, value: float, limits: Sequence[_Limit]) -> LevelLimits:
+    def _limited(self, channel: Channel, name: str, value: float, limits: Sequence[_Limit], words: str) -> LevelLimits:
         """The nearest limits of a level, and on which side it is."""
         danger = min((one for one in limits if one.danger is not None), key=lambda one: one.danger or 0.0, default=None)
         alert = min((one for one in limits if one.alert is not None), key=lambda one: one.alert or 0.0, default=None)
         fall = max((one for one in limits if one.fall is not None), key=lambda one: one.fall or 0.0, default=None)
         unit = _unit(channel, name)
-        said = f"{channel.name} ({channel.location} {channel.direction}) {_WORDS[name]}".rstrip()
+        said = f"{channel.name} ({channel.location} {channel.direction}) {words}".rstrip()
         said += f" {value:.3g} {unit}"
         state, text, decided = "normal", "", alert or danger or fall
         if danger is not None and value >= (danger.danger or math.inf):
@@ -185,6 +207,8 @@ def _shown(channel: Channel, name: str, value: float) -> float:
 def _unit(channel: Channel, name: str) -> str:
     if name in {"crest", "kurtosis"}:
         return ""
+    if name == "growth":
+        return "times the reference"
     if name == "velocity":
         return "mm/s rms"
     if name in {"peak", "s_max", "mean"}:

@@ -16,6 +16,8 @@ mean       mean position: the gap (API 670)
 crest      peak over rms                                           the same
 kurtosis   fourth moment over the square of the second: 3 of a     the same
            Gaussian vibration (ISO 13373-3)
+growth     the band of a twelfth of an octave that has grown most, the same
+           times the reference (`models.levels.bands`)
 high                                                               of acceleration: rms above 1 kHz (ISO 13373-3)
 envelope                                                           of acceleration: rms of the envelope of that, about
                                                                    its mean (ISO 13373-3, VDI 3832)
@@ -35,12 +37,13 @@ import numpy.typing as npt
 import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
+from models.levels.bands import BandLevels, band_edges
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 
 ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
 """Multiples of running speed, by the name of their measure."""
-COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
+COMPARED = ("overall", "velocity", "s_max", "x_half", "x1", "x2", "x3", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
@@ -48,6 +51,8 @@ _HIGH_HZ = 1000.0
 _NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
 _MANY_REVOLUTIONS = 8.0
+_HANN_BINS = 1.5
+"""Bins of a tapered spectrum that say as much as one of an untapered one."""
 _STANDS = 2 * np.pi * 0.5
 """Slower than this, rad/s, a shaft is not taken to turn."""
 
@@ -145,12 +150,15 @@ class HopLevels:
         means nothing: the shaft angle is known to a whole turn.
     radius : ndarray, shape (n_pairs,)
         Largest distance from the mean position.
+    bands : ndarray, shape (n_bands, n)
+        Mean squares in the bands of `models.levels.bands`.
     """
 
     n_samples: int
     sums: FloatArray
     orders: _ComplexArray
     radius: FloatArray
+    bands: FloatArray
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything as named arrays."""
@@ -159,6 +167,7 @@ class HopLevels:
             "sums": self.sums,
             "orders": self.orders,
             "radius": self.radius,
+            "bands": self.bands,
         }
 
     @classmethod
@@ -176,6 +185,7 @@ class HopLevels:
             sums,
             checked(arrays, "orders", np.complex128, (len(ORDERS), sums.shape[1])),
             checked(arrays, "radius", np.float64, (None,)),
+            checked(arrays, "bands", np.float64, (None, sums.shape[1])),
         )
 
 
@@ -202,28 +212,34 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     sums[2] = np.maximum(high, -low)
     sums[3] = high - low
     sums[4] = np.einsum("ij,ij->i", square, square) / n_samples
+    # Strong lines must not leak into the low end of a band, where integration would magnify them.
+    taper = _taper(n_samples)
+    spectrum = scipy.fft.rfft(x * taper, axis=1)
+    scale = 2 / (n_samples * float(taper @ taper))
     casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
     if casing.size:
-        sums[5:, casing] = _band_squares(plan, x[casing], plan.columns(Quantity.ACCELERATION)[:, None] == casing)
+        accelerations = (plan.columns(Quantity.ACCELERATION)[:, None] == casing).any(axis=0)
+        sums[5:, casing] = _band_squares(plan, spectrum[casing], n_samples, accelerations)
+    edges = band_edges(n_samples, _NYQUIST_PART)
+    within = spectrum[:, : edges[-1]]
+    bands = scale * np.add.reduceat(within.real**2 + within.imag**2, edges[:-1], axis=1)
     radius = [
         float(np.sqrt((square[y] + square[z] - (2 * skew * x[y] * x[z] if skew else 0.0)).max() / (1 - skew**2)))
         for (y, z), skew in zip(plan.pairs, plan.skew, strict=True)
     ]
-    return HopLevels(n_samples, sums, _orders(x, angle_rad), np.array(radius))
+    return HopLevels(n_samples, sums, _orders(x, angle_rad), np.array(radius), np.ascontiguousarray(bands.T))
 
 
-def _band_squares(plan: LevelPlan, x: FloatArray, of_acceleration: npt.NDArray[np.bool_]) -> FloatArray:
+def _band_squares(
+    plan: LevelPlan, spectrum: _ComplexArray, n_samples: int, accelerations: npt.NDArray[np.bool_]
+) -> FloatArray:
     """Mean squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n)."""
-    accelerations = of_acceleration.any(axis=0)
-    n_samples = x.shape[1]
-    # Strong lines must not leak into the low end of the band, where integration would magnify them.
     taper = _taper(n_samples)
-    spectrum = scipy.fft.rfft(x * taper, axis=1)
     step_hz = plan.rate_hz / n_samples
     scale = 2 / (n_samples * float(taper @ taper))
     first, last = (round(edge / step_hz) for edge in plan.band_hz)
     first = max(first, 1)
-    found = np.full((3, x.shape[0]), np.nan)
+    found = np.full((3, spectrum.shape[0]), np.nan)
     band = spectrum[:, first : last + 1]
     power = band.real**2 + band.imag**2
     found[0] = power.sum(axis=1)
@@ -295,6 +311,7 @@ class WindowLevels:
         Mean of q of the hops at the orders, with a phase reference.
     speed_rad_s : float or None
         Mean speed; None where it is not known.
+    bands : BandLevels or None
     """
 
     values: Mapping[str, FloatArray]
@@ -302,6 +319,7 @@ class WindowLevels:
     vectors: _ComplexArray | None
     speed_rad_s: float | None = None
     hops: int = 1
+    bands: BandLevels | None = None
 
 
 def window_levels(
@@ -372,7 +390,15 @@ def window_levels(
         }
     errors = {name: each.std(axis=0) / np.sqrt(max(1, count - 1)) for name, each in by_hop.items()}
     errors |= {name: shown * scatter[number] for number, name in enumerate(ORDERS) if name in COMPARED}
-    return WindowLevels(values, errors, vectors, speed_rad_s, count)
+    in_bands = np.sqrt(np.stack([hop.bands for hop in hops]))
+    edges = band_edges(hops[0].n_samples, _NYQUIST_PART) - 0.5  # halfway between bins
+    bands = BandLevels(
+        np.asarray(edges * (plan.rate_hz / hops[0].n_samples), dtype=np.float64),
+        np.sqrt((in_bands**2).mean(axis=0)),
+        in_bands.std(axis=0) / np.sqrt(max(1, count - 1)),
+        2 * count * np.maximum(1.0, np.diff(edges) / _HANN_BINS),
+    )
+    return WindowLevels(values, errors, vectors, speed_rad_s, count, bands)
 
 
 def _amplitudes(orders: _ComplexArray, *, phase_reference: bool) -> tuple[FloatArray, FloatArray, _ComplexArray | None]:

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from models.checkpoint import checked, texts
 from models.errors import CheckpointError
+from models.levels.bands import BandLevels, BandReference, learn_bands
 from models.levels.measures import COMPARED, WindowLevels
 
 _STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -54,6 +55,8 @@ class OperatingState(BaseModel):
         By channel and measure.
     hops : float
         Mean number of hops in a window.
+    bands : dict
+        By channel.
     """
 
     model_config = _STORED
@@ -62,6 +65,7 @@ class OperatingState(BaseModel):
     speed_rad_s: tuple[_Finite, _Finite] | None
     levels: dict[str, dict[str, ReferenceLevel]]
     hops: float = Field(ge=1)
+    bands: dict[str, BandReference] = {}
 
 
 class LevelReference(BaseModel):
@@ -126,6 +130,7 @@ def _speed(levels: WindowLevels) -> float:
 
 def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
     speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
+    bands = [one.bands for one in group if one.bands is not None]
     return OperatingState(
         windows=len(group),
         speed_rad_s=(min(speeds), max(speeds)) if speeds else None,
@@ -134,6 +139,9 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
             for column, channel in enumerate(channels)
         },
         hops=float(np.mean([one.hops for one in group])),
+        bands={
+            channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
+        },
     )
 
 
@@ -202,6 +210,12 @@ class FirstWindows:
             "hops": np.array([one.hops for one in seen], dtype=np.int64),
             "values": np.array([[one.values[name] for name in COMPARED] for one in seen]).reshape(shape),
             "errors": np.array([[one.errors[name] for name in COMPARED] for one in seen]).reshape(shape),
+            **{
+                f"{name}_{number}": getattr(one.bands, name)
+                for number, one in enumerate(seen)
+                if one.bands is not None
+                for name in ("edges_hz", "rms", "errors", "freedom")
+            },
             **{f"vectors_{number}": np.asarray(each, np.complex128) for number, each in enumerate(vectors)},
         }
 
@@ -223,6 +237,14 @@ class FirstWindows:
         shape = (speeds.size, len(COMPARED), len(self._channels))
         values, errors = (checked(arrays, name, np.float64, shape) for name in ("values", "errors"))
         vectors = [checked(arrays, f"vectors_{number}", np.complex128, (None, None)) for number in range(speeds.size)]
+        flat, wide = (None,), (None, shape[2])
+        forms = {"edges_hz": flat, "rms": wide, "errors": wide, "freedom": flat}
+        bands = [
+            BandLevels(**{name: checked(arrays, f"{name}_{n}", np.float64, form) for name, form in forms.items()})
+            if f"rms_{n}" in arrays
+            else None
+            for n in range(speeds.size)
+        ]
         self._seen = [
             WindowLevels(
                 dict(zip(COMPARED, values[number], strict=True)),
@@ -230,6 +252,7 @@ class FirstWindows:
                 vectors[number] if vectors[number].size else None,
                 speed if math.isfinite(speed) else None,
                 hops[number],
+                bands[number],
             )
             for number, speed in enumerate(speeds.tolist())
         ]

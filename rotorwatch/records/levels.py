@@ -72,6 +72,12 @@ class ChannelLevels(BaseModel):
     kurtosis: Number = Field(default=None, description="3 of a Gaussian vibration", examples=[3.0])
     high: Number = Field(default=None, description="of an accelerometer: rms above 1 kHz", examples=[0.8])
     envelope: Number = Field(default=None, description="rms of the envelope of that", examples=[0.3])
+    growth: Number = Field(
+        default=None,
+        description="of all bands of a twelfth of an octave the one nearest to its limit, times the reference; null "
+        "without one",
+        examples=[1.1],
+    )
     zone: Literal["", "A", "B", "C", "D"] = Field(
         default="", description="zone of the standard that applies; empty without one", examples=["B"]
     )

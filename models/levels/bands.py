@@ -1,0 +1,161 @@
+"""Levels in narrow bands, which are compared with the reference: what grows at any frequency, whatever the speed.
+
+Where the running speed is not known there are no orders, and a line that doubles is lost in the overall level;
+sidebands and subharmonics are at no order at all. In bands of a twelfth of an octave a line stands out of random
+vibration, and growth of any kind is growth of one of them. A line moves to a neighbouring band when the speed does:
+each band is compared with the loudest of its neighbourhood.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.special import fdtri
+
+from models.signals.block import FloatArray
+
+_PER_OCTAVE = 12
+_FIRST_BIN = 2
+"""The taper spreads the mean over the bins before it."""
+_COUNTS = 0.01
+"""Part of a channel's rms below which a band is not looked at: what is there is mostly the noise of the sensor."""
+_CHANCE = 1e-9
+_Level = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+@lru_cache(maxsize=8)
+def band_edges(n_samples: int, used: float) -> npt.NDArray[np.intp]:
+    """Bins of a Fourier transform at which bands begin, and the end of the last one.
+
+    Parameters
+    ----------
+    n_samples : int
+    used : float
+        Part of the spectrum that is used.
+    """
+    last = int(used * (n_samples // 2))
+    count = max(0, int(np.log2(max(1, last) / _FIRST_BIN) * _PER_OCTAVE))
+    edges = np.unique(np.rint(_FIRST_BIN * 2.0 ** (np.arange(count + 1) / _PER_OCTAVE)).astype(np.intp))
+    edges.flags.writeable = False
+    return edges
+
+
+@dataclass(frozen=True, slots=True)
+class BandLevels:
+    """Levels of a window in bands.
+
+    Attributes
+    ----------
+    edges_hz : ndarray, shape (n_bands + 1,)
+    rms : ndarray, shape (n_bands, n)
+        SI units.
+    errors : ndarray, shape (n_bands, n)
+        Standard errors by the scatter of the hops.
+    freedom : ndarray, shape (n_bands,)
+        Degrees of freedom of a mean square of Gaussian noise.
+    """
+
+    edges_hz: FloatArray
+    rms: FloatArray
+    errors: FloatArray
+    freedom: FloatArray
+
+
+class BandReference(BaseModel):
+    """Healthy levels of one channel in bands, SI units.
+
+    Attributes
+    ----------
+    high : tuple of float
+        Largest of the windows.
+    error : tuple of float
+        Mean standard error of one window.
+    freedom : tuple of float
+        Degrees of freedom of `mean`.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    edges_hz: tuple[_Level, ...]
+    mean: tuple[_Level, ...]
+    high: tuple[_Level, ...]
+    error: tuple[_Level, ...]
+    freedom: tuple[_Level, ...]
+
+
+def learn_bands(windows: Sequence[BandLevels], column: int) -> BandReference:
+    """Learn a channel's from healthy windows."""
+    rms = np.stack([one.rms[:, column] for one in windows])
+    errors = np.stack([one.errors[:, column] for one in windows])
+    return BandReference(
+        edges_hz=_short(windows[0].edges_hz),
+        mean=_short(rms.mean(axis=0)),
+        high=_short(rms.max(axis=0)),
+        error=_short(errors.mean(axis=0)),
+        freedom=_short(np.asarray(sum(one.freedom for one in windows))),
+    )
+
+
+def _short(values: FloatArray) -> tuple[float, ...]:
+    return tuple(float(f"{value:.4g}") for value in values.tolist())
+
+
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """The band that is nearest to its limit, or farthest beyond.
+
+    Attributes
+    ----------
+    band_hz : tuple of float
+    ratio : float
+        Its level over that of the reference.
+    limit : float
+        Ratio from which on it is an alert.
+    """
+
+    band_hz: tuple[float, float]
+    ratio: float
+    limit: float
+
+
+def growth(
+    levels: BandLevels, column: int, reference: BandReference, ratio: float, beyond_range: float, n_errors: float
+) -> Growth | None:
+    """Compare a channel's bands with the reference; None where there is nothing to compare.
+
+    The ratio of the mean squares of two stretches of Gaussian noise follows an F distribution (J. S. Bendat, A. G.
+    Piersol, "Random Data", 4th ed., chapter 4): no limit is nearer than what chance exceeds once in 10⁹ bands.
+
+    Parameters
+    ----------
+    ratio : float
+        Limit, times the mean of the reference.
+    beyond_range : float
+        No limit is nearer than that, times the largest healthy level.
+    n_errors : float
+        Nor nearer than so many standard errors of a window.
+    """
+    if _short(levels.edges_hz) != reference.edges_hz:
+        return None
+    now, own = levels.rms[:, column], np.array(reference.mean)
+    mean, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
+    chance = np.sqrt(fdtri(levels.freedom, np.array(reference.freedom), 1 - _CHANCE))
+    limit = np.max([np.maximum(ratio, chance) * mean, beyond_range * high, mean + n_errors * error], axis=0)
+    looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2))) & (own > 0)
+    if not looked_at.any():
+        return None
+    # What grows in all bands alike is growth of the excitation, which the overall level is judged by.
+    limit *= max(1.0, float(np.median(now[looked_at] / own[looked_at])))
+    at = int(np.argmax(np.where(looked_at, now / np.where(mean > 0, limit, 1.0), 0.0)))
+    edges = levels.edges_hz
+    return Growth((float(edges[at]), float(edges[at + 1])), float(now[at] / mean[at]), float(limit[at] / mean[at]))
+
+
+def _around(values: FloatArray) -> FloatArray:
+    """Largest of each band and its two neighbours."""
+    padded = np.pad(values, 1, mode="edge")
+    return np.asarray(np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:]))
