@@ -10,6 +10,7 @@ from models.errors import RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.orbit import in_planes
+from service.analysis.past import Past
 from service.analysis.recorded import Recorded, begins_again
 from service.analysis.revolutions import newest_revolutions
 
@@ -37,6 +38,34 @@ class Centreline:
     speed_rad_s: FloatArray
     y_um: FloatArray
     z_um: FloatArray
+
+
+def past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Centreline:
+    """Mean positions in the windows of the history, as the monitor reported them.
+
+    Raises
+    ------
+    RotorwatchError
+        If there are not two windows with all of them.
+    """
+    channels = [channel for pair in pairs for channel in pair]
+    rows = []
+    for report in data.reports:
+        means = {one.channel: one.mean for one in report.levels}
+        values = [means.get(channel.name) for channel in channels]
+        if None not in values:
+            rows.append((report.start_ns, report.end_ns, report.speed_rad_s, values))
+    if len(rows) < 2:
+        raise RotorwatchError(
+            f"{data.place}: {len(rows)} reports of {data.name} have the mean positions of "
+            f"{', '.join(channel.name for channel in channels)}, expected at least 2 for a centreline"
+        )
+    start, end, speed, means_ = zip(*rows, strict=True)
+    middle_ns = (np.array(start, dtype=np.int64) + np.array(end, dtype=np.int64)) // 2
+    y_um, z_um = in_planes(np.array(means_, dtype=np.float64), pairs)
+    return Centreline(
+        tuple(pairs), (end[-1] - start[-1]) / 1e9, middle_ns, np.array(speed, dtype=np.float64), y_um, z_um
+    )
 
 
 def read_centreline(data: Recorded, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:

@@ -11,7 +11,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.levels.measures import level_plan
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity, turned_pairs
-from service.analysis.recorded import Recorded
+from service.analysis.recorded import Described, Recorded
 from service.analysis.revolutions import Excerpt, newest_revolutions, pulses
 from service.analysis.vectors import vectors_of
 
@@ -200,8 +200,8 @@ def no_pair(channels: Iterable[Channel]) -> str:
     return f"an orbit needs the displacements in y and z at one place; measured displacements: {there}"
 
 
-def recorded_pairs(data: Recorded, place: str | None = None) -> list[tuple[Channel, Channel]]:
-    """Pairs of the recorded channels, all or those at one place.
+def recorded_pairs(data: Described, place: str | None = None) -> list[tuple[Channel, Channel]]:
+    """Pairs of the channels of some data, all or those at one place.
 
     Raises
     ------

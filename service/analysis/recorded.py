@@ -1,5 +1,6 @@
 """What was recorded of one machine in a stretch of time: channels by name, and samples without a gap."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,68 @@ def begins_again(end_ns: int, start_ns: int) -> bool:
     return start_ns < end_ns - _TOLERANCE_S * 1e9
 
 
-class Recorded:
+class Described(ABC):
+    """Data of one machine whose channels are known.
+
+    Attributes
+    ----------
+    name : str
+        ``site/machine``.
+    place : str
+        Where they are.
+    """
+
+    name: str
+    place: str
+
+    @property
+    @abstractmethod
+    def descriptor(self) -> ChannelDescriptor:
+        """Names and units of the channels."""
+
+    @property
+    def displacements(self) -> tuple[Channel, ...]:
+        """Channels that measure a displacement."""
+        return tuple(channel for channel in self.descriptor.channels if channel.quantity is Quantity.DISPLACEMENT)
+
+    @property
+    def has_angle(self) -> bool:
+        """Whether the shaft angle is measured."""
+        return "theta" in self.descriptor.states
+
+    def channels(self, names: Sequence[str]) -> tuple[Channel, ...]:
+        """Channels by name.
+
+        Raises
+        ------
+        MachineFileError
+            If there is no such channel, or it is the shaft angle; the message lists those that can be plotted.
+        """
+        there = {channel.name: channel for channel in self.descriptor.channels}
+        vibration = [name for name, channel in there.items() if channel.quantity is not Quantity.SHAFT_ANGLE]
+        for name in names:
+            if name not in vibration:
+                what = "is the shaft angle" if name in there else "is not a channel"
+                raise MachineFileError(
+                    f"--channel is {name!r}, which {what} of {self.name}; expected one of {', '.join(vibration)}"
+                )
+        return tuple(there[name] for name in dict.fromkeys(names))
+
+    def chosen(self, names: Sequence[str]) -> tuple[Channel, ...]:
+        """Channels by name; without names all displacements.
+
+        Raises
+        ------
+        MachineFileError
+            If there is no such channel, or none that could be meant.
+        """
+        found = self.channels(names) or self.displacements
+        if not found:
+            raise MachineFileError(f"{self.name} measures no displacement: name channels with --channel")
+        return found
+
+
+class Recorded(Described):
     """Recorded data of one machine.
 
     Parameters
@@ -83,7 +145,7 @@ class Recorded:
 
     @cached_property
     def descriptor(self) -> ChannelDescriptor:
-        """Names and units of the columns.
+        """Names and units of the channels.
 
         Raises
         ------
@@ -102,47 +164,6 @@ class Recorded:
     def messages(self, key: str) -> Iterator[RecordedMessage]:
         """What was recorded under a key."""
         return self.source.messages({key}, from_ns=self.from_ns, to_ns=self.to_ns)
-
-    @property
-    def displacements(self) -> tuple[Channel, ...]:
-        """Channels that measure a displacement."""
-        return tuple(channel for channel in self.descriptor.channels if channel.quantity is Quantity.DISPLACEMENT)
-
-    @property
-    def has_angle(self) -> bool:
-        """Whether the shaft angle is measured."""
-        return "theta" in self.descriptor.states
-
-    def channels(self, names: Sequence[str]) -> tuple[Channel, ...]:
-        """Channels by name.
-
-        Raises
-        ------
-        MachineFileError
-            If there is no such channel, or it is the shaft angle; the message lists those that can be plotted.
-        """
-        there = {channel.name: channel for channel in self.descriptor.channels}
-        vibration = [name for name, channel in there.items() if channel.quantity is not Quantity.SHAFT_ANGLE]
-        for name in names:
-            if name not in vibration:
-                what = "is the shaft angle" if name in there else "is not a channel"
-                raise MachineFileError(
-                    f"--channel is {name!r}, which {what} of {self.name}; expected one of {', '.join(vibration)}"
-                )
-        return tuple(there[name] for name in dict.fromkeys(names))
-
-    def chosen(self, names: Sequence[str]) -> tuple[Channel, ...]:
-        """Channels by name; without names all displacements.
-
-        Raises
-        ------
-        MachineFileError
-            If there is no such channel, or none that could be meant.
-        """
-        found = self.channels(names) or self.displacements
-        if not found:
-            raise MachineFileError(f"{self.name} measures no displacement: name channels with --channel")
-        return found
 
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None

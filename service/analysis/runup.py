@@ -9,8 +9,9 @@ from models.errors import MachineFileError, RotorwatchError
 from models.levels.measures import ORDERS
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
+from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.spectrum import shown_as, steady
+from service.analysis.spectrum import shown_as, steady, unit_shown
 from service.analysis.vectors import estimated_vectors, read_vectors
 
 
@@ -20,6 +21,8 @@ class RunUp:
 
     Attributes
     ----------
+    revolutions : int or None
+        That each vector is of; None where it is of a window of the monitor.
     time_ns : ndarray of int, shape (n,)
     speed_rad_s : ndarray, shape (n,)
         Negative where the shaft turns from z to y.
@@ -34,7 +37,7 @@ class RunUp:
     channels: tuple[Channel, ...]
     units: tuple[str, ...]
     order: int
-    revolutions: int
+    revolutions: int | None
     time_ns: npt.NDArray[np.int64]
     speed_rad_s: FloatArray
     amplitude: FloatArray
@@ -59,6 +62,43 @@ class RunUp:
             raise RotorwatchError(f"{what} needs a run-up or coast-down: {text}")
 
 
+def past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
+    """Vectors of the windows of the history, as the monitor reported them.
+
+    Raises
+    ------
+    RotorwatchError
+        If no window has the phases of all of these channels at this order.
+    """
+    measure = f"x{order}"
+    found = []
+    for report in data.reports:
+        levels = {one.channel: one for one in report.levels}
+        names = (measure, f"{measure}_phase_lag_deg")
+        values = [tuple(getattr(levels.get(one.name), name, None) for name in names) for one in channels]
+        if report.speed_rad_s is not None and all(None not in pair for pair in values):
+            found.append((report.end_ns, report.speed_rad_s, values))
+    if not found:
+        raise RotorwatchError(
+            f"{data.place}: no report of {data.name} has amplitude and phase of {order}x of "
+            f"{', '.join(one.name for one in channels)}: phases need a keyphasor, and are kept of 1x and 2x"
+        )
+    vectors = np.array([row for _, _, row in found], dtype=np.float64)
+    shown = [unit_shown(channel) for channel in channels]
+    return RunUp(
+        channels=channels,
+        units=tuple(shown_as(channel, "amplitude")[0] for channel in channels),
+        order=order,
+        revolutions=None,
+        time_ns=np.array([end_ns for end_ns, _, _ in found], dtype=np.int64),
+        speed_rad_s=np.array([speed for _, speed, _ in found]),
+        amplitude=vectors[:, :, 0] * np.array([factor for _, factor in shown]),
+        lag_deg=vectors[:, :, 1],
+        slow_roll_rpm=None,
+        estimated=False,
+    )
+
+
 def read_run_up(
     data: Recorded,
     channels: tuple[Channel, ...],
@@ -76,7 +116,7 @@ def read_run_up(
     revolutions : int
         How many each vector is taken of.
     slow_roll_rpm : float, optional
-        The mean vector up to this speed is taken away: it is runout, not vibration (API 670, slow-roll compensation).
+        The mean vector up to this speed is taken away: it is run-out, not vibration (API 670, slow-roll compensation).
     between_rpm : (float, float), optional
         Where the speed is looked for in the vibration, if there is no shaft angle.
 

@@ -1,7 +1,7 @@
 """Trends: what the monitor read of every parameter over time, and what it said."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from models.signals.block import FloatArray
 from models.signals.keys import MachineKeys
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmEventData, EventKind
 from rotorwatch.records.health import MEASURES, HealthState, Report
+from service.analysis.past import Past
 from service.analysis.recorded import Recorded
 from service.monitor.reports import machine_hash
 from service.recordings.replay.machine import choose_machine
@@ -89,6 +90,18 @@ class Trend:
     origin: str
 
 
+def past_trend(data: Past, *, levels: bool = False) -> Trend:
+    """What the history holds of a machine.
+
+    Raises
+    ------
+    RotorwatchError
+        If nothing was read in any report.
+    """
+    alarms = _shown_alarms(data.alarm_texts)
+    return trend_of([_slim(one) for one in data.reports], alarms, data.machine.alarms, "of the history", levels=levels)
+
+
 def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = False) -> Trend:
     """The recorded reports; or, without any or with another machine file, those of an offline replay.
 
@@ -117,10 +130,14 @@ def read_trend(data: Recorded, machine: str | None = None, *, levels: bool = Fal
 
 def recorded_alarms(data: Recorded) -> tuple[AlarmEventData, ...]:
     """Alarm events that were recorded, each once, by their time; unreadable ones are left out."""
+    return _shown_alarms(message.payload for message in data.messages(data.keys.alarm_event))
+
+
+def _shown_alarms(texts: Iterable[str | bytes]) -> tuple[AlarmEventData, ...]:
     found: dict[str, AlarmEventData] = {}
-    for message in data.messages(data.keys.alarm_event):
+    for text in texts:
         try:
-            event = AlarmCloudEvent.model_validate_json(message.payload)
+            event = AlarmCloudEvent.model_validate_json(text)
         except ValidationError:
             continue
         if event.data.kind in SHOWN:

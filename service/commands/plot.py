@@ -15,6 +15,7 @@ from service.commands.running import Commands, FromOption, ToOption, exit_codes,
 if TYPE_CHECKING:
     from service.analysis.figures.spectrum import Lines
     from service.analysis.figures.style import Paint
+    from service.analysis.past import Past
     from service.analysis.recorded import Recorded
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)")
@@ -44,7 +45,7 @@ _OrderOption = Annotated[int, typer.Option("--order", min=1, max=3, help="Multip
 _EachOption = Annotated[int, typer.Option("--revolutions", min=1, max=1000, help="How many each point is taken of.")]
 _SlowRollOption = Annotated[
     float | None,
-    typer.Option("--slow-roll", metavar="RPM", help="Take away the mean vector up to this speed, which is runout."),
+    typer.Option("--slow-roll", metavar="RPM", help="Take away the mean vector up to this speed, which is run-out."),
 ]
 
 
@@ -74,12 +75,24 @@ def _describe() -> None:
     """
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Picture:
     """What every picture asks for."""
 
-    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.")]
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="FILE...", help="Recordings (.mcap), in any order.", show_default=False),
+    ] = None
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="Picture to write: .png or .svg.")]
+    history: Annotated[
+        Path | None,
+        typer.Option(
+            "--history",
+            metavar="FILE",
+            help="Settings (TOML) of a monitor: what its history has, instead of recordings. For trend, bode, polar "
+            "and centreline.",
+        ),
+    ] = None
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a picture that is there already.")] = False
     key: Annotated[
         str | None, typer.Option("--key", metavar="SITE/MACHINE", help="Which machine, if the recordings hold several.")
@@ -109,7 +122,21 @@ class _Picture:
         """The data it is of."""
         from service.analysis.recorded import Recorded  # noqa: PLC0415  # keeps --help quick
 
+        if self.history is not None:
+            raise MachineFileError("--history: a history has no samples, which this picture is of; name recordings")
+        if not self.files:
+            raise MachineFileError("no recordings are named: expected FILE...")
         return Recorded.find(self.files, self.key, (self.from_, self.to), at, reports=reports)
+
+    def known(self, *, reports: bool = False) -> "Recorded | Past":
+        """The recorded data it is of, or what the history has."""
+        if self.history is None or self.files:
+            if self.history is not None:
+                raise MachineFileError("recordings and --history are named, expected one of them")
+            return self.recorded(reports=reports)
+        from service.analysis.past import Past  # noqa: PLC0415
+
+        return Past.find(self.history, self.key, (self.from_, self.to))
 
     def draw(self, paint: "Paint") -> None:
         """Draw and write it."""
@@ -164,7 +191,7 @@ def trend(
     """Every parameter's change with its 95 % interval over time, or vibration levels; state, alarms and speed."""
     from service.analysis.figures.trend import trend as read  # noqa: PLC0415
 
-    return read(picture.recorded(reports=True), machine, levels=levels)
+    return read(picture.known(reports=True), machine, levels=levels)
 
 
 @_kind
@@ -295,7 +322,7 @@ def centreline(
 
     _positive("--window", window)
     _positive("--clearance", clearance)
-    return read(picture.recorded(), place, window, clearance)
+    return read(picture.known(), place, window, clearance)
 
 
 @_kind
@@ -315,7 +342,7 @@ def bode(
     """Amplitude and phase lag of 1x over the speed, from a run-up or coast-down."""
     from service.analysis.figures.bode import bode as read  # noqa: PLC0415
 
-    return read(picture.recorded(), channel or (), order, revolutions, slow_roll, _speeds(speeds))
+    return read(picture.known(), channel or (), order, revolutions, slow_roll, _speeds(speeds))
 
 
 @_kind
@@ -329,7 +356,7 @@ def polar(
     """The same as vectors in their plane, with speeds at points; the lag goes against the rotation."""
     from service.analysis.figures.bode import polar as read  # noqa: PLC0415
 
-    return read(picture.recorded(), channel or (), order, revolutions, slow_roll)
+    return read(picture.known(), channel or (), order, revolutions, slow_roll)
 
 
 def _lines(window_s: float, resolution_hz: float, to_hz: float | None, *, density: bool, log: bool) -> "Lines":

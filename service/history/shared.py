@@ -1,12 +1,13 @@
-"""What no single machine has the right to: tokens, audit log, cursors of webhooks, and all logs of alarms to read."""
+"""What no single machine has the right to: tokens, audit log, cursors of webhooks; and alarms and reports to read."""
 
 from typing import Any
 
-from sqlalchemy import insert, select, update
+from sqlalchemy import func, insert, select, update
 
+from service.history.claim import unpack
 from service.history.database import Database
 from service.history.records import AuditEntry, StoredEvent, StoreError, TokenRecord
-from service.history.tables import alarm_events, audit_log, machines, tokens, webhook_cursors
+from service.history.tables import alarm_events, audit_log, machines, reports, tokens, webhook_cursors
 
 EVENT = [alarm_events.c[name] for name in StoredEvent.__dataclass_fields__]
 _MOST = 10_000
@@ -55,6 +56,29 @@ def committed_events(url: str, site: str, name: str, recorded_ns: int) -> tuple[
         return AlarmLog(database).since(site, name, recorded_ns)
     finally:
         database.stop()
+
+
+class ReportLog:
+    """Reports that monitors committed, of one machine; for any thread. Both methods raise `StoreError`."""
+
+    def __init__(self, database: Database, site: str, name: str) -> None:
+        self._database = database
+        self._own = (machines.c.machine_id == reports.c.machine_id, machines.c.site == site, machines.c.name == name)
+
+    def span_ns(self) -> tuple[int, int] | None:
+        """When the oldest and the newest window end; None if there are no reports."""
+        ((first, last),) = self._database.rows(
+            select(func.min(reports.c.end_ns), func.max(reports.c.end_ns)).where(*self._own)
+        )
+        return None if first is None else (first, last)
+
+    def texts(self, since_ns: int, until_ns: int, most: int) -> list[str]:
+        """Reports of windows with since_ns ≤ end_ns < until_ns, oldest first; every so many, if there are more."""
+        where = (*self._own, reports.c.end_ns >= since_ns, reports.c.end_ns < until_ns)
+        ((count,),) = self._database.rows(select(func.count()).select_from(reports).where(*where))
+        every = -(-count // most) or 1
+        query = select(reports.c.text).where(*where, reports.c.number % every == 0).order_by(reports.c.number)
+        return [unpack(text) for (text,) in self._database.rows(query)]
 
 
 _ENTRY = [audit_log.c[name] for name in AuditEntry.__dataclass_fields__]

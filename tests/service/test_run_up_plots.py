@@ -218,7 +218,7 @@ def test_a_bode_plot_marks_the_greatest_amplitude(run_up: tuple[int, Path]) -> N
     assert lower.get_title(loc="right").startswith("greatest: 2")
 
 
-def test_runout_is_taken_away(tmp_path: Path) -> None:
+def test_run_out_is_taken_away(tmp_path: Path) -> None:
     """A shaft that is 3 µm out of round all along, and vibrates by 10 µm half a turn later when it is fast."""
 
     def fast(t: FloatArray) -> FloatArray:
@@ -321,7 +321,7 @@ def test_a_centreline_is_the_mean_of_the_gaps(tmp_path: Path, keyphasor: bool) -
     axes, bar = drawn(centreline(data, "bearing", 2.0, 100.0)).axes
     if keyphasor:
         assert found.speed_rad_s / (2 * np.pi) == pytest.approx(2.2 + np.arange(1, 20, 2), rel=0.01)
-    assert bar.get_ylabel() == ("speed, rpm" if keyphasor else "time, s")
+    assert bar.get_ylabel() == ("speed, rpm" if keyphasor else "time after the start, s")
     assert f"start: y1 {found.y_um[0, 0]:.4g} µm, z1 {found.z_um[0, 0]:.4g} µm" in axes.texts[-1].get_text()
     assert axes.get_xlim()[0] < -50 < 50 < axes.get_xlim()[1]  # the whole clearance
     with pytest.raises(RotorwatchError, match="1 stretches of 20 s of demo/lab without a gap, expected at least 2"):

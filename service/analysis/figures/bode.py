@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.projections.polar import PolarAxes
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
+from models.errors import MachineFileError
 from models.signals.block import FloatArray
 from service.analysis.figures.style import (
     COLOURS,
@@ -21,22 +22,25 @@ from service.analysis.figures.style import (
     PLATE,
     Look,
     Paint,
+    along_path,
     heading,
+    mark_text,
     place_text,
     rotation_text,
     speeds_text,
     spread_marks,
     stretch_text,
 )
+from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.runup import RunUp, read_run_up
+from service.analysis.runup import RunUp, past_run_up, read_run_up
 
 _APART = 0.16
 """Distance of marks, of the longest vector."""
 
 
-def bode(
-    data: Recorded,
+def bode(  # what may be asked for
+    data: Recorded | Past,
     channels: Sequence[str],
     order: int,
     revolutions: int,
@@ -44,15 +48,32 @@ def bode(
     between_rpm: tuple[float, float] | None = None,
 ) -> Paint:
     """Amplitude and phase lag at an order over the speed."""
-    found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm, between_rpm)
+    found = _read(data, channels, order, revolutions, slow_roll_rpm, between_rpm)
     found.check_speeds("a Bode plot")
     return partial(_paint_bode, found, data.name)
 
 
-def polar(data: Recorded, channels: Sequence[str], order: int, revolutions: int, slow_roll_rpm: float | None) -> Paint:
-    """The same as vectors in their plane, with speeds written at points."""
-    found = read_run_up(data, data.chosen(channels), order, revolutions, slow_roll_rpm)
-    return partial(_paint_polar, found, data.name)
+def polar(
+    data: Recorded | Past, channels: Sequence[str], order: int, revolutions: int, slow_roll_rpm: float | None
+) -> Paint:
+    """The same as vectors in their plane, with speeds or times written at points."""
+    return partial(_paint_polar, _read(data, channels, order, revolutions, slow_roll_rpm), data.name)
+
+
+def _read(  # what may be asked for
+    data: Recorded | Past,
+    channels: Sequence[str],
+    order: int,
+    revolutions: int,
+    slow_roll_rpm: float | None,
+    between_rpm: tuple[float, float] | None = None,
+) -> RunUp:
+    chosen = data.chosen(channels)
+    if isinstance(data, Recorded):
+        return read_run_up(data, chosen, order, revolutions, slow_roll_rpm, between_rpm)
+    if slow_roll_rpm is not None or between_rpm is not None:
+        raise MachineFileError("--slow-roll and --speeds need samples: name recordings instead of --history")
+    return past_run_up(data, chosen, order)
 
 
 def _paint_bode(found: RunUp, name: str, look: Look) -> Figure:
@@ -115,7 +136,7 @@ def _cut_deg(lag_deg: FloatArray, amplitude: FloatArray) -> float:
 def _paint_polar(found: RunUp, name: str, look: Look) -> Figure:
     columns = min(2, len(found.channels))
     rows = -(-len(found.channels) // columns)
-    figure = Figure(figsize=look.size_in or (5.2 * columns if columns > 1 else 6.4, 0.9 + 5.6 * rows))
+    figure = Figure(figsize=look.size_in or (max(8.0, 5.2 * columns), 0.9 + 5.6 * rows))
     figure.set_layout_engine("constrained")
     direction = found.direction
     panels = figure.subplots(rows, columns, squeeze=False, subplot_kw={"projection": "polar"}).ravel()
@@ -139,16 +160,16 @@ def _trace(axes: PolarAxes, found: RunUp, number: int) -> None:
     axes.plot(lag, amplitude, ".-", color=COLOURS[0], markersize=3, linewidth=0.7)
     axes.set_rmax(1.12 * float(np.max(amplitude)) or 1.0)
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.set_rlabel_position(_cut_deg(lag_deg, amplitude))
+    axes.set_rlabel_position(45 * (_cut_deg(lag_deg, amplitude) // 45) + 22.5)
     axes.tick_params(labelsize=8)
-    speed = np.abs(found.speed_rad_s) * 30 / np.pi
-    for at in spread_marks(speed, amplitude * np.exp(1j * lag), _APART * float(np.max(amplitude))):
+    along, unit = along_path(found.speed_rad_s, found.time_ns)
+    for at in spread_marks(along, amplitude * np.exp(1j * lag), _APART * float(np.max(amplitude))):
         axes.plot(lag[at], amplitude[at], "o", color=COLOURS[1], markersize=4, zorder=4)
         axes.annotate(
-            f"{speed[at]:.0f}", (lag[at], amplitude[at]), xytext=(4, 4),
+            mark_text(along[at], unit), (lag[at], amplitude[at]), xytext=(4, 4),
             textcoords="offset points", fontsize=8, color=COLOURS[1], bbox=PLATE, zorder=5,
         )  # fmt: skip
-    axes.set_xlabel(f"{found.order}× amplitude, {found.units[number]}; speeds in rpm", fontsize=8, color=GREY)
+    axes.set_xlabel(f"{found.order}× amplitude, {found.units[number]}; marks: {unit}", fontsize=8, color=GREY)
 
 
 def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
@@ -159,8 +180,14 @@ def _heading(figure: Figure, look: Look, found: RunUp, title: str) -> None:
         (
             stretch_text(int(found.time_ns[0]), int(found.time_ns[-1])),
             speeds_text(found.speed_rad_s),
-            "speed found in the vibration, no phase" if found.estimated else f"{found.revolutions} revolutions a point",
+            _points_text(found),
             f"less slow roll up to {found.slow_roll_rpm:g} rpm" if found.slow_roll_rpm is not None else "",
             "" if found.estimated else rotation_text(found.direction),
         ),
     )
+
+
+def _points_text(found: RunUp) -> str:
+    if found.estimated:
+        return "speed found in the vibration, no phase"
+    return "windows of the monitor" if found.revolutions is None else f"{found.revolutions} revolutions a point"

@@ -9,7 +9,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from service.analysis.centreline import Centreline, read_centreline
+from service.analysis.centreline import Centreline, past_centreline, read_centreline
 from service.analysis.figures.style import (
     COLOURS,
     GREY,
@@ -17,28 +17,30 @@ from service.analysis.figures.style import (
     PLATE,
     Look,
     Paint,
+    along_path,
     heading,
+    mark_text,
     plane_labels,
     speeds_text,
     spread_marks,
     stretch_text,
 )
 from service.analysis.orbit import planes_of, recorded_pairs
+from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.spectrum import steady
 
 
-def centreline(data: Recorded, place: str | None, each_s: float, clearance_um: float | None) -> Paint:
+def centreline(data: Recorded | Past, place: str | None, each_s: float, clearance_um: float | None) -> Paint:
     """Mean positions of pairs of probes, from the first one on."""
-    found = read_centreline(data, recorded_pairs(data, place), each_s)
+    pairs = recorded_pairs(data, place)
+    found = read_centreline(data, pairs, each_s) if isinstance(data, Recorded) else past_centreline(data, pairs)
     return partial(_paint, found, data.name, clearance_um)
 
 
 def _paint(found: Centreline, name: str, clearance_um: float | None, look: Look) -> Figure:
     columns = len(found.pairs)
     figure = Figure(figsize=look.size_in or (max(7.2, 5.4 * columns), 6.2), layout="constrained")
-    over_speed = bool(np.isfinite(found.speed_rad_s).all()) and not steady(found.speed_rad_s)
-    along = np.abs(found.speed_rad_s) * 30 / np.pi if over_speed else (found.time_ns - found.time_ns[0]) / 1e9
+    along, unit = along_path(found.speed_rad_s, found.time_ns)
     norm = Normalize(float(along.min()), float(along.max()))
     panels = figure.subplots(1, columns, squeeze=False)[0]
     for number, (axes, pair) in enumerate(zip(panels, found.pairs, strict=True)):
@@ -48,12 +50,11 @@ def _paint(found: Centreline, name: str, clearance_um: float | None, look: Look)
         lines.set_array((along[:-1] + along[1:]) / 2)
         axes.add_collection(lines)
         axes.scatter(y, z, c=along, cmap="viridis_r", norm=norm, s=9, zorder=3, linewidths=0)
-        unit = "rpm" if over_speed else "s"
         reach = max(float(np.ptp(y)), float(np.ptp(z)), 1e-3)
         for at in spread_marks(along, y + 1j * z, 0.14 * reach):
             axes.plot(y[at], z[at], "o", color=COLOURS[1], markersize=4.5, zorder=4)
             axes.annotate(
-                f"{along[at]:.0f} {unit}", (y[at], z[at]), xytext=(5, 4), textcoords="offset points", fontsize=8,
+                mark_text(along[at], unit), (y[at], z[at]), xytext=(5, 4), textcoords="offset points", fontsize=8,
                 color=COLOURS[1], bbox=PLATE, zorder=5,
             )  # fmt: skip
         if clearance_um is not None:
@@ -61,7 +62,7 @@ def _paint(found: Centreline, name: str, clearance_um: float | None, look: Look)
         _frame(axes, found, number, y, z, clearance_um)
         axes.set_title(f"{pair[0].location}", fontweight="bold")
     bar = figure.colorbar(lines, ax=list(panels), pad=0.02, aspect=32, shrink=0.9)
-    bar.set_label("speed, rpm" if over_speed else "time, s")
+    bar.set_label(unit)
     heading(
         figure,
         look,

@@ -17,6 +17,7 @@ from models.errors import RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from rotorwatch.records.alarms import AlarmEventData
+from service.analysis.spectrum import steady
 from service.recordings.replay.source import clock
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -40,6 +41,7 @@ PLATE = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none"
 
 _ROUND = tuple(step * 10.0**power for power in range(-3, 9) for step in (1, 2, 5))
 _MOST_MARKS = 30
+_UNITS = (("days", 86_400), ("hours", 3600), ("minutes", 60), ("s", 1))
 
 _STYLE = {
     "font.size": 9.0,
@@ -153,6 +155,20 @@ def speeds_text(speed_rad_s: FloatArray) -> str:
     """From which speed to which."""
     low, high = float(np.min(np.abs(speed_rad_s))), float(np.max(np.abs(speed_rad_s)))
     return rpm(low) if not np.isfinite(low) or high - low < 0.005 * high else f"{rpm(low)} to {rpm(high)}"
+
+
+def along_path(speed_rad_s: FloatArray, time_ns: npt.NDArray[np.int64]) -> tuple[FloatArray, str]:
+    """Numbers to be written along a path, and what they are: speeds if they change, times after the start if not."""
+    if np.isfinite(speed_rad_s).all() and not steady(speed_rad_s):
+        return np.abs(speed_rad_s) * 30 / np.pi, "speed, rpm"
+    seconds = (time_ns - time_ns[0]) / 1e9
+    unit, length = next((unit, length) for unit, length in _UNITS if seconds[-1] >= 2 * length or length == 1)
+    return seconds / length, f"time after the start, {unit}"
+
+
+def mark_text(value: float, unit: str) -> str:
+    """One of those numbers."""
+    return f"{value:.0f}" if unit.endswith("rpm") else f"{value:.3g}"
 
 
 def spread_marks(along: FloatArray, places: npt.NDArray[Any], apart: float) -> list[int]:

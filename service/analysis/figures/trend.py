@@ -10,6 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from models.alarm_names import MODEL
+from models.errors import MachineFileError
 from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.alarms import AlarmEventData
@@ -30,17 +31,22 @@ from service.analysis.figures.style import (
     stretch_text,
     time_axis,
 )
+from service.analysis.past import Past
 from service.analysis.recorded import Recorded
-from service.analysis.trend import LevelTrend, ParameterTrend, Trend, read_trend
+from service.analysis.trend import LevelTrend, ParameterTrend, Trend, past_trend, read_trend
 
 _GAP = 2.5
 _DASHES = (0, (4, 3))
 _LEAST_PERCENT = 5.0
 
 
-def trend(data: Recorded, machine: str | None, *, levels: bool) -> Paint:
+def trend(data: Recorded | Past, machine: str | None, *, levels: bool) -> Paint:
     """Parameters or levels over time, as recorded or with the machine file ``FILE[@BUNDLE]``."""
-    return partial(_paint, read_trend(data, machine, levels=levels))
+    if isinstance(data, Recorded):
+        return partial(_paint, read_trend(data, machine, levels=levels))
+    if machine is not None:
+        raise MachineFileError("--machine needs samples: name recordings instead of --history")
+    return partial(_paint, past_trend(data, levels=levels))
 
 
 def _paint(trend: Trend, look: Look) -> Figure:

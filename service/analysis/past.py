@@ -1,0 +1,89 @@
+"""What the history of a monitor holds of one machine: reports, each with the levels of its window."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from models.errors import MachineFileError, RotorwatchError
+from models.machine import MachineFile
+from models.signals.channels import ChannelDescriptor
+from rotorwatch.records.health import Report
+from service.analysis.recorded import Described
+from service.history.database import Database
+from service.history.shared import AlarmLog, ReportLog
+from service.recordings.replay.source import parse_moment
+from service.settings.service import load_settings
+
+_TIMEOUT_S = 5.0
+_MOST = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Past(Described):
+    """Reports of one machine, oldest first; every so many of a long time."""
+
+    machine: MachineFile
+    name: str
+    place: str
+    reports: tuple[Report, ...]
+    alarm_texts: tuple[str, ...]
+
+    @property
+    def descriptor(self) -> ChannelDescriptor:
+        """Names and units of the channels, as the machine file has them now."""
+        return self.machine.descriptor
+
+    @classmethod
+    def find(cls, settings: Path, key: str | None, between: tuple[str | None, str | None]) -> "Past":
+        """Read the history that a monitor's settings name; the monitor may be running.
+
+        Parameters
+        ----------
+        key : str or None
+            ``SITE/MACHINE``, where the settings name several machines.
+        between : (str or None, str or None)
+            From and to: seconds after the end of the oldest window, or times.
+
+        Raises
+        ------
+        MachineFileError
+            If settings or times cannot be used, or there is no such machine.
+        RotorwatchError
+            If the history cannot be read, or has no reports there.
+        """
+        chosen = load_settings(settings)
+        there = {f"{one.site}/{one.name}": one for one in (entry.load() for entry in chosen.machines)}
+        name = key or next(iter(there))
+        if name not in there or (key is None and len(there) > 1):
+            raise MachineFileError(f"{settings}: machines: {', '.join(there)}; name one, as --key SITE/MACHINE")
+        machine = there[name]
+        database = Database(chosen.history.database, _TIMEOUT_S)
+        database.start(read_only=True)
+        try:
+            log = ReportLog(database, machine.site, machine.name)
+            span = log.span_ns()
+            if span is None:
+                raise RotorwatchError(f"{settings}: no reports of {name} in the history")
+            first, last = span
+            since, until = (
+                other if text is None else parse_moment(text, first, option)
+                for text, other, option in zip(between, (first, last + 1), ("--from", "--to"), strict=True)
+            )
+            alarms = AlarmLog(database).since(machine.site, machine.name, 0)
+            found = [_parsed(text) for text in log.texts(since, until, _MOST)]
+        finally:
+            database.stop()
+        reports = tuple(report for report in found if report is not None)
+        if not reports:
+            raise RotorwatchError(f"{settings}: no reports of {name} in this stretch of time")
+        return cls(
+            machine, name, str(settings), reports, tuple(one.text for one in alarms if since <= one.time_ns < until)
+        )
+
+
+def _parsed(text: str) -> Report | None:
+    try:
+        return Report.model_validate_json(text)
+    except ValidationError:
+        return None  # of another version of the program
