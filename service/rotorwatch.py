@@ -26,9 +26,8 @@ from service.commands.running import (
     VersionOption,
     check_address_space,
     exit_codes,
-    one_blas_thread,
+    prepare_numerics,
     raise_file_limit,
-    share_memory_arenas,
 )
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
@@ -95,9 +94,8 @@ def run(
     """
     with exit_codes():
         check_address_space()
-        one_blas_thread()
+        prepare_numerics()
         raise_file_limit()
-        share_memory_arenas()
         from service.runtime import running  # noqa: PLC0415  # must see the variables set above
         from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
         from service.terminal.logs import configure_logging  # noqa: PLC0415
@@ -216,7 +214,7 @@ def demo(
     """
     with exit_codes():
         check_address_space()
-        one_blas_thread()
+        prepare_numerics()
         typer.echo("starting a simulated machine and a monitor (some seconds) ...")
         sys.stdout.flush()
         from service.commands.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -157,7 +157,7 @@ def doctor(
     [cyan]rotorwatch doctor --machine fan.toml --connect tcp/127.0.0.1:7447[/cyan]
     """
     with exit_codes():
-        one_blas_thread()
+        prepare_numerics()
         from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
         from models.signals.link import LinkSettings  # noqa: PLC0415
         from models.signals.recording import RecordedMessage  # noqa: PLC0415

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.commands.running import exit_codes, one_blas_thread
+from service.commands.running import exit_codes, prepare_numerics
 
 _LISTED = 5
 _TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d"]
@@ -44,7 +44,7 @@ def import_(
     [cyan]rotorwatch import run7.csv --mapping run7.toml --machine pump-7.toml --out run7.mcap[/cyan]
     """
     with exit_codes():
-        one_blas_thread()
+        prepare_numerics()
         from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
         from service.interchange.importing import import_file  # noqa: PLC0415
         from service.interchange.mapping import load_mapping  # noqa: PLC0415
@@ -90,7 +90,7 @@ def export(
     2026-01-31T12:01:00[/cyan]
     """
     with exit_codes():
-        one_blas_thread()
+        prepare_numerics()
         from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
         from service.interchange.exporting import export as write  # noqa: PLC0415
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import Commands, FromOption, ToOption, exit_codes, one_blas_thread
+from service.commands.running import Commands, FromOption, ToOption, exit_codes, prepare_numerics
 
 if TYPE_CHECKING:
     from service.analysis.figures.spectrum import Lines
@@ -161,7 +161,7 @@ def _kind(paint: Callable[..., "Paint"]) -> None:
 
     def command(**given: Any) -> None:
         with exit_codes():
-            one_blas_thread()
+            prepare_numerics()
             picture = _Picture(**{name: given.pop(name) for name in shared})
             picture.check()
             picture.draw(paint(picture, **given))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from models.errors import MachineFileError, RecordingError
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, one_blas_thread
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -72,7 +72,7 @@ def record(
     [cyan]rotorwatch record --machine pump-7.toml --machine fan-2.toml --out /data --connect tcp/10.0.0.9:7447[/cyan]
     """
     with exit_codes(), ExitStack() as undo:
-        one_blas_thread()
+        prepare_numerics()
         changes = {"rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
         machines, settings, history = _settings(
             config, machine, out, {k: v for k, v in changes.items() if v is not None}

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from models.errors import MachineFileError, RecordingError, RotorwatchError
-from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes, one_blas_thread
+from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes, prepare_numerics
 
 if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
@@ -132,7 +132,7 @@ def replay(
     with exit_codes():
         if nice:
             os.nice(nice)
-        one_blas_thread()
+        prepare_numerics()
         from service.recordings.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
         from service.recordings.replay.control import Control  # noqa: PLC0415
         from service.recordings.replay.source import RecordingSource  # noqa: PLC0415

@@ -17,7 +17,8 @@ ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
 
 _FILES = 65_536
-_M_ARENA_MAX = -8  # of malloc.h
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of malloc.h
+_KEPT_BYTES, _LARGE_BYTES = 64 << 20, 32 << 20
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
@@ -79,13 +80,25 @@ class Commands(TyperGroup):
             raise
 
 
-def one_blas_thread() -> None:
-    """Let numpy compute in one thread: results do not depend on the number of cores, and workers do not compete.
+def prepare_numerics() -> None:
+    """Settings of the process for numerics: threads and memory. Works only before numpy is imported.
 
-    Works only before numpy is imported.
+    One thread for linear algebra: results do not depend on the number of cores, and workers do not compete.
+
+    Two arenas of the C library's memory for all threads: by default glibc gives each thread of up to eight per core one
+    of its own, and each keeps what it once needed. After hundreds of thousands of messages of all sizes the monitor
+    held twice the memory that it used.
+
+    What a hop has freed is kept for the next one: by default glibc hands arrays of more than 128 kB back to the kernel,
+    and getting them again, page by page, took longer than the arithmetic of a hop.
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
+    library = ctypes.CDLL(None)
+    if hasattr(library, "mallopt"):  # not everywhere
+        library.mallopt(_M_ARENA_MAX, 2)
+        library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
+        library.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def raise_file_limit() -> None:
@@ -95,17 +108,6 @@ def raise_file_limit() -> None:
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with suppress(OSError, ValueError):  # where even this is forbidden, it goes on with what there is
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def share_memory_arenas() -> None:
-    """Let all threads share two arenas of the C library's memory.
-
-    By default glibc gives each thread of up to eight per core one of its own, and each keeps what it once needed: after
-    hundreds of thousands of messages of all sizes the monitor held twice the memory that it used.
-    """
-    library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):  # not everywhere
-        library.mallopt(_M_ARENA_MAX, 2)
 
 
 def check_address_space() -> None:

@@ -67,7 +67,7 @@ def test_numpy_computes_in_one_thread() -> None:
     code = (
         "import os, sys\nfrom service import rotorwatch\n"
         "assert not {'numpy', 'pydantic', 'sqlalchemy', 'zenoh'} & set(sys.modules)  # --help does not wait for them\n"
-        "rotorwatch.one_blas_thread()\nimport numpy as np\n"
+        "rotorwatch.prepare_numerics()\nimport numpy as np\n"
         "a = np.ones((800, 800))\na @ a\nprint(len(os.listdir('/proc/self/task')))"
     )
     found = subprocess.run(

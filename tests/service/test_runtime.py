@@ -272,11 +272,11 @@ def test_health_over_http_is_the_health_on_the_topic() -> None:
 _ARENAS = """
 import sys, threading
 from pathlib import Path
-from service.commands.running import share_memory_arenas
+from service.commands.running import prepare_numerics
 def size_mb():
     return int(Path("/proc/self/statm").read_text().split()[0]) * 4096 / 1e6
 if sys.argv[1] == "shared":
-    share_memory_arenas()
+    prepare_numerics()
 threading.stack_size(2**20)
 before_mb, barrier, done = size_mb(), threading.Barrier(9), threading.Event()
 def work():
