@@ -71,8 +71,9 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
             refused[verdict.text] += 1
             continue
         if not verdict.continuous:
-            accepted.clear()
             troubles.append(verdict.text)
+        if not verdict.continuous or verdict.new_snapshot:
+            accepted.clear()
         accepted.append(block)
     for text, count in refused.most_common(5):
         troubles.append(f"{count} blocks would be refused: {text}")
@@ -91,9 +92,8 @@ def _of_samples(machine: MachineFile, blocks: Sequence[SampleBlock], troubles: l
     plan = plan_for(machine, levels=True)
     samples = plan.to_si(np.concatenate([block.samples for block in blocks]))
     duration_s = (blocks[-1].end_ns - blocks[0].start_ns) / 1e9
-    lines = [
-        f"{duration_s:.3g} s without a gap, in blocks of {np.median([len(one.samples) for one in blocks]):g} samples"
-    ]
+    what = "without a gap" if machine.schedule is None else "in the latest snapshot"
+    lines = [f"{duration_s:.3g} s {what}, in blocks of {np.median([len(one.samples) for one in blocks]):g} samples"]
     speed, angle = np.nan, None
     if plan.angle_column is None:
         lines.append("no shaft angle (keyphasor): no phases, and 1x only near a known speed")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # these import numpy, which --help must not wait for
 
 _SENSOR = ("name", "quantity", "unit", "location", "direction")
 _ANGLE = "angle_deg"
+_SCHEDULE = ("on_s", "every_s")
 _EXAMPLE = "DE-H acceleration g DE horizontal"
 
 
@@ -46,6 +47,14 @@ def init(
     speed_rpm: Annotated[
         float | None, typer.Option("--speed-rpm", metavar="RPM", help="Nominal speed, if it is known: for 1x and 2x.")
     ] = None,
+    snapshots: Annotated[
+        str | None,
+        typer.Option(
+            "--snapshots",
+            metavar="'SECONDS EVERY'",
+            help="Where samples come in pieces, their length and period in seconds, such as '0.1 10'.",
+        ),
+    ] = None,
     zones: Annotated[
         list[str] | None,
         typer.Option("--zones", help="Zones of a standard, such as 'ISO 20816-3 group 2 rigid'. Repeatable."),
@@ -75,6 +84,7 @@ def init(
             "name": name,
             "rate_hz": rate,
             "operation": None if speed_rpm is None else {"speed_rpm": speed_rpm},
+            "schedule": None if snapshots is None else _schedule(snapshots),
             "levels": {"zones": zones or []},
             "sensors": [_sensor(line) for line in lines],
         }
@@ -124,12 +134,21 @@ def _sensor(line: str) -> dict[str, str]:
     return dict(zip((*_SENSOR, _ANGLE), words, strict=False))
 
 
+def _schedule(given: str) -> dict[str, str]:
+    words = given.split()
+    if len(words) != len(_SCHEDULE):
+        raise MachineFileError(f"--snapshots {given!r} has {len(words)} words, expected two, such as '0.1 10'")
+    return dict(zip(_SCHEDULE, words, strict=True))
+
+
 def _machine_text(machine: "MachineFile", speed_rpm: float | None) -> str:
     """A machine file of what is known, and hints at the rest."""
     lines = [f"{key} = {json.dumps(value)}" for key, value in (("site", machine.site), ("name", machine.name))]
     lines += [f"rate_hz = {machine.rate_hz}", f'dtype = "{machine.dtype}"']
     if speed_rpm is not None:
         lines += ["", "[operation]", f"speed_rpm = {float(speed_rpm)}"]
+    if machine.schedule is not None:
+        lines += ["", "[schedule]", *(f"{key} = {getattr(machine.schedule, key)}" for key in _SCHEDULE)]
     zones = json.dumps(machine.levels.zones)
     lines += ["", "# Limits of vibration levels: docs/levels.md", "[levels]", f"zones = {zones}"]
     for channel in machine.sensors:
@@ -142,7 +161,15 @@ def doctor(
     machine: Annotated[str, typer.Option("--machine", metavar="FILE", help="Machine file: shipped name or path.")],
     connect: ConnectOption = None,
     listen: ListenOption = None,
-    seconds: Annotated[float, typer.Option("--seconds", min=1, max=3600, help="How long to listen.")] = 10.0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            "--seconds",
+            min=1,
+            max=86400,
+            help="How long to listen; 10 s if left out, or until a snapshot must have come.",
+        ),
+    ] = None,
 ) -> None:
     """Listen to a machine's stream for a while, and say what arrives: rate, units, levels, keyphasor; what is missing.
 
@@ -170,6 +197,8 @@ def doctor(
         heard: list[RecordedMessage] = []
         try:
             tap = MachineTap(link, known.keys, heard.append)
+            schedule = known.schedule
+            seconds = seconds or (10.0 if schedule is None else 10.0 + schedule.every_s + schedule.on_s)
             typer.echo(f"listening for {seconds:g} s to {known.keys.root} ...")
             sys.stdout.flush()
             time.sleep(seconds)

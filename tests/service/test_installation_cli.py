@@ -33,13 +33,13 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return ran("service.rotorwatch", *arguments, environment={"PATH": "/usr/bin:/bin", "COLUMNS": "200"})
 
 
-def blocks(seconds: float, rate_hz: float = RATE_HZ) -> Iterator[tuple[SampleBlock, tuple[()]]]:
+def blocks(seconds: float, rate_hz: float = RATE_HZ, every_s: float = 0.5) -> Iterator[tuple[SampleBlock, tuple[()]]]:
     rng, size = np.random.default_rng(95), round(0.5 * rate_hz)
-    for number in range(round(seconds / 0.5)):
-        t = number * 0.5 + np.arange(size) / rate_hz
+    for number in range(round(seconds / every_s)):
+        t = number * every_s + np.arange(size) / rate_hz
         drive = 0.04 * np.sin(2 * np.pi * 24.8 * t) + 0.05 * rng.standard_normal(size)
         samples = np.column_stack([drive, 1.1 * np.sin(2 * np.pi * 24.8 * t)]).astype(np.float32)
-        start_ns = START_NS + number * 500_000_000
+        start_ns = START_NS + round(number * every_s * 1e9)
         yield SampleBlock(run=3, sequence=number, start_ns=start_ns, rate_hz=rate_hz, samples=samples), ()
 
 
@@ -48,10 +48,11 @@ def publishing(folder: Path, address: str, seconds: float, pace: float, rate_hz:
     """Somebody's sensors: they wait for a subscriber and send until the end."""
     stop = threading.Event()
     machine = load_machine_file(folder / "fan.toml").model_copy(update={"rate_hz": rate_hz})
+    every_s = 0.5 if machine.schedule is None else machine.schedule.every_s
     settings = PublishSettings(
         link=LinkSettings(connect=(address,)), pace=pace, wait_for_subscriber_s=60.0, linger_s=5.0
     )
-    sender = threading.Thread(target=lambda: publish(machine, blocks(seconds, rate_hz), settings, stop=stop))
+    sender = threading.Thread(target=lambda: publish(machine, blocks(seconds, rate_hz, every_s), settings, stop=stop))
     sender.start()
     try:
         yield
@@ -80,6 +81,8 @@ def test_init_writes_files_that_the_other_commands_take(tmp_path: Path) -> None:
         (("init", "--site", "plant", "--name", "fan", "--sensor", "a b c d e"), "--rate-hz is missing"),
         ((*FAN, "--sensor", "DE-A acceleration"), "has 2 words, expected 5"),
         ((*FAN, "--sensor", "DE-A acceleration G DE axial"), "did you mean g"),
+        ((*FAN, "--snapshots", "10"), "--snapshots '10' has 1 words, expected two, such as '0.1 10'"),
+        ((*FAN, "--snapshots", "10 5"), "on_s 10 must be below every_s 5"),
         ((*FAN, "--zones", "ISO 20816-3 group 2 stiff"), "is not one of"),
         (("init", "--site", "a plant", *FAN[3:]), "a plant"),
     ],
@@ -100,6 +103,16 @@ def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
     assert "sampling rate 2560 Hz, expected 2560" in done.stdout
     assert "DE-H 0.057" in done.stdout
     assert "zone" in done.stdout
+
+
+def test_the_doctor_waits_for_snapshots(tmp_path: Path) -> None:
+    run(*FAN, "--folder", str(tmp_path), "--snapshots", "0.5 30")
+    address = endpoint()
+    with publishing(tmp_path, address, 1200, 20.0):
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "5")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0.5 s in the latest snapshot, in blocks of 1280 samples" in done.stdout
+    assert "DE-H 0.05" in done.stdout
 
 
 def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
