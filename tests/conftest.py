@@ -3,6 +3,7 @@
 And keeps what programs leave behind by default out of the home of whoever runs the tests.
 """
 
+import gc
 import os
 import signal
 import sys
@@ -68,6 +69,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     tests = Counter(item.path for item in items)
     ranks = {name: rank for rank, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: (ranks.get(item.path.stem, len(ranks)), -tests[item.path]))
+    gc.freeze()  # what is imported by now stays to the end: nobody need look through it again and again
 
 
 @pytest.fixture(autouse=True, scope="session")

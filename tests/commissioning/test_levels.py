@@ -25,7 +25,7 @@ from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
 
-HEALTHY_S = 189.0
+HEALTHY_S = 130.0
 MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
 
 
