@@ -11,10 +11,12 @@ from pydantic import BaseModel, Field
 from models.commissioning.healthy import HealthyRecording, foreign_lines
 from models.diagnosis.baseline.relation import one_source
 from models.diagnosis.readings import Diagnosis
+from models.diagnosis.shape import SEEN_GROWTH, ShapePower
 from models.diagnosis.verdict.isolation import isolate_window
 from models.diagnosis.window import WindowStatistics
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT
+from models.signals.channels import with_channel_names
 from rotorwatch.records.windows import SensorFault
 
 _FEWEST_HOPS = 8
@@ -217,6 +219,43 @@ def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Ch
         text += "; each channel will only be called changed or not changed, and no part of the machine will be named"
         advice += "; a machine that is more than one bearing and one disc may stay beyond these relations"
     return told(verdict="limited", text=text, advice=advice)
+
+
+def check_shapes(machine: MachineFile, powers: Mapping[str, ShapePower], windows: int) -> Check:
+    """Whether a change of a channel's shape would be called one, where nothing else is compared.
+
+    Parameters
+    ----------
+    windows : int
+        Healthy windows that the shapes were learned from.
+    """
+    told = partial(Check, name="changes would be seen")
+    names = {state: with_channel_names(state, machine.sensors) for state in powers}
+    seen = {names[state]: one.growth for state, one in powers.items() if one.growth <= SEEN_GROWTH}
+    blind = {names[state]: one for state, one in powers.items() if one.growth > SEEN_GROWTH}
+    text = "no channel's change of shape would be called one"
+    if seen:
+        least = max(seen, key=seen.__getitem__)
+        text = f"noise that makes a channel {seen[least]:.2g} times as loud ({least}) is called a change of its shape"
+    if not blind:
+        return told(verdict="passed", text=text)
+    text += (
+        f"; with {windows} healthy windows not even noise that makes {', '.join(blind)} {SEEN_GROWTH:g} times as loud "
+        "is called one"
+    )
+    wanted = max((one.windows or 0 for one in blind.values()), default=0)
+    if wanted <= windows:
+        return told(
+            verdict="limited",
+            text=text,
+            advice="set own limits of the levels: these channels sound like noise as it is",
+        )
+    return told(
+        verdict="limited" if seen else "refused",
+        text=text,
+        advice=f"record about {wanted} windows, {wanted * machine.window.length_s:g} s: the fewer there are, the "
+        "further a window must lie from them to be beyond chance",
+    )
 
 
 def check_halves(first_on_second: Sequence[Diagnosis]) -> Check:

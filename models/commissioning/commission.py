@@ -28,6 +28,7 @@ from models.diagnosis.sensors.reference import learn_sensor_reference
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.errors import EstimationError
+from models.levels.judgement import alerts_of
 from models.levels.reference import learn_levels
 from models.machine import Machine, MachineFile
 from models.physics.rotor import FAULT_FIELDS, PARAMETER_TEXT, PARAMETERS
@@ -75,6 +76,19 @@ class ParameterSummary(BaseModel, extra="forbid", frozen=True):
     readings: tuple[HealthyReading, ...] = ()
 
 
+class GrowthToAlert(BaseModel, extra="forbid", frozen=True):
+    """What growth of one level of one channel raises an alert relative to the healthy machine."""
+
+    speed_rpm: tuple[float, float] | None = Field(description="slowest and fastest window of the operating state")
+    windows: int = Field(description="healthy windows in it")
+    channel: str
+    measure: str
+    unit: str
+    healthy: float = Field(description="mean level of the healthy windows")
+    alert: float = Field(description="alert from here on")
+    growth: float | None = Field(description="of the mean healthy level, relative; none where that is nothing")
+
+
 class CommissioningReport(BaseModel, extra="forbid", frozen=True):
     """The whole report."""
 
@@ -93,6 +107,7 @@ class CommissioningReport(BaseModel, extra="forbid", frozen=True):
     equations: tuple[EquationRow, ...]
     parameters: tuple[ParameterSummary, ...]
     conditions: OperatingRange | None = None
+    levels: tuple[GrowthToAlert, ...] = ()
     notes: tuple[str, ...] = ()
 
 
@@ -341,8 +356,30 @@ def _report(
             "equations": _equations(machine, learned, pieces),
             "parameters": parameters,
             "conditions": None if commissioned is None else commissioned.conditions,
+            "levels": _growths(machine, commissioned),
             "notes": learned.notes,
         }
+    )
+
+
+def _growths(machine: MachineFile, commissioned: Commissioned | None) -> tuple[GrowthToAlert, ...]:
+    """What growth of each level raises an alert; none where limits refer to the first windows instead."""
+    if commissioned is None or commissioned.levels is None or machine.levels.reference == "first windows":
+        return ()
+    return tuple(
+        GrowthToAlert(
+            speed_rpm=None
+            if one.state.speed_rad_s is None
+            else tuple(sorted(abs(speed) * 30 / math.pi for speed in one.state.speed_rad_s)),
+            windows=one.state.windows,
+            channel=one.channel.name,
+            measure=one.measure,
+            unit=one.unit,
+            healthy=one.healthy,
+            alert=one.alert,
+            growth=one.growth,
+        )
+        for one in alerts_of(commissioned.levels, machine.sensors, machine.levels, machine.window.hops)
     )
 
 

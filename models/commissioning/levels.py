@@ -15,6 +15,7 @@ from models.commissioning.checks import (
     check_determined,
     check_halves,
     check_recordings,
+    check_shapes,
     check_sources,
 )
 from models.commissioning.commissioned import ConditionBaseline, IdentifiedRecord, KnowledgeLevel, OperatingRange
@@ -35,6 +36,7 @@ from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
 from models.diagnosis.shape import HealthyShape, learn_shape
+from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics, levels_of, window_statistics
 from models.errors import EstimationError
@@ -147,13 +149,15 @@ def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
         if not reason
     ]
     if not evaluable:
-        return _without_equations(shape, no_shape)
+        return _without_equations(machine, shape, no_shape)
     try:
         return replace(_with_relations(machine, pieces, progress), shape=shape)
     except EstimationError as error:
         if shape is None:
             raise
-        return Learned((check_determined([str(error)], only_shapes=True),), shape=shape)
+        powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
+        checks = (check_determined([str(error)], only_shapes=True), check_shapes(machine, powers, shape.windows))
+        return Learned(checks, shape=shape)
 
 
 def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
@@ -271,7 +275,7 @@ def _by_speed(pieces: Sequence[Piece]) -> list[list[Piece]]:
     return groups
 
 
-def _without_equations(shape: HealthyShape | None, no_shape: str) -> Learned:
+def _without_equations(machine: MachineFile, shape: HealthyShape | None, no_shape: str) -> Learned:
     advice = (
         "for the bearing in one plane: a displacement, velocity or acceleration at the bearing and at the disc in that "
         "plane"
@@ -285,7 +289,9 @@ def _without_equations(shape: HealthyShape | None, no_shape: str) -> Learned:
         "these sensors allow no equation: each channel will only be called changed or not changed, and no part of the "
         "machine will be named"
     )
-    return Learned((Check(name="equations", verdict="limited", text=text, advice=advice),), shape=shape)
+    powers = shape.powers(SequentialSettings.for_machine(machine, short=False).shape_rate)
+    equations = Check(name="equations", verdict="limited", text=text, advice=advice)
+    return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)
 
 
 def _halves(pieces: Sequence[Piece]) -> tuple[Read, ...]:

@@ -20,17 +20,22 @@ E. Brunner, H. Dette, A. Munk, "Box-type approximations in nonparametric factori
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from pydantic import BaseModel, Field, model_validator
-from scipy.special import fdtrc, ndtri
+from scipy.special import fdtrc, fdtri, ndtri
 
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import Shape
 
+SEEN_GROWTH = 8.0
+"""Noise that makes a channel so many times as loud and is not seen: then its shape says nothing."""
+_POWER_Z = float(ndtri(0.95))
+_MOST_WINDOWS = 100
 FEWEST_WINDOWS = 4  # healthy windows without which nothing is learned; six or more are advised, from several recordings
 _DIRECTIONS = 3
 _SPEED_TOLERANCE = 0.03
@@ -73,6 +78,17 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
                 raise ValueError(f"channel {one.channel}: {len(one.mean)} values for {len(self.lags_s)} lags")
         return self
 
+    def powers(self, rate: float) -> dict[str, "ShapePower"]:
+        """What would be called a change of each channel's shape, at the rate of `judge`: noise of another colour.
+
+        White noise that makes a channel g times as loud takes its shape by 1 - 1/g² of the way to that of white noise.
+        """
+        own_rate = self._own_rate(rate)
+        return {one.channel: _power(one, self.windows, np.array(self.lags_s), own_rate) for one in self.channels}
+
+    def _own_rate(self, rate: float) -> float:
+        return -math.expm1(math.log1p(-rate) / len(self.channels))
+
     def judge(self, window: WindowStatistics, rate: float = 0.01) -> tuple[Shape, ...]:
         """Compare every channel of a window with its healthy shape; what cannot be compared says why.
 
@@ -89,7 +105,7 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
         if not 0 < rate < 1:
             raise ValueError(f"rate is {rate}, expected between 0 and 1")
         window = window.as_mounted
-        own_rate = -math.expm1(math.log1p(-rate) / len(self.channels))
+        own_rate = self._own_rate(rate)
         limit = -float(ndtri(own_rate))
         common = self._unlike(window)
         return tuple(self._judged(one, window, common, own_rate, limit) for one in self.channels)
@@ -139,6 +155,37 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
             return Shape(state=one.channel, verdict="changed", z=z, limit=limit, text=text)
         text = f"{one.channel}: its correlation function has its healthy shape ({figures})"
         return Shape(state=one.channel, verdict="not changed", z=z, limit=limit, text=text)
+
+
+@dataclass(frozen=True, slots=True)
+class ShapePower:
+    """What is seen of one channel's shape.
+
+    Attributes
+    ----------
+    growth : float
+        So many times as loud noise must make it to be called a change with 95 % probability; infinite where none is.
+    windows : int or None
+        Healthy windows with which `SEEN_GROWTH` suffices, if they scatter as these do; None where none do.
+    """
+
+    growth: float
+    windows: int | None
+
+
+def _power(one: ShapeSpread, windows: int, lags_s: FloatArray, rate: float) -> ShapePower:
+    white = np.where(lags_s == 0, 1.0, 0.0)
+    distance = float(np.linalg.norm(np.array(one.directions) @ (white - np.array(one.mean)))) / math.sqrt(one.variance)
+
+    def part(count: int) -> float:
+        """Of the way to white noise."""
+        wider = math.sqrt(1 + 1 / count)
+        limit = math.sqrt(float(fdtri(one.freedom, one.freedom * (count - 1), 1 - rate)))
+        return wider * (limit + _POWER_Z) / distance if distance > 0 else math.inf
+
+    own = part(windows)
+    enough = (count for count in range(FEWEST_WINDOWS, _MOST_WINDOWS) if part(count) <= 1 - SEEN_GROWTH**-2)
+    return ShapePower(1 / math.sqrt(1 - own) if own < 1 else math.inf, next(enough, None))
 
 
 def learn_shape(windows: Sequence[WindowStatistics]) -> HealthyShape:

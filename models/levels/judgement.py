@@ -13,11 +13,11 @@ import numpy as np
 
 from models.levels.bands import Growth, growth
 from models.levels.measures import LevelPlan, WindowLevels
-from models.levels.reference import LevelReference, ReferenceLevel
+from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
 from models.levels.settings import LevelSettings
 from models.levels.zones import ZONES, zone_of
 from models.signals.channels import Channel, Quantity
-from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelLimits
+from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
 
 _BEYOND_RANGE = 1.25
 _ERRORS = 6.0
@@ -126,11 +126,10 @@ class LevelJudge:
         channel, given = self._channels[column], self._settings
         state, seen = reference.at(levels.speed_rad_s)
         source = reference.source if seen else f"{reference.source} at another speed"
-        shorter = math.sqrt(max(1.0, state.hops / levels.hops))  # while the window fills
+        shorter = _shorter(state, levels.hops)
         for name, one in state.levels.get(channel.name, {}).items():
             spread = _ERRORS * one.error * shorter
-            least = max(_BEYOND_RANGE * one.high, one.mean + spread)
-            alert = max(given.alert_ratio * one.mean, least)
+            alert = _alert_from(one, given, spread)
             danger = None  # what levels are at another speed says too little
             if seen:
                 danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
@@ -148,7 +147,7 @@ class LevelJudge:
         own = state.bands.get(self._channels[column].name)
         if own is None or levels.bands is None or not seen:
             return None
-        shorter = math.sqrt(max(1.0, state.hops / levels.hops))  # while the window fills
+        shorter = _shorter(state, levels.hops)
         return growth(levels.bands, column, own, self._settings.alert_ratio, _BEYOND_RANGE, _ERRORS * shorter)
 
     def _turned(
@@ -166,7 +165,7 @@ class LevelJudge:
         danger = min((one for one in limits if one.danger is not None), key=lambda one: one.danger or 0.0, default=None)
         alert = min((one for one in limits if one.alert is not None), key=lambda one: one.alert or 0.0, default=None)
         fall = max((one for one in limits if one.fall is not None), key=lambda one: one.fall or 0.0, default=None)
-        unit = _unit(channel, name)
+        unit = _unit(channel.unit, name, channel.quantity in _PEAK_TO_PEAK)
         said = f"{channel.name} ({channel.location} {channel.direction}) {words}".rstrip()
         said += f" {value:.3g} {unit}"
         state, text, decided = "normal", "", alert or danger or fall
@@ -195,6 +194,51 @@ class LevelJudge:
         )
 
 
+def _shorter(state: OperatingState, hops: int) -> float:
+    """By how much a level scatters more than in the healthy windows while the window fills."""
+    return math.sqrt(max(1.0, state.hops / hops))
+
+
+def _alert_from(one: ReferenceLevel, given: LevelSettings, spread: float) -> float:
+    return max(given.alert_ratio * one.mean, _BEYOND_RANGE * one.high, one.mean + spread)
+
+
+@dataclass(frozen=True, slots=True)
+class AlertFrom:
+    """From where on a level of a channel raises an alert relative to its reference, as shown."""
+
+    state: OperatingState
+    channel: Channel
+    measure: str
+    unit: str
+    healthy: float  # mean of the healthy windows
+    alert: float
+
+    @property
+    def growth(self) -> float | None:
+        """Of the mean healthy level, relative; None where that is nothing."""
+        return self.alert / self.healthy - 1 if self.healthy > 0 else None
+
+
+def alerts_of(
+    reference: LevelReference, channels: Sequence[Channel], settings: LevelSettings, hops: int
+) -> Iterator[AlertFrom]:
+    """Alert limits relative to a reference, state by state.
+
+    Parameters
+    ----------
+    hops : int
+        In the windows that are judged.
+    """
+    for state in reference.states:
+        for channel in channels:
+            for name, one in state.levels.get(channel.name, {}).items():
+                alert = _alert_from(one, settings, _ERRORS * one.error * _shorter(state, hops))
+                healthy, limit = (_shown(channel, name, value) for value in (one.mean, alert))
+                peak_to_peak = channel.quantity in _PEAK_TO_PEAK
+                yield AlertFrom(state, channel, name, _unit(channel.unit, name, peak_to_peak), healthy, limit)
+
+
 def _shown(channel: Channel, name: str, value: float) -> float:
     """A level in the unit in which it is shown."""
     if name in {"crest", "kurtosis"}:
@@ -204,7 +248,7 @@ def _shown(channel: Channel, name: str, value: float) -> float:
     return value / channel.to_si
 
 
-def _unit(channel: Channel, name: str) -> str:
+def _unit(unit: str, name: str, peak_to_peak: bool) -> str:
     if name in {"crest", "kurtosis"}:
         return ""
     if name == "growth":
@@ -212,8 +256,8 @@ def _unit(channel: Channel, name: str) -> str:
     if name == "velocity":
         return "mm/s rms"
     if name in {"peak", "s_max", "mean"}:
-        return f"{channel.unit} peak" if name != "mean" else channel.unit
-    return f"{channel.unit} {'pp' if channel.quantity in _PEAK_TO_PEAK and name != 'not_x1' else 'rms'}"
+        return f"{unit} peak" if name != "mean" else unit
+    return f"{unit} {'pp' if peak_to_peak and name != 'not_x1' else 'rms'}"
 
 
 def _rounded(value: float) -> float:
@@ -249,3 +293,44 @@ def _near(value: float | None, limits: LevelLimits) -> bool:
         return False
     above = min((edge for edge in (limits.alert, limits.danger) if edge is not None), default=math.inf)
     return value > _DEADBAND * above or (limits.fall is not None and value < limits.fall / _DEADBAND)
+
+
+_NO_GROWTH = {"mean", "crest", "kurtosis"}
+"""Measures that do not grow with the vibration."""
+
+
+def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
+    """By how much every channel would have had to grow to raise an alert; the one that needs most decides.
+
+    Parameters
+    ----------
+    levels : sequence of ChannelLevels
+        Of one window, at least one.
+    """
+    nearest = [(one, _nearest(one)) for one in levels]
+    unlimited = [one.channel for one, found in nearest if found is None]
+    if unlimited:
+        *most, last = unlimited
+        names, they_have = f"{', '.join(most)} or {last}" if most else last, "they have" if most else "it has"
+        text = f"no growth of {names} would have raised an alert: {they_have} no limit yet"
+        return LevelGrowth(growth=None, channel=unlimited[0], measure="", text=text)
+    one, (growth, measure, value, limit) = max(
+        ((one, found) for one, found in nearest if found), key=lambda each: each[1]
+    )
+    text = (
+        f"every channel that had grown by {growth:.0%} would have raised an alert; {one.channel} last, whose "
+        f"{'narrow band' if measure == 'growth' else _WORDS[measure]} is {value:.3g} {_unit(one.unit, measure, one.detection == 'peak to peak')} and its alert "
+        f"from {limit:.3g}"
+    ).replace("%", " %")
+    return LevelGrowth(growth=_rounded(growth), channel=one.channel, measure=measure, text=text)
+
+
+def _nearest(levels: ChannelLevels) -> tuple[float, str, float, float] | None:
+    """The smallest growth of a channel that takes one of its levels to a limit: that, measure, level and limit."""
+    found = []
+    for limits in levels.limits:
+        value = getattr(levels, limits.measure)
+        edges = [edge for edge in (limits.alert, limits.danger) if edge is not None]
+        if limits.measure not in _NO_GROWTH and edges and value is not None and value > 0:
+            found.append((max(0.0, min(edges) / value - 1), limits.measure, value, min(edges)))
+    return min(found, default=None)

@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 
 from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Reason, Site
-from rotorwatch.records.levels import ChannelLevels
+from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
 
 __all__ = ["MEASURES", "Health", "HealthState", "Measure", "Quality", "Report", "State", "StreamStatus"]
@@ -94,6 +94,11 @@ class Report(BaseModel):
         default=(), description="where no equation can be evaluated: whether each channel is as it was", examples=[()]
     )
     levels: tuple[ChannelLevels, ...] = Field(default=(), description="vibration levels, channel by channel")
+    level_growth: LevelGrowth | None = Field(
+        default=None,
+        description="where the state is unchanged or watching: what growth of the levels would have raised an alert",
+        examples=[None],
+    )
     reason: Reason = ""
     bundle: BundleIdentity
     machine_hash: MachineHash

@@ -6,7 +6,7 @@ from pydantic import BaseModel, Field
 
 from rotorwatch.records.fields import JSON, Number
 
-__all__ = ["ChannelLevels", "LevelLimits"]
+__all__ = ["ChannelLevels", "LevelGrowth", "LevelLimits"]
 
 
 class LevelLimits(BaseModel):
@@ -29,6 +29,27 @@ class LevelLimits(BaseModel):
         default="",
         description="the level and the limit it is beyond, in words; empty while it is normal",
         examples=[""],
+    )
+
+
+class LevelGrowth(BaseModel):
+    """What growth of vibration would have been seen in a window that is called unchanged, or only watched."""
+
+    model_config = JSON
+
+    growth: Number = Field(
+        description="smallest growth, relative to the level of the window, with which every channel would have raised "
+        "an alert; null where one has no limit, so that no growth of it would have",
+        examples=[0.6],
+    )
+    channel: str = Field(description="the channel that would have raised it last, or never", examples=["DE-H"])
+    measure: str = Field(description="the level of it that decides; empty without one", examples=["overall"])
+    text: str = Field(
+        description="the same in words",
+        examples=[
+            "every channel that had grown by 60 % would have raised an alert; DE-H last, whose overall is 1.93 m/s2 "
+            "rms and its alert from 3.09"
+        ],
     )
 
 

@@ -152,6 +152,8 @@ def status(
                 str(health.quality.gaps),
             )
             remarks += [f"{place}: {health.reason}"] if health.reason else []
+            growth = None if health.report is None else health.report.level_growth
+            remarks += [] if growth is None else [f"{place}: {growth.text}"]
             remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
         Console(soft_wrap=True).print(table)
         for remark in remarks:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
-from scipy.special import ndtr
 
 from models.checkpoint import checked, prefixed, unprefixed
 from models.commissioning.commissioned import Commissioned, IdentifiedRecord, Installed
@@ -22,7 +21,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
-from models.diagnosis.verdict.calibration import agreements, month_thresholds
+from models.diagnosis.verdict.calibration import agreements
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
@@ -324,9 +323,7 @@ class BaselineEvaluator(_Unremembering):
         self._conditions = commissioned.conditions
         self._shape = commissioned.shape
         self._length_s = machine.window_data_s
-        settings = SequentialSettings.for_machine(machine, short=False)
-        per_month = month_thresholds(settings.false_alarms_per_month, settings.hop_s, settings.window_hops, 1)
-        self._shape_rate = 2 * float(ndtr(-per_month.first))
+        self._shape_rate = SequentialSettings.for_machine(machine, short=False).shape_rate
         self._baselines = tuple((one.conditions, one.baseline.diagnostician()) for one in commissioned.baselines)
 
     @property

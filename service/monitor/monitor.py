@@ -29,6 +29,7 @@ from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError
 from models.ingest import Admission, Gate, Reason
+from models.levels.judgement import growth_seen
 from models.signals.block import NewestBlocks, SampleBlock
 from models.signals.wire import decode_block
 from rotorwatch.records.alarms import Evidence, Severity
@@ -44,6 +45,8 @@ from service.monitor.reports import MachineHealth, MonitorReport, MonitorState, 
 
 _RPM = 30 / np.pi
 _NEWEST_SAMPLES = 20_000
+_ONLY_LEVELS = {HealthState.UNCHANGED, HealthState.WATCHING}
+"""States in which little is claimed, and what would have been seen has to be said."""
 
 
 class MachineMonitor:
@@ -479,6 +482,7 @@ class MachineMonitor:
             "state": state,
             "filled": self._window.filled,
             "levels": self._levels.latest,
+            "level_growth": growth_seen(self._levels.latest) if state in _ONLY_LEVELS else None,
         }
 
     def _state(self, otherwise: HealthState) -> HealthState:

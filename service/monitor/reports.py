@@ -9,7 +9,7 @@ from models.commissioning.commissioned import Installed
 from models.ingest import Admission
 from models.machine import MachineFile
 from rotorwatch.records.health import HealthState, Quality, Report
-from rotorwatch.records.levels import ChannelLevels
+from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 
 
@@ -30,6 +30,7 @@ class WindowHeading(Identity):
     state: HealthState
     filled: float
     levels: tuple[ChannelLevels, ...]
+    level_growth: LevelGrowth | None
 
 
 def identity_of(installed: Installed) -> Identity:

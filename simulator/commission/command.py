@@ -22,6 +22,7 @@ from simulator.commission.verdict import (
     VERDICT_TEXT,
     budget_sentences,
     dominant,
+    growth_sentence,
     headline,
     next_steps,
     parameter_value,
@@ -51,6 +52,8 @@ def print_report(report: CommissioningReport, console: Console | None = None) ->
         console.print(_parameters(report))
         for sentence in budget_sentences(report):
             console.print(Text(sentence))
+    if report.levels:
+        console.print(Text(growth_sentence(report)))
     console.print(Text("\nWhat to do next", style="bold"))
     for number, step in enumerate(next_steps(report), start=1):
         console.print(Padding(Text(f"{number}. {step}"), (0, 0, 0, 2)))

@@ -197,6 +197,8 @@ def _render(
         pictures=pictures_of(report, [one.name for one in recordings], [one for one in portraits if one is not None]),
         speed_range=_speed_range(report),
         levels=_levels(report),
+        growths=_growths(report),
+        growth_sentence=verdict.growth_sentence(report),
         recordings=[_row(*pair) for pair in zip(recordings, portraits, strict=True)],
         hashes=hashes,
     )
@@ -225,6 +227,20 @@ def _levels(report: CommissioningReport) -> tuple[tuple[str, str], ...]:
         unit, scale = verdict.channel_unit(state)
         low, high = (verdict.significant(scale * edge, 3) for edge in edges)
         found.append((verdict.channel_text(state), f"{low if low == high else f'{low} to {high}'} {unit}"))
+    return tuple(found)
+
+
+def _growths(report: CommissioningReport) -> tuple[tuple[str, ...], ...]:
+    """Rows of the table of levels: operating state, windows, channel, level, healthy, alert from, growth."""
+    found = []
+    for one in report.levels:
+        state = "any"
+        if one.speed_rpm is not None:
+            low, high = (f"{edge:.0f}" for edge in one.speed_rpm)
+            state = f"{low if low == high else f'{low} to {high}'} rpm"
+        healthy, alert = (f"{verdict.significant(edge, 3)} {one.unit}" for edge in (one.healthy, one.alert))
+        growth = "–" if one.growth is None else f"{100 * one.growth:.0f}%"
+        found.append((state, str(one.windows), one.channel, one.measure, healthy, alert, growth))
     return tuple(found)
 
 

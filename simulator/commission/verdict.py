@@ -240,6 +240,18 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
     return tuple(told)
 
 
+def growth_sentence(report: CommissioningReport) -> str:
+    """What growth of a level raises an alert, at best and at worst; empty where there is no such limit."""
+    found = [(one.growth, one) for one in report.levels if one.growth is not None]
+    if not found:
+        return ""
+    (least, first), (most, last) = (edge(found, key=lambda each: each[0]) for edge in (min, max))
+    return (
+        f"A level raises an alert, relative to the healthy machine, once it has grown by {100 * least:.0f}% "
+        f"({first.channel} {first.measure}) to {100 * most:.0f}% ({last.channel} {last.measure})."
+    )
+
+
 def _found_already(parameter: ParameterSummary) -> bool:
     loss, gain, wished = parameter.detectable_loss, parameter.detectable_gain, parameter.wished
     return loss is not None and gain is not None and wished is not None and max(-loss, gain) <= wished

@@ -1,13 +1,15 @@
 """Recordings that are not fit: refused or limited, with a sentence that says what to record instead."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from models.commissioning.checks import check_lines
+from models.commissioning.checks import check_lines, check_shapes
 from models.commissioning.commission import Commissioning
+from models.diagnosis.shape import HealthyShape, ShapeSpread
 from models.machine import MachineFile
 from models.signals.block import SampleBlock
 from simulator.scenario import Event
@@ -175,3 +177,42 @@ def test_the_usual_lag_spacing_fits_every_rate() -> None:
     assert machine.window.lag_step_s == 3 / 2560
     assert MachineFile.model_validate(machine.model_dump()).window == machine.window
     assert MachineFile.model_validate(fields | {"rate_hz": 4000.0}).window.lag_step_s == 0.001
+
+
+def _shaped(count: int, varies: float = 1.0) -> HealthyShape:
+    """Shapes of two channels whose windows scatter."""
+    lags = np.arange(20) * 1e-3
+    mean = np.exp(-lags / 5e-3) * np.cos(2 * np.pi * 40 * lags)
+    channels = [
+        ShapeSpread(
+            channel=name,
+            mean=tuple(mean.tolist()),
+            directions=(tuple(np.r_[0.0, np.full(19, 1.0)].tolist()),),
+            variance=variance * varies,
+            freedom=1.0,
+        )
+        for name, variance in (("y1", 1e-3), ("z1", 0.02))
+    ]
+    return HealthyShape(
+        windows=count, window_s=60.0, lags_s=tuple(lags.tolist()), speed_rad_s=None, channels=tuple(channels)
+    )
+
+
+@pytest.mark.parametrize(
+    ("count", "varies", "verdict"),
+    [(30, 1.0, "passed"), (6, 1.0, "limited"), (4, 1.0, "refused"), (4, 20.0, "refused"), (90, 1e6, "limited")],
+)
+def test_shapes_without_power_are_no_commissioning(count: int, varies: float, verdict: str) -> None:
+    shape = _shaped(count, varies)
+    powers = shape.powers(3e-6)
+    check = check_shapes(NOTHING, powers, count)
+    assert check.verdict == verdict
+    blind = [name for name, one in powers.items() if one.growth > 8]
+    assert ("not even noise that makes" in check.text) == bool(blind)
+    if verdict == "refused":
+        (wanted,) = re.findall(r"record about (\d+) windows", check.advice)
+        assert int(wanted) > count
+        then = _shaped(int(wanted), varies).powers(3e-6)
+        assert all(then[name].growth <= 8 for name, one in powers.items() if one.windows is not None)
+    if verdict == "limited" and varies > 1:
+        assert "own limits of the levels" in check.advice

@@ -146,3 +146,46 @@ def test_json_gives_back_the_same_shape_to_the_last_bit_and_refuses_anything_els
         assert damaged != text
         with pytest.raises(ValidationError):
             HealthyShape.model_validate_json(damaged)
+
+
+@pytest.mark.parametrize("growth", [1.5, 2.0, 3.0, 8.0])
+def test_noise_that_would_be_seen_is_seen_and_other_noise_is_not(growth: float) -> None:
+    """Noise of another colour is added to windows until a channel is so many times as loud."""
+    shape, others = learn_shape(recorded(1, 11)), recorded(9, 6)
+    powers = shape.powers(1e-4)
+    for number, name in enumerate(PROBES):
+        found = 0
+        for window in others:
+            correlation = window.correlation.copy()
+            correlation[0, number, number] *= growth**2
+            judged = {one.state: one for one in shape.judge(replace(window, correlation=correlation), 1e-4)}
+            found += judged[name].verdict == "changed"
+        if growth >= powers[name].growth:
+            assert found == len(others)
+        elif growth < 0.6 * powers[name].growth:
+            assert found < len(others)
+
+
+def test_few_healthy_windows_have_no_power_and_say_how_many_would() -> None:
+    """Of a machine whose excitation varies: its windows scatter by more than their own errors."""
+    rate, measured = 3e-6, learn_shape(recorded(1, 11))  # of one alarm a month and a hop of 5 s
+    calm, few = (replace_windows(measured, count).powers(rate) for count in (11, 5))
+    assert all(few[name].growth > calm[name].growth for name in PROBES)
+    spread = {"variance": 7 * measured.channels[0].variance, "freedom": 1.5}
+    varies = measured.model_copy(update={"channels": (measured.channels[0].model_copy(update=spread),)})
+    growths = {count: replace_windows(varies, count).powers(rate)["y1"].growth for count in range(4, 12)}
+    assert growths[5] == np.inf
+    assert growths[11] < 8
+    needed = varies.powers(rate)["y1"].windows
+    assert needed is not None
+    assert 5 < needed <= 11
+    assert growths[needed] <= 8 < growths[needed - 1]
+
+
+def test_vibration_that_is_white_as_it_is_shows_no_noise_whatever_was_recorded() -> None:
+    shape = learn_shape(recorded(1, 6))
+    white = [0.0] * len(shape.lags_s)
+    white[0] = 1.0
+    channels = tuple(one.model_copy(update={"mean": tuple(white)}) for one in shape.channels)
+    found = shape.model_copy(update={"channels": channels}).powers(1e-4)
+    assert all(one.growth == np.inf and one.windows is None for one in found.values())

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from models.commissioning.commission import commission
 from models.commissioning.commissioned import FILE, Installed, RecordingEntry, install
@@ -14,11 +15,14 @@ from models.machine import AlarmSettings, MachineFile, Operation
 from models.signals.block import SampleBlock
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.example import example
-from rotorwatch.records.health import HealthState
-from rotorwatch.records.levels import ChannelLevels
+from rotorwatch.records.health import Health, HealthState, Report
+from rotorwatch.records.levels import ChannelLevels, LevelGrowth
+from service.api.routes.page import front_page
+from service.commands import watching
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
+from service.rotorwatch import app
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
 FAN = MachineFile.model_validate(
@@ -166,3 +170,38 @@ def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_pat
     _, events = run(monitor, blocks(7, 40, growth=(0.0, 2.2), first=120))
     assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
     assert monitor.health().state is HealthState.ALERT
+
+
+def test_a_machine_that_is_watched_says_what_would_have_been_seen() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    run(monitor, blocks(1, 30))
+    before = monitor.health().latest
+    assert before is not None
+    assert before.level_growth is not None
+    assert before.level_growth.growth is None
+    assert "no limit yet" in before.level_growth.text
+    run(monitor, blocks(1, 70, first=60))
+    now = monitor.health().latest
+    assert now is not None
+    assert now.state == HealthState.WATCHING
+    assert now.level_growth is not None
+    assert now.level_growth.growth is not None
+    assert 0.5 < now.level_growth.growth < 0.9
+    _, events = run(monitor, blocks(1, 40, growth=(0.0, 1.05 * (1 + now.level_growth.growth)), first=200))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "level:DE-H")]
+    later = monitor.health().latest
+    assert later is not None
+    assert later.level_growth is None  # an alert says more
+
+
+def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    growth = LevelGrowth.model_validate(example(LevelGrowth))
+    report = Report.model_validate(example(Report)).model_copy(update={"level_growth": growth})
+    health = Health.model_validate(example(Health)).model_copy(update={"report": report})
+    monkeypatch.setattr(watching, "_fetch_healths", lambda *_: [health])
+    said = CliRunner().invoke(app, ["status"]).stdout
+    assert f"demo/lab: {growth.text}" in said
+    assert growth.text[1:] in front_page((health,))
+    assert growth.text[1:] not in front_page(
+        (health.model_copy(update={"report": Report.model_validate(example(Report))}),)
+    )

@@ -451,3 +451,21 @@ def test_every_channel_has_words() -> None:
     for state in ("y1", "z2_ddot", "psi", "phi_dot", "theta"):
         assert channel_text(state) != state
     assert channel_text("x9") == "x9"
+
+
+def test_what_growth_of_a_level_raises_an_alert_stands_on_the_page_and_in_the_terminal(folder: Path) -> None:
+    text, report = written(folder, "no phase reference")
+    assert {one.channel for one in report.levels} == {channel.name for channel in case("no phase reference")[2].sensors}
+    told = section(text, "levels")
+    for one in report.levels:
+        assert one.growth is not None
+        assert one.growth >= 0.6 - 1e-9  # 1.6 times the healthy level, or further
+        assert one.alert == pytest.approx(one.healthy * (1 + one.growth))
+        assert one.windows > 0
+        assert f"{one.channel} {one.measure} " in told
+        assert f"{100 * one.growth:.0f}%" in told
+    out = StringIO()
+    print_report(report, Console(file=out, width=200))
+    assert "A level raises an alert, relative to the healthy machine, once it has grown by 60%" in out.getvalue()
+    refused, _ = written(folder, "no hop")
+    assert 'id="levels"' not in refused

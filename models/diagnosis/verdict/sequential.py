@@ -20,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
 import numpy as np
+from scipy.special import ndtr
 
 from models.checkpoint import checked
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
@@ -70,6 +71,12 @@ class SequentialSettings:
             short_hops=tuple(hops for hops in _SHORT_HOPS if short and hops < machine.window.hops),
             false_alarms_per_month=machine.alarms.false_alarms_per_month if per_month is None else per_month,
         )
+
+    @property
+    def shape_rate(self) -> float:
+        """Rate at which the shape of any channel of an unchanged machine may be called changed in one window."""
+        per_month = month_thresholds(self.false_alarms_per_month, self.hop_s, self.window_hops, 1)
+        return 2 * float(ndtr(-per_month.first))
 
     @property
     def lengths(self) -> tuple[int, ...]:

@@ -133,7 +133,12 @@ def _levels(report: Report) -> str:
     return (
         "<table><tr><th>channel<th>unit<th>overall<th>velocity, mm/s<th>1x<th>2x<th>gap<th>crest<th>kurtosis"
         f"<th>alert / danger from<th>zone<th></tr>{rows}</table>"
+        + ("" if report.level_growth is None else f"<p>{html.escape(_sentence(report.level_growth.text))}</p>")
     )
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _figure(value: float | None) -> str:
