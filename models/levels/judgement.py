@@ -317,10 +317,12 @@ def growth_seen(levels: Sequence[ChannelLevels]) -> LevelGrowth:
     one, (growth, measure, value, limit) = max(
         ((one, found) for one, found in nearest if found), key=lambda each: each[1]
     )
+    word, unit = _WORDS[measure], _unit(one.unit, measure, one.detection == "peak to peak")
+    if measure == "growth":
+        word = "strongest band"
     text = (
-        f"every channel that had grown by {growth:.0%} would have raised an alert; {one.channel} last, whose "
-        f"{'narrow band' if measure == 'growth' else _WORDS[measure]} is {value:.3g} {_unit(one.unit, measure, one.detection == 'peak to peak')} and its alert "
-        f"from {limit:.3g}"
+        f"every channel that had grown by {growth:.0%} would have raised an alert; {one.channel} last, whose {word} is "
+        f"{value:.3g} {unit} and its alert from {limit:.3g}"
     ).replace("%", " %")
     return LevelGrowth(growth=_rounded(growth), channel=one.channel, measure=measure, text=text)
 
