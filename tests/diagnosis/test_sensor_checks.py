@@ -30,6 +30,16 @@ def plan_of(name: str) -> Plan:
     return plan_for(machine_of(name), lagged=False)
 
 
+def sources_along(directions: FloatArray, cutoff_hz: float, force_N: float) -> tuple[NamedSource, ...]:
+    """One source for each direction, shape (n, 6)."""
+    return tuple(
+        NamedSource.model_validate(
+            {"name": str(i), "cutoff_hz": cutoff_hz, "direction": tuple(row), "force_rms_N": force_N}
+        )
+        for i, row in enumerate(directions)
+    )
+
+
 @cache
 def recorded(name: str, seed: int, windows: int = 1, *, one_source: bool = False) -> FloatArray:
     """SI samples of a healthy machine, with a level, a cutoff and a noise drawn from the seed."""
@@ -38,12 +48,7 @@ def recorded(name: str, seed: int, windows: int = 1, *, one_source: bool = False
     cutoff_hz, directions = rng.uniform(*machine.condition.cutoff_hz), np.eye(6)[[0, 1, 3, 4]]
     if one_source:
         directions = rng.standard_normal((1, 6)) * [1, 1, 0.05, 1, 1, 0.05]
-    sources = tuple(
-        NamedSource.model_validate(
-            {"name": str(i), "cutoff_hz": cutoff_hz, "direction": tuple(row), "force_rms_N": force_N}
-        )
-        for i, row in enumerate(directions)
-    )
+    sources = sources_along(directions, cutoff_hz, force_N)
     sensors = Sensors(noise_relative=rng.uniform(0.01, 0.05), noise_corner_hz=rng.uniform(30, 500))
     scenario = Scenario(
         machine=name, seed=seed, duration_s=windows * WINDOW_S + MORE_S, sources=sources, sensors=sensors

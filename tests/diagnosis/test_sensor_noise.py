@@ -11,20 +11,15 @@ from pydantic import ValidationError
 from models.diagnosis.moments import Plan, plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import SensorReference, learn_sensor_reference
-from models.diagnosis.window import SlidingWindow, WindowStatistics
-from models.machine import Machine, load_machine
+from models.diagnosis.window import WindowStatistics
 from models.signals.block import FloatArray
 from rotorwatch.records.windows import SensorFault
-from simulator.scenario import Event, NamedSource, Scenario, Sensors
+from simulator.scenario import Event, Scenario, Sensors
 from simulator.stream import blocks
+from tests.diagnosis.test_sensor_checks import MORE_S, WINDOW_S, machine_of, sources_along
+from tests.diagnosis.test_sensor_checks import windows_of as windows_in
 
-WINDOW_S, MORE_S = 60.0, 3.0
 DISPLACEMENTS = ("y1", "z1", "y2", "z2")
-
-
-@cache
-def machine_of(name: str) -> Machine:
-    return load_machine(name)
 
 
 @cache
@@ -45,17 +40,11 @@ def recorded(
     force_N = machine.rotor.m2_kg * machine.rotor.e_m * machine.operation.speed_rad_s**2 * rng.uniform(0.5, 2)
     cutoff_hz = rng.uniform(*machine.condition.cutoff_hz)
     rows = np.eye(6)[[0, 1, 3, 4]] if directions == 4 else rng.standard_normal((1, 6)) * [1, 1, 0.05, 1, 1, 0.05]
-    sources = tuple(
-        NamedSource.model_validate(
-            {"name": str(i), "cutoff_hz": cutoff_hz, "direction": tuple(row), "force_rms_N": force_N}
-        )
-        for i, row in enumerate(rows)
-    )
     scenario = Scenario(
         machine=name,
         seed=seed,
         duration_s=windows * WINDOW_S + MORE_S,
-        sources=sources,
+        sources=sources_along(rows, cutoff_hz, force_N),
         sensors=Sensors(noise_relative=noise),
         events=events,
     )
@@ -66,12 +55,7 @@ def windows_of(name: str, samples: FloatArray, *, displacements: bool = False) -
     plan = plan_of(name, displacements=displacements)
     if displacements:
         samples = samples[:, [*(plan_of(name).states.index(state) for state in DISPLACEMENTS), -1]]
-    sliding, found = SlidingWindow(plan), []
-    for number, _ in enumerate(sliding.feed(samples, 0), start=1):
-        statistics = sliding.statistics() if number % plan.hops == 0 else None
-        if statistics is not None:
-            found.append(statistics)
-    return found
+    return windows_in(plan, samples)
 
 
 @cache

@@ -3,7 +3,9 @@
 import hashlib
 import subprocess
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -33,10 +35,19 @@ def engine_for(url: str) -> Engine:
     return create_engine(made.set(drivername={"sqlite": "sqlite", "postgresql": "postgresql+psycopg"}[made.drivername]))
 
 
-def opened_and_closed(url: str) -> None:
+@contextmanager
+def opened(url: str) -> Iterator[Store]:
     store = Store(url, Retention())
     store.open()
-    store.close()
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def opened_and_closed(url: str) -> None:
+    with opened(url):
+        pass
 
 
 def test_migrations_and_tables_agree(url: str) -> None:
@@ -104,12 +115,8 @@ def test_buckets_of_an_older_version_get_the_readings_that_are_still_there(
         for statement in statements:
             connection.execute(text(statement))
     engine.dispose()
-    store = Store(url, Retention())
-    store.open()
-    try:
+    with opened(url) as store:
         found = store.machine("demo", "lab").downsampled(quantity="parameter", points=100)
-    finally:
-        store.close()
     assert [(one.count, one.minimum, one.mean, one.maximum, one.mean_standard_error) for one in found] == [
         (1, 7.0, 7.0, 7.0, None), (2, 1.0, 1.5, 2.0, 0.375), (2, 3.0, 3.5, 4.0, 0.25)
     ]  # fmt: skip
@@ -141,9 +148,7 @@ def test_readings_and_buckets_of_rows_are_those_that_were_there(
         for statement in statements:
             connection.execute(text(statement))
     engine.dispose()
-    store = Store(url, Retention())
-    store.open()
-    try:
+    with opened(url) as store:
         lab, pump = store.machine("demo", "lab"), store.machine("demo", "pump")
         # What comes next completes the bucket, and is counted once.
         assert lab.commit(Step(readings=(StoredReading(1_300 * 10**9, "parameter", "e", 5.0, 0.25),)))
@@ -160,8 +165,6 @@ def test_readings_and_buckets_of_rows_are_those_that_were_there(
         ]
         assert [one.value for one in pump.readings(quantity="parameter", name="e")] == [-1.0]
         assert [one.mean for one in pump.downsampled(quantity="parameter")] == [-1.0]
-    finally:
-        store.close()
     assert found == {
         "e": [(3, 200 * 10**9, 0.1, None), (4, 600 * 10**9, 3.0, None), (5, 1_300 * 10**9, 5.0, 0.25)],
         "k_by": [(2, 100 * 10**9, 7.0, 0.5), (3, 200 * 10**9, 8.0, None)],
@@ -188,12 +191,8 @@ def test_a_large_history_says_how_far_it_is_brought_up_to_date(url: str) -> None
     engine.dispose()
     told = [(line["table"], line["rows"]) for line in lines if line["event"] == "the history is brought up to date"]
     assert told == [("windows", 20_000), ("windows", 40_000)]
-    store = Store(url, Retention())
-    store.open()
-    try:
+    with opened(url) as store:
         found = store.machine("demo", "lab").readings(quantity="parameter", name="e", limit=50_000)
-    finally:
-        store.close()
     assert [(one.number, one.value) for one in found] == [(number, number / 7) for number in range(1, 40_004)]
 
 
@@ -226,12 +225,8 @@ def test_a_checkpoint_of_an_older_version_keeps_its_alarms(url: str) -> None:
         )
         connection.execute(text("INSERT INTO checkpoint_hops VALUES (1, 5, :moments)"), {"moments": b"moments"})
     engine.dispose()
-    store = Store(url, Retention())
-    store.open()
-    try:
+    with opened(url) as store:
         found = store.machine("demo", "lab").restore()
-    finally:
-        store.close()
     assert found == Checkpoint(CheckpointHead(1, None, "hash", "0.1", 5, 6, alarms, b"RWCP"), ())
 
 
