@@ -47,6 +47,8 @@ _TEXTS: dict[OperationKind, str] = {
     "remove-from-service": "Take an alarm out of service, until it is returned.",
     "return-to-service": "Return an alarm to service.",
 }
+_Order = OperationOrder | ReasonedOrder | ShelveOrder
+_ORDERS: dict[OperationKind, type[_Order]] = {"shelve": ShelveOrder, "remove-from-service": ReasonedOrder}
 
 _Alarm = Annotated[str, Path(description="name of the alarm", examples=["k_by"])]
 _IfMatch = Annotated[
@@ -97,18 +99,29 @@ def _add_reading_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
 def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: OperationKind) -> None:
     """Add the route of one operation."""
     configures = kind in ("remove-from-service", "return-to-service")
-    scoped = guard.configure if configures else guard.operate
+    model: Any = _ORDERS.get(kind, OperationOrder)
+    shown = {"example": {"summary": "as seen in the control room", "value": example(model)}}
 
+    @app.post(
+        f"{PLACE}/alarms/{{name}}/{kind}",
+        tags=["alarms"],
+        name=kind,
+        operation_id=kind.replace("-", "_"),
+        summary=kind.replace("-", " ").capitalize(),
+        description=f"{_TEXTS[kind]} It is done only if the alarm still is as the caller saw it.",
+        responses=responses(OperationDone, 400, 404, 409, 413, 415, 422, 428, headers=_ETAG),
+    )
     def operate(
         request: Request,
         response: Response,
         site: SiteName,
         machine: MachineName,
         name: _Alarm,
-        caller: Caller,
-        order: OperationOrder | ReasonedOrder | ShelveOrder,
-        if_match: str | None,
+        caller: Annotated[Caller, guard.configure if configures else guard.operate],
+        posted: Annotated[model, Body(openapi_examples=shown)],
+        if_match: _IfMatch = None,
     ) -> OperationDone:
+        order: _Order = posted
         request.state.audit = AuditNote(kind, f"{site}/{machine}", name, order.reason)
         view = found_machine(service, site, machine)
         if if_match is None and order.expected_state is None:
@@ -130,60 +143,6 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         except (UnknownAlarm, OperationConflict, OperationRefused, NotInTime) as error:
             raise HTTPException(_STATUS[type(error)], str(error)) from error
         return OperationDone(alarm=_marked(_present(view, name), response), events=events)
-
-    options: dict[str, Any] = {
-        "tags": ["alarms"],
-        "name": kind,
-        "operation_id": kind.replace("-", "_"),
-        "summary": kind.replace("-", " ").capitalize(),
-        "description": f"{_TEXTS[kind]} It is done only if the alarm still is as the caller saw it.",
-        "responses": responses(OperationDone, 400, 404, 409, 413, 415, 422, 428, headers=_ETAG),
-    }
-    path = f"{PLACE}/alarms/{{name}}/{kind}"
-    if kind == "shelve":
-
-        @app.post(path, **options)
-        def shelve(
-            request: Request,
-            response: Response,
-            site: SiteName,
-            machine: MachineName,
-            name: _Alarm,
-            caller: Annotated[Caller, scoped],
-            order: Annotated[ShelveOrder, Body(openapi_examples=_shown(ShelveOrder))],
-            if_match: _IfMatch = None,
-        ) -> OperationDone:
-            return operate(request, response, site, machine, name, caller, order, if_match)
-
-    elif kind == "remove-from-service":
-
-        @app.post(path, **options)
-        def remove(
-            request: Request,
-            response: Response,
-            site: SiteName,
-            machine: MachineName,
-            name: _Alarm,
-            caller: Annotated[Caller, scoped],
-            order: Annotated[ReasonedOrder, Body(openapi_examples=_shown(ReasonedOrder))],
-            if_match: _IfMatch = None,
-        ) -> OperationDone:
-            return operate(request, response, site, machine, name, caller, order, if_match)
-
-    else:
-
-        @app.post(path, **options)
-        def other(
-            request: Request,
-            response: Response,
-            site: SiteName,
-            machine: MachineName,
-            name: _Alarm,
-            caller: Annotated[Caller, scoped],
-            order: Annotated[OperationOrder, Body(openapi_examples=_shown(OperationOrder))],
-            if_match: _IfMatch = None,
-        ) -> OperationDone:
-            return operate(request, response, site, machine, name, caller, order, if_match)
 
 
 def _present(view: MachineView, name: str) -> Alarm:
@@ -213,7 +172,3 @@ def _version(if_match: str | None) -> int | None:
     """Version that an ETag stands for; a proxy that packs answers may have made it a weak one."""
     found = re.search(r"-?[0-9]+", if_match or "")
     return None if found is None else int(found[0])
-
-
-def _shown(model: type[OperationOrder] | type[ReasonedOrder] | type[ShelveOrder]) -> Any:
-    return {"example": {"summary": "as seen in the control room", "value": example(model)}}
