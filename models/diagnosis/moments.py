@@ -62,6 +62,7 @@ class Plan:
     # Speed to look for where there is no shaft angle; None: the rotation is not looked for.
     speed_rad_s: float | None = None
     speed_tolerance: float = 0.0  # how far the speed may be off, relative
+    others: tuple[str, ...] = ()  # channels at other places, of which only levels are taken
     levels: LevelPlan | None = None  # of all `columns`; None where no levels are wanted
     # Where sensors are at an angle: what each column of `states` is as mounted (``bearing@45``), and the matrix that
     # turns those, shape (n, n), states = turn @ mounted.
@@ -82,9 +83,9 @@ class Plan:
         return min(self.need, self.stride)
 
     @property
-    def others(self) -> slice:
-        """Columns of SI samples that are no states."""
-        return slice(len(self.states), self.columns.size)
+    def sensors(self) -> tuple[str, ...]:
+        """What the columns of a waveform are: of the mounted sensors, of the shaft angle, and of channels elsewhere."""
+        return (*self.mounted, *(() if self.angle_column is None else ("theta",)), *self.others)
 
     @property
     def width(self) -> int:
@@ -168,6 +169,7 @@ def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False)
         max_span_ns=round(window.max_span_s * 1e9),
         speed_rad_s=None if machine.operation is None else machine.operation.speed_rad_s,
         speed_tolerance=0.0 if machine.operation is None else machine.operation.speed_tolerance,
+        others=others,
         levels=level_plan(channels, rate_hz, machine.levels.band(speed_rpm), runout) if levels else None,
         angled=tuple(state_name(one) for one in channels[: len(states)]),
         turn=None if np.array_equal(seen, np.eye(len(states))) else np.linalg.inv(seen),
@@ -267,7 +269,10 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
     a = np.hstack(regressors)
     segments = _segment_spectra(a, plan)
     own = samples[-plan.fresh :]
-    waveform = waveform_of(own if n_states == plan.columns.size else np.delete(own, plan.others, axis=1))
+    waveform = waveform_of(own)
+    if plan.angle_column is not None and plan.others:
+        order = [*range(n_states), own.shape[1] - 1, *range(n_states, own.shape[1] - 1)]
+        waveform = waveform_of(own[:, order])
     levels = None
     if plan.levels is not None:
         turned = None if theta is None or (line is None and plan.angle_column is None) else theta[-plan.fresh :]

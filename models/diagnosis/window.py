@@ -67,8 +67,9 @@ class WindowStatistics:
     hop_speed_rad_s: FloatArray  # (n_hops,), mean speed of each hop (nan if unknown)
     removed_by_hop: bool  # whether the rotation was taken out hop by hop, each with its own amplitude
     duration_s: float  # length of the data in the window
-    # What the samples of each hop look like: of each of `states` and, last, of the shaft angle if there is one.
+    # What the samples of each hop look like: of each of `sensors`, those of `states` first.
     waveforms: tuple[Waveform, ...]
+    sensors: tuple[str, ...]
     # (n_pairs, n_bands, 3): powers of the motions that are measured twice, of each hop (`models.diagnosis.waveform`)
     pair_powers: tuple[ComplexArray, ...]
     # The same window of the sensors as they are mounted, run-out included, where some of them are at an angle or have a
@@ -170,6 +171,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         removed_by_hop=rotation.by_hop,
         duration_s=len(hops) * plan.hop / plan.rate_hz,
         waveforms=tuple(hop.waveform for hop in hops),
+        sensors=plan.sensors,
         pair_powers=tuple(hop.pair_powers for hop in hops),
     )
     shaft = found if plan.runout is None else _without(found, plan.runout)

@@ -418,8 +418,10 @@ class MachineMonitor:
         self._alarms.suppress(float(speed_rad_s * _RPM) if np.isfinite(speed_rad_s) else None, end_ns)
         findings = sensor_findings(statistics, self._sensors, self.machine.sensors)
         self._data_path.sensors(findings, statistics)
-        if findings:
-            self._levels.tell(self._alarms, end_ns, faulty=implicated(findings))
+        faulty = implicated(findings)
+        # A fault of a channel elsewhere says nothing of the equations, but it is all there is where they are none.
+        if findings and (not self._plan.states or faulty - set(self._plan.others)):
+            self._levels.tell(self._alarms, end_ns, faulty=faulty)
             state = self._state(HealthState.DATA_HEALTH)
             return Report(
                 **self._window_now(statistics.start_ns, end_ns, state),
@@ -431,9 +433,9 @@ class MachineMonitor:
         try:
             evaluation = self._evaluator.evaluate(statistics, present)
         except EstimationError as error:
-            self._levels.tell(self._alarms, end_ns)
+            self._levels.tell(self._alarms, end_ns, faulty=faulty)
             state = self._state(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE)
-            return Report(**self._window_now(statistics.start_ns, end_ns, state), reason=str(error))
+            return Report(**self._window_now(statistics.start_ns, end_ns, state), sensors=findings, reason=str(error))
         evaluation = evaluation.named(self.machine.sensors)
         looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
         whole = self._test.settings.window_hops
@@ -441,7 +443,7 @@ class MachineMonitor:
         verdict = self._test.update(looks)
         changed = [shape.text for shape in evaluation.shapes if shape.verdict == "changed"]
         self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
-        self._levels.tell(self._alarms, end_ns, explained=bool(verdict.changed))
+        self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=bool(verdict.changed))
         unexplained = evaluation.deciding.unexplained
         # Where the window straddles a change, what is explained is in the verdict's current readings.
         reason = "" if verdict.current else unexplained
@@ -464,6 +466,7 @@ class MachineMonitor:
             misfit_z=evaluation.deciding.misfit_z,
             suspect=evaluation.deciding.suspect if outside and not unexplained else "",
             verdict=verdict,
+            sensors=findings,
             detectable=()
             if unexplained
             else detectable_changes(

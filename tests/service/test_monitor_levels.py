@@ -1,6 +1,7 @@
 """Machines of which nothing is known but their sensors: levels are watched from the first hop on."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from models.commissioning.healthy import healthy_from_blocks
 from models.diagnosis.moments import plan_for
 from models.machine import AlarmSettings, MachineFile, Operation
 from models.signals.block import SampleBlock
+from models.signals.channels import Channel
 from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
@@ -23,6 +25,7 @@ from service.monitor.alarms.book import AlarmBook
 from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
 from service.rotorwatch import app
+from tests.service.live import LAB, scenario_blocks
 
 RATE_HZ, BLOCK_S, START_NS = 5120.0, 0.5, 1_767_225_600_000_000_000
 FAN = MachineFile.model_validate(
@@ -205,3 +208,40 @@ def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) 
     assert growth.text[1:] not in front_page(
         (health.model_copy(update={"report": Report.model_validate(example(Report))}),)
     )
+
+
+def held(stream: Iterator[SampleBlock], column: int, value: float) -> Iterator[SampleBlock]:
+    """The stream with a channel that gives nothing but one value."""
+    for block in stream:
+        samples = block.samples.copy()
+        samples[:, column] = value
+        yield replace(block, samples=samples)
+
+
+def test_a_dead_sensor_at_whatever_place_is_a_fault_of_that_sensor_and_no_quiet_machine() -> None:
+    monitor = MachineMonitor(install(FAN, None))
+    _, events = run(monitor, held(blocks(5, 60), 1, 0.25))
+    assert [(kind, name) for kind, name, _ in events] == [(EventKind.RAISED, "data-stuck")]
+    health = monitor.health()
+    assert health.latest is not None
+    assert [(one.states, one.kind) for one in health.latest.sensors] == [(("@NDE-V",), "stuck")]
+    assert health.latest.sensors[0].text.startswith("NDE-V: repeated the value 0.25 mm/s")
+    assert health.state is HealthState.DATA_HEALTH
+
+
+def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() -> None:
+    casing = Channel.model_validate(
+        {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "horizontal", "unit": "m/s2"}
+    )
+    rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
+    monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
+    for block in scenario_blocks(92.0):
+        wider = np.pad(block.samples.astype(np.float32), ((0, 0), (0, 1)))
+        monitor.step(replace(block, samples=wider))
+        alone.step(block)
+    told, plain = monitor.health().latest, alone.health().latest
+    assert told is not None
+    assert plain is not None
+    assert [one.states for one in told.sensors] == [("@DE-H",)]
+    assert (told.state, told.verdict) == (plain.state, plain.verdict)
+    assert [one.name for one in monitor.health().alarms if one.raised] == ["data-stuck"]

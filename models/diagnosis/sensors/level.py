@@ -33,8 +33,8 @@ def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
     """Channels that hold a value, show nothing but their quantisation, or an angle that does not turn."""
     hops, findings = window.hop_waveform, []
     rate_hz = hops.n_samples * len(window.waveforms) / window.duration_s
-    limit = max(3, round(STILL_S * rate_hz))
-    for column, state in enumerate((*window.states, "theta")[: hops.mean.shape[1]]):
+    limit = max(3, min(round(STILL_S * rate_hz), hops.n_samples))
+    for column, state in enumerate(window.sensors):
         runs, rms, step = hops.longest_run[:, column], hops.rms[:, column], hops.step[:, column]
         name, coarse = naming.name(state), rms < step
         whole = int(np.sum(runs[runs >= hops.n_samples]))
@@ -63,12 +63,13 @@ def stuck(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
 def clipped(window: WindowStatistics, naming: Naming) -> list[SensorFault]:
     """Channels whose tops are flat: more samples exactly at a hop's extreme than even a quantised sine would leave."""
     hops, findings = window.hop_waveform, []
-    n = len(window.states)
-    swing = (hops.maximum[:, :n] - hops.minimum[:, :n]) / 2
-    step = np.where(np.isnan(hops.step[:, :n]), 0.0, hops.step[:, :n])
+    swing = (hops.maximum - hops.minimum) / 2
+    step = np.where(np.isnan(hops.step), 0.0, hops.step)
     sine = np.sqrt(2 * step / np.where(swing > 0, swing, np.inf)) / np.pi
     allowed = FLAT_PART + 1.5 * sine
-    for column, state in enumerate(window.states):
+    for column, state in enumerate(window.sensors):
+        if state == "theta":
+            continue
         sides: dict[str, tuple[float, float]] = {}
         for side, counts, levels in (
             ("upper", hops.at_maximum, hops.maximum),
