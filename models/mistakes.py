@@ -86,6 +86,19 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
         raise MachineFileError("\n".join(f"{place}: {text}" for _, text in mistakes(error, model, fields))) from error
 
 
+def in_folder(model: _Model, folder: Path) -> _Model:
+    """The fields of a file, with paths that are not whole taken from its folder; also those in its tables and lists."""
+
+    def found(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(map(found, value))
+        if isinstance(value, BaseModel):
+            return in_folder(value, folder)
+        return folder / value if isinstance(value, Path) else value
+
+    return model.model_copy(update={name: found(getattr(model, name)) for name in type(model).model_fields})
+
+
 def mistakes(error: ValidationError, model: type[BaseModel], fields: object = None) -> tuple[tuple[_Place, str], ...]:
     """What is wrong, mistake by mistake.
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, Self
 from pydantic import BaseModel, Field, model_validator
 
 from models.errors import MachineFileError
-from models.mistakes import checked, did_you_mean, read_toml
+from models.mistakes import checked, did_you_mean, in_folder, read_toml
 from models.signals.keys import Grant, access_control
 
 _OF_HOSTS = ("tcp", "udp", "tls", "quic", "ws")
@@ -282,16 +282,6 @@ class LinkSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=
                 "or without_grants = true in [link] (of a router also --without-grants)"
             )
 
-    def beside(self, folder: Path) -> Self:
-        """These settings with files that are named without a whole path taken from a folder, that of the settings."""
-        tls = self.tls
-        if tls is not None:
-            places = {name: getattr(tls, name) for name in ("root_certificate", "certificate", "key")}
-            tls = tls.model_copy(update={name: folder / path for name, path in places.items() if path is not None})
-        files = {name: getattr(self, name) for name in ("password_file", "passwords_file")}
-        found = {name: folder / path for name, path in files.items() if path is not None}
-        return self.model_copy(update={**found, "tls": tls})
-
     def zenoh_items(self) -> dict[str, str]:
         """Configuration paths and their JSON5 values, to be inserted one by one into a Zenoh configuration.
 
@@ -456,4 +446,4 @@ def load_link(path: Path) -> LinkSettings:
     link = checked(_LinkFile, read_toml(path), path).link
     if not link.listen and not link.connect:
         raise MachineFileError(f"{path}: link: expected endpoints in listen or connect, found neither")
-    return link.beside(path.parent)
+    return in_folder(link, path.parent)

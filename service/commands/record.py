@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from models.errors import MachineFileError, RecordingError
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, prepare_numerics
+from service.commands.replay import link_of
+from service.commands.running import ConnectOption, ListenOption, exit_codes, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -77,8 +78,7 @@ def record(
         machines, settings, history = _settings(
             config, machine, out, {k: v for k, v in changes.items() if v is not None}
         )
-        from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
-        from service.history.shared import committed_events  # noqa: PLC0415
+        from service.history.shared import committed_events  # noqa: PLC0415  # keeps --help quick
         from service.recordings.recorder import MachineRecorder  # noqa: PLC0415
         from service.settings.service import LogSettings  # noqa: PLC0415
         from service.stream.transport import Link, MachineTap  # noqa: PLC0415
@@ -86,8 +86,6 @@ def record(
         from service.terminal.stopping import stop_request  # noqa: PLC0415
 
         configure_logging(LogSettings())
-        ends = tuple(connect or (() if listen else (ENDPOINT,)))
-        link_settings = LinkSettings(mode="peer" if listen else "client", listen=tuple(listen or ()), connect=ends)
         recorders = [
             MachineRecorder(one, settings, partial(committed_events, history.database, one.site, one.name))
             for one in machines
@@ -95,7 +93,7 @@ def record(
         for recorder in recorders:
             recorder.prepare()  # a folder that cannot be written is a mistake to be told at once
         stop = undo.enter_context(stop_request())
-        link = Link(link_settings)
+        link = Link(link_of(connect, listen))
         undo.callback(link.close)
         with ExitStack() as running:
             for recorder in recorders:

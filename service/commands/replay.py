@@ -154,7 +154,7 @@ def replay(
             from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
 
             plan = NetworkPlan(
-                link=_link(connect, listen),
+                link=link_of(connect, listen),
                 machines=machines,
                 everything=everything,
                 prefix=_prefix(prefix, files[0]),
@@ -322,7 +322,8 @@ def _check_prefix(option: str, prefix: str) -> None:
         )
 
 
-def _link(connect: list[str] | None, listen: list[str] | None) -> "LinkSettings":
+def link_of(connect: list[str] | None, listen: list[str] | None) -> "LinkSettings":
+    """Link settings of a command line that names endpoints, or none."""
     from models.signals.link import LinkSettings  # noqa: PLC0415  # keeps --help quick
 
     if listen:

@@ -2,7 +2,6 @@
 
 import ipaddress
 from pathlib import Path
-from typing import Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
@@ -72,18 +71,6 @@ class AccessSettings(BaseModel):
     @classmethod
     def _lower_case(cls, hosts: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(host.lower() for host in hosts)
-
-    def beside(self, folder: Path) -> Self:
-        """Resolve the paths of certificate and key against the folder of the settings file."""
-        if self.tls is None:
-            return self
-        ca = self.tls.client_ca
-        tls = TlsSettings(
-            certificate=folder / self.tls.certificate,
-            key=folder / self.tls.key,
-            client_ca=None if ca is None else folder / ca,
-        )
-        return self.model_copy(update={"tls": tls})
 
 
 def check_access(place: str, access: AccessSettings, host: str) -> None:

@@ -14,7 +14,7 @@ from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, Settings
 
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
-from models.mistakes import mistakes, read_toml
+from models.mistakes import in_folder, mistakes, read_toml
 from models.signals.link import LinkSettings
 from service.history.records import Retention
 from service.settings.access import AccessSettings, check_access
@@ -269,16 +269,8 @@ def load_settings(path: Path | None = None) -> ServiceSettings:
     recording = settings.recording
     if recording.directory is not None:
         recording = recording.model_copy(update={"directory": str(folder / recording.directory)})
-    settings = settings.model_copy(
-        update={
-            "machines": entries,
-            "recording": recording,
-            "history": history,
-            "link": settings.link.beside(folder),
-            "access": settings.access.beside(folder),
-            "webhooks": tuple(webhook.beside(folder) for webhook in settings.webhooks),
-        }
-    )
+    update = {"machines": entries, "recording": recording, "history": history}
+    settings = in_folder(settings, folder).model_copy(update=update)
     check_distinct(place, settings)
     check_access(str(place), settings.access, settings.http.host)
     settings.link.check_reach(str(place))

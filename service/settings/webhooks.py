@@ -129,11 +129,6 @@ class WebhookSettings(BaseModel):
         """Whether the receiver runs on this computer."""
         return is_loopback(self._parts.hostname or "")
 
-    def beside(self, folder: Path) -> Self:
-        """Resolve the paths against the folder of the settings file."""
-        files = {name: getattr(self, name) for name in ("secret_file", "ca_file")}
-        return self.model_copy(update={name: folder / path for name, path in files.items() if path is not None})
-
 
 def repeated_name(webhooks: tuple[WebhookSettings, ...]) -> str | None:
     """A name that two webhooks have; None if there is none.

@@ -15,7 +15,7 @@ import json
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
 from typing import Protocol, TypeVar
@@ -264,14 +264,7 @@ class MachineLink:
         alive = sample.kind == zenoh.SampleKind.PUT
         self._callbacks.on_publisher(alive)
         if alive:
-            # Publishers without a cache answer only queries.
-            self._link.session.get(
-                self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S
-            )
-
-    def _take_reply(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self._callbacks.on_descriptor(reply.ok.payload.to_bytes())
+            _ask(self._link, self._keys.descriptor, self._take_descriptor)  # without a cache they answer only queries
 
 
 class MachineTap:
@@ -303,14 +296,11 @@ class MachineTap:
             )
             undo.callback(alive.undeclare)
             self._undeclare = undo.pop_all()
-        self._ask()
+        _ask(self._link, self._keys.descriptor, self._take)
 
     def close(self) -> None:
         """Undeclare the subscriptions."""
         self._undeclare.close()
-
-    def _ask(self) -> None:
-        self._link.session.get(self._keys.descriptor, self._link.guarded(self._take_reply), timeout=_QUERY_TIMEOUT_S)
 
     def _take(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr) != self._keys.stream:
@@ -322,11 +312,7 @@ class MachineTap:
 
     def _take_alive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            self._ask()
-
-    def _take_reply(self, reply: zenoh.Reply) -> None:
-        if reply.ok is not None:
-            self._on_message(_verbatim(reply.ok))
+            _ask(self._link, self._keys.descriptor, self._take)
 
 
 @contextmanager
@@ -359,28 +345,22 @@ def follow(
     """
     site, _, machine = machines.partition("/")
     suffixes = {name: getattr(MachineKeys("s", "m"), name).removeprefix(f"{PREFIX}/s/m/") for name in topics}
-    link = Link(settings, fail_fast=True)
-    try:
-        with ExitStack() as undo:
-            for name, suffix in suffixes.items():
-                current = name in {"health", "alarm_state"}
+    with closing(Link(settings, fail_fast=True)) as link, ExitStack() as undo:
+        for name, suffix in suffixes.items():
+            current = name in {"health", "alarm_state"}
 
-                def take(sample: zenoh.Sample) -> None:
-                    callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
+            def take(sample: zenoh.Sample) -> None:
+                callback(TopicMessage(str(sample.key_expr), sample.payload.to_string()))
 
-                subscriber = zenoh.ext.declare_advanced_subscriber(
-                    link.session,
-                    f"{PREFIX}/{site}/{machine}/{suffix}",
-                    link.guarded(take),
-                    history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1) if current else None,
-                    recovery=None
-                    if name == "report"
-                    else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
-                )
-                undo.callback(subscriber.undeclare)
-            yield lambda: link.is_open and bool(link.session.info.peers_zid() or link.session.info.routers_zid())
-    finally:
-        link.close()
+            subscriber = zenoh.ext.declare_advanced_subscriber(
+                link.session,
+                f"{PREFIX}/{site}/{machine}/{suffix}",
+                link.guarded(take),
+                history=zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=1) if current else None,
+                recovery=None if name == "report" else zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+            )
+            undo.callback(subscriber.undeclare)
+        yield lambda: link.is_open and bool(link.session.info.peers_zid() or link.session.info.routers_zid())
 
 
 @contextmanager
@@ -392,11 +372,18 @@ def route(settings: LinkSettings) -> Iterator[None]:
     LinkError
         If it cannot listen.
     """
-    link = Link(settings.model_copy(update={"mode": "router"}))
-    try:
+    with closing(Link(settings.model_copy(update={"mode": "router"}))):
         yield
-    finally:
-        link.close()
+
+
+def _ask(link: Link, key: str, callback: Callable[[zenoh.Sample], None]) -> None:
+    """Query a key; each answer is taken like a message."""
+
+    def take(reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            callback(reply.ok)
+
+    link.session.get(key, link.guarded(take), timeout=_QUERY_TIMEOUT_S)
 
 
 def _source(sample: zenoh.Sample) -> str:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from models.errors import MachineFileError
+from models.mistakes import in_folder
 from service.access.credentials import network_of
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.scopes import ANONYMOUS, Scope
@@ -198,11 +199,11 @@ def test_settings_refuse_what_they_do_not_know() -> None:
 
 def test_certificates_are_beside_the_settings_file() -> None:
     tls = TlsSettings(certificate=Path("c.pem"), key=Path("/keys/k.pem"), client_ca=Path("ca.pem"))
-    found = AccessSettings(tls=tls).beside(Path("/etc/rotorwatch")).tls
+    found = in_folder(AccessSettings(tls=tls), Path("/etc/rotorwatch")).tls
     assert found == TlsSettings(
         certificate=Path("/etc/rotorwatch/c.pem"), key=Path("/keys/k.pem"), client_ca=Path("/etc/rotorwatch/ca.pem")
     )
-    assert AccessSettings().beside(Path("/x")) == AccessSettings()
+    assert in_folder(AccessSettings(), Path("/x")) == AccessSettings()
 
 
 @pytest.fixture

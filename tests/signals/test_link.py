@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from models.arrivals import Senders
 from models.errors import MachineFileError
+from models.mistakes import in_folder
 from models.signals.block import SampleBlock
 from models.signals.keys import Grant, MachineKeys, access_control
 from models.signals.link import LinkSettings, TlsSettings, load_link
@@ -110,7 +111,7 @@ def test_secrets_are_in_what_goes_to_zenoh_and_nowhere_else(tmp_path: Path, monk
     monkeypatch.setenv("LAB_PASSWORD", HIDDEN)
     by_variable = LinkSettings.model_validate(BY_VARIABLE)
     secret_file(tmp_path / "p", f"{HIDDEN}\n")
-    by_file = LinkSettings(connect=ENDPOINT, user="lab", password_file=Path("p")).beside(tmp_path)
+    by_file = in_folder(LinkSettings(connect=ENDPOINT, user="lab", password_file=Path("p")), tmp_path)
     for link in (by_variable, by_file):
         assert json.loads(inserted(link).get_json("transport/auth/usrpwd/password")) == HIDDEN
         for shown in (repr(link), str(link), repr(link.model_dump()), link.model_dump_json(), link.refusal()):

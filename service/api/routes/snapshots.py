@@ -2,11 +2,12 @@
 
 from typing import Annotated, Any
 
-from fastapi import FastAPI, HTTPException, Query
+from fastapi import FastAPI, HTTPException, Query, Request
+from fastapi.responses import JSONResponse
 
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.access.guard import Guard
-from service.access.problems import responses
+from service.access.problems import problem_answer, responses
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
@@ -27,6 +28,11 @@ _Revolutions = Annotated[
 
 def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     """Add the routes."""
+
+    @app.exception_handler(SnapshotError)
+    async def refused(request: Request, error: Exception) -> JSONResponse:
+        return problem_answer(request, 422, str(error))
+
     common: dict[str, Any] = {"tags": ["snapshots"], "dependencies": [guard.read]}
 
     @app.get(f"{PLACE}/correlations", responses=responses(CorrelationSnapshot, 404, 422), **common)
@@ -35,10 +41,7 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     ) -> CorrelationSnapshot:
         """Correlation functions of the latest window, measured and as theory predicts them; a few pairs by default."""
         view = found_machine(service, site, machine)
-        try:
-            return view.snapshots.correlations(view.latest, first, second, units)
-        except SnapshotError as error:
-            raise HTTPException(422, str(error)) from error
+        return view.snapshots.correlations(view.latest, first, second, units)
 
     @app.get(f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), **common)
     def spectra(
@@ -56,10 +59,7 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         band = None if from_hz is None and to_hz is None else (from_hz or 0.0, 1e6 if to_hz is None else to_hz)
         if band is not None and not band[0] < band[1]:
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
-        try:
-            return view.snapshots.spectra(view.latest, channel, first, second, band, units)
-        except SnapshotError as error:
-            raise HTTPException(422, str(error)) from error
+        return view.snapshots.spectra(view.latest, channel, first, second, band, units)
 
     @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), **common)
     def orbits(
@@ -67,7 +67,4 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     ) -> OrbitSnapshot:
         """Orbits of the latest window at running speed, and the newest revolutions as measured."""
         view = found_machine(service, site, machine)
-        try:
-            return view.snapshots.orbits(view.latest, revolutions, units)
-        except SnapshotError as error:
-            raise HTTPException(422, str(error)) from error
+        return view.snapshots.orbits(view.latest, revolutions, units)
