@@ -43,7 +43,7 @@ from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_de
 
 ORDERS = {"x_half": 0.5, "x1": 1.0, "x2": 2.0, "x3": 3.0}
 """Multiples of running speed, by the name of their measure."""
-COMPARED = ("overall", "velocity", "s_max", "x_half", "x1", "x2", "x3", "high", "envelope")
+COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
