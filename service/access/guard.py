@@ -252,9 +252,7 @@ class Guard:
             if known is not None and method in SAFE_METHODS and now_s - known.looked_up_s <= _WITHOUT_DATABASE_S:
                 return known.record
             # Who asks is not known, and where the database is only concerns those who read the log.
-            withheld = self._limiter.admit("look-up")
-            if withheld is not None:
-                _log.error("tokens cannot be looked up", why=str(error), **({"withheld": withheld} if withheld else {}))
+            self._limiter.say("look-up", _log.error, "tokens cannot be looked up", why=str(error))
             raise HTTPException(
                 503, "tokens cannot be looked up in the history: nothing was done; the log says why"
             ) from error

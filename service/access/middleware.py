@@ -131,16 +131,8 @@ class AccessMiddleware:
             note = AuditNote()
         refused = status in _REFUSED or not hasattr(request.state, CALLER)
         if refused and not visit.started:
-            withheld = self._limiter.admit(f"refused {status}")
-            if withheld is not None:
-                _log.warning(
-                    "request refused",
-                    status=status,
-                    address=visit.address,
-                    actor=visit.actor,
-                    method=visit.method,
-                    **({"withheld": withheld} if withheld else {}),
-                )
+            told = {"status": status, "address": visit.address, "actor": visit.actor, "method": visit.method}
+            self._limiter.say(f"refused {status}", _log.warning, "request refused", **told)
             left_out = self._trail.admits_refusal(network_of(visit.address))
             if left_out is None:
                 return

@@ -243,10 +243,8 @@ class HttpConnections:
                 one.end()
 
     def _say(self, what: str, address: str, why: str) -> None:
-        withheld = self._limiter.admit(what)
-        if withheld is not None:
-            more = {"withheld": withheld} if withheld else {}
-            _log.warning(f"connection {what}; said at most once a minute", address=address, why=why, **more)
+        text = f"connection {what}; said at most once a minute"
+        self._limiter.say(what, _log.warning, text, address=address, why=why)
 
     def _is_proxy(self, address: str) -> bool:
         return any(ipaddress.ip_address(address.partition("%")[0]) in network for network in self._proxies)
@@ -257,10 +255,8 @@ class HttpConnections:
             loop.default_exception_handler(context)
             return
         self.exhausted += 1
-        withheld = self._limiter.admit("accept")
-        if withheld is not None:
-            more = {"withheld": withheld} if withheld else {}
-            _log.error("no connection can be accepted; said at most once a minute", why=error.strerror, **more)
+        text = "no connection can be accepted; said at most once a minute"
+        self._limiter.say("accept", _log.error, text, why=error.strerror)
 
 
 class _Listener(socket.socket):

@@ -283,7 +283,7 @@ def _message_batches(
             continue
         when = found[time]
         if isinstance(when, int) and selection.wants(when):
-            pending.append(found)
+            pending.append({name: found.get(name) for name in table.schema.names})
         if len(pending) >= _MESSAGES:
             yield pa.RecordBatch.from_pylist(pending, schema=table.schema)
             table.rows += len(pending)
@@ -295,15 +295,7 @@ def _message_batches(
 
 def _report_row(payload: bytes) -> _Row:
     report = Report.model_validate_json(payload)
-    row: _Row = {
-        "start_ns": report.start_ns,
-        "end_ns": report.end_ns,
-        "state": report.state,
-        "filled": report.filled,
-        **{field: getattr(report, field) for field, _ in MEASURES.values()},
-        "suspect": report.suspect,
-        "reason": report.reason,
-    }
+    row: _Row = dict(vars(report))
     if report.verdict is not None:
         row["verdict"] = report.verdict.text
         row["changed"] = " ".join(finding.name for finding in report.verdict.changed)
@@ -317,7 +309,4 @@ def _report_row(payload: bytes) -> _Row:
 
 def _alarm_row(payload: bytes) -> _Row:
     event = AlarmCloudEvent.model_validate_json(payload)
-    names = ("time_ns", "name", "kind", "severity", "text", "relative_change", "standard_error")
-    more = ("low_confidence", "raised_ns", "occurrence", "sequence", "state", "actor", "reason")
-    row: _Row = {name: getattr(event.data, name) for name in (*names, *more)}
-    return {**row, "id": event.id}
+    return {**vars(event.data), "id": event.id}

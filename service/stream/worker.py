@@ -491,6 +491,4 @@ class MachineWorker:
             self._dropped_logged = dropped
 
     def _warn(self, kind: str, text: str, **details: object) -> None:
-        withheld = self._limiter.admit(kind)
-        if withheld is not None:
-            self._log.warning(text, **details, **({"withheld": withheld} if withheld else {}))
+        self._limiter.say(kind, self._log.warning, text, **details)

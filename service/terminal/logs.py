@@ -78,6 +78,11 @@ class Limiter:
         self._next_s[kind] = now_s + self._quiet_s
         return self._withheld.pop(kind, 0)
 
+    def say(self, kind: str, write: Callable[..., object], text: str, /, **details: object) -> None:
+        """Write a line of a kind, with how many were withheld before it, unless it is to be withheld as well."""
+        if (withheld := self.admit(kind)) is not None:
+            write(text, **details, **({"withheld": withheld} if withheld else {}))
+
 
 class _OnceAMinute(logging.Filter):
     """Lets a warning through once a minute, and every error."""

@@ -262,11 +262,8 @@ class Dispatcher:
             self._failures += 1
             pause = pause_s(answer, self._failures, self.settings.longest_pause_s, self._chance())
             self._due_s = self._clock() + pause
-        if (withheld := self._limiter.admit("attempt")) is not None:
-            more = {"withheld": withheld} if withheld else {}
-            self._log.warning(
-                "not delivered, trying again", id=event.id, why=answer.text, pause_s=round(pause, 1), **more
-            )
+        told = {"id": event.id, "why": answer.text, "pause_s": round(pause, 1)}
+        self._limiter.say("attempt", self._log.warning, "not delivered, trying again", **told)
 
     def _conclude(self, lane: _Lane, event: StoredEvent) -> None:
         if self._failures or lane.failures:
@@ -291,10 +288,7 @@ class Dispatcher:
 
     def _unwell(self, error: StoreError) -> None:
         self._note(str(error))
-        if (withheld := self._limiter.admit("history")) is not None:
-            self._log.warning(
-                "the history cannot be used", why=str(error), **({"withheld": withheld} if withheld else {})
-            )
+        self._limiter.say("history", self._log.warning, "the history cannot be used", why=str(error))
 
     def _note(self, error: str) -> None:
         self._last_error, self._last_error_ns = error, self._now_ns()
