@@ -32,7 +32,7 @@ from types import FrameType
 from typing import IO
 
 import httpx
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel
 from rich.console import Console
 
 from models.alarm_names import CLOCK, GAP, OVERLOADED, STREAM_LOST
@@ -81,10 +81,8 @@ class DemoError(RotorwatchError):
     """A program of the demo did not start or died; the message holds the end of its output."""
 
 
-class Truth(BaseModel):
+class Truth(BaseModel, extra="ignore", frozen=True):
     """The part of the simulator's truth record that the demo looks at."""
-
-    model_config = ConfigDict(extra="ignore", frozen=True)
 
     time_ns: int
     data_s: float

@@ -6,7 +6,7 @@ are the computer's time, all others data time.
 
 from dataclasses import dataclass
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from models.errors import RotorwatchError
 
@@ -156,14 +156,12 @@ class DamagedError(StoreError):
     """The file is there and is no usable database; the message says what SQLite found."""
 
 
-class Retention(BaseModel):
+class Retention(BaseModel, extra="forbid", frozen=True):
     """How long the history is kept, by the computer's time of recording; alarm events and audit log are kept for ever.
 
     Readings are reduced to buckets as they come: count, least, mean and largest value, and mean standard error. Buckets
     never go before the readings in them.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     reports_days: float = Field(
         default=14.0, gt=0.0, le=36_500.0, description="how long full reports are kept, in days; about 2 kB each"

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, model_validator
 
 from models.errors import MachineFileError
 from models.machine import MachineFile
@@ -15,7 +15,6 @@ from models.mistakes import checked, did_you_mean, read_toml
 from models.signals.channels import Channel, Quantity, time_unit_ns, unit_factor
 from service.interchange.formats import Format
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 _DATETIME = "datetime"
 
 
@@ -27,10 +26,8 @@ _Name = Annotated[str, BeforeValidator(_text), Field(min_length=1)]
 """Name of a column; columns without names are numbered from 1."""
 
 
-class CsvFormat(BaseModel):
+class CsvFormat(BaseModel, extra="forbid", frozen=True):
     """How a text table is written."""
-
-    model_config = _STRICT
 
     delimiter: str = Field(default=",", min_length=1, max_length=1, description="between cells")
     decimal: Literal[".", ","] = Field(default=".", description="decimal sign")
@@ -46,10 +43,8 @@ class CsvFormat(BaseModel):
         return self
 
 
-class TimeBase(BaseModel):
+class TimeBase(BaseModel, extra="forbid", frozen=True):
     """When the rows were sampled."""
-
-    model_config = _STRICT
 
     column: _Name | None = Field(default=None, description="column with the time of each row")
     index: int | None = Field(default=None, ge=0, description="its column, in a table within an array file")
@@ -99,10 +94,8 @@ class TimeBase(BaseModel):
         return ((since.days * 86400 + since.seconds) * 1_000_000 + since.microseconds) * 1000
 
 
-class Column(BaseModel):
+class Column(BaseModel, extra="forbid", frozen=True):
     """Where a channel's samples are: sample = sign · (number · scale + offset) in `unit`."""
-
-    model_config = _STRICT
 
     column: _Name = Field(description="column, array, channel or data set")
     index: int | None = Field(default=None, ge=0, description="column of a table within an array file, from 0")
@@ -119,19 +112,15 @@ class Column(BaseModel):
         return self
 
 
-class Acceleration(BaseModel):
+class Acceleration(BaseModel, extra="forbid", frozen=True):
     """Channels that are integrated from accelerometers."""
-
-    model_config = _STRICT
 
     high_pass_hz: float = Field(gt=0, le=1e4, description="corner of the high-pass; valid from twice that frequency")
     channels: dict[str, Column] = Field(min_length=1, description="channel of the machine to accelerometer")
 
 
-class Keyphasor(BaseModel):
+class Keyphasor(BaseModel, extra="forbid", frozen=True):
     """Shaft angle from pulses: their times, or a sampled signal that has them."""
-
-    model_config = _STRICT
 
     pulse_times: _Name | None = Field(default=None, description="array of the times of all pulses")
     unit: str = Field(default="s", description="unit of these times, counted like the rows")
@@ -153,10 +142,8 @@ class Keyphasor(BaseModel):
         return self
 
 
-class Mapping(BaseModel):
+class Mapping(BaseModel, extra="forbid", frozen=True):
     """All of it."""
-
-    model_config = _STRICT
 
     format: Format | None = Field(default=None, description="format of the file where its name does not say")
     csv: CsvFormat = CsvFormat()

@@ -164,10 +164,7 @@ def evaluator_for(installed: Installed) -> WindowEvaluator:
 class _Unremembering:
     """Whose evaluations each stand for themselves: only the whole window is taken, and nothing is remembered of it."""
 
-    @property
-    def takes_short(self) -> bool:
-        """Short stretches are not evaluated."""
-        return False
+    takes_short = False
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Nothing."""
@@ -204,6 +201,9 @@ class KnownMachineEvaluator:
         Uncertainty of parameters that were identified; part of every reading.
     """
 
+    by = "likelihood"
+    takes_short = True
+
     def __init__(self, machine: Machine, bundle: Bundle | None, identified: IdentifiedRecord | None = None) -> None:
         self._machine = machine
         self._place = f"{machine.site}/{machine.name}"
@@ -216,16 +216,6 @@ class KnownMachineEvaluator:
             others.append(NetworkDiagnostician(machine, bundle.amortised))
         others.append(RelationDiagnostician(machine, () if bundle is None else bundle.networks))
         self._others = tuple(others)
-
-    @property
-    def by(self) -> str:
-        """The likelihood."""
-        return "likelihood"
-
-    @property
-    def takes_short(self) -> bool:
-        """Short stretches can be evaluated."""
-        return True
 
     @property
     def needs_lags(self) -> bool:
@@ -318,6 +308,8 @@ class BaselineEvaluator(_Unremembering):
         With a baseline, or at least the healthy shape of every channel.
     """
 
+    needs_lags = True  # relations hold between correlation functions
+
     def __init__(self, machine: MachineFile, commissioned: Commissioned) -> None:
         self._place = f"{machine.site}/{machine.name}"
         self._conditions = commissioned.conditions
@@ -330,11 +322,6 @@ class BaselineEvaluator(_Unremembering):
     def by(self) -> str:
         """The baseline, or nothing but the shapes of channels."""
         return self._baselines[0][1].by if self._baselines else _SHAPE
-
-    @property
-    def needs_lags(self) -> bool:
-        """Relations hold between correlation functions."""
-        return True
 
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window, see `WindowEvaluator`; outside the commissioned conditions it is not evaluable."""

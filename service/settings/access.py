@@ -3,18 +3,14 @@
 import ipaddress
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, Field, field_validator
 
 from models.errors import MachineFileError
 from models.signals.link import is_loopback
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 
-
-class TlsSettings(BaseModel):
+class TlsSettings(BaseModel, extra="forbid", frozen=True):
     """Certificate and key of the HTTP API, PEM files relative to the settings file; TLS 1.2 or newer."""
-
-    model_config = _STRICT
 
     certificate: Path = Field(description="the service's certificate, followed by those that lead to its authority")
     key: Path = Field(description="private key, without a password and not readable by others")
@@ -23,10 +19,8 @@ class TlsSettings(BaseModel):
     )
 
 
-class LimitSettings(BaseModel):
+class LimitSettings(BaseModel, extra="forbid", frozen=True):
     """How much one caller may ask for; a caller is a token, or an address where there is none."""
-
-    model_config = _STRICT
 
     body_bytes: int = Field(default=1_000_000, ge=1_000, le=1_000_000_000, description="largest request body, in bytes")
     requests_per_minute: int = Field(default=600, ge=1, le=1_000_000, description="most requests of one caller")
@@ -40,10 +34,8 @@ class LimitSettings(BaseModel):
     )
 
 
-class AccessSettings(BaseModel):
+class AccessSettings(BaseModel, extra="forbid", frozen=True):
     """Who may use the HTTP API; without anything here a token is needed for all but ``/healthz``."""
-
-    model_config = _STRICT
 
     open_on_loopback: bool = Field(
         default=False, description="everybody on this computer may do everything without a token"

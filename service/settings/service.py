@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from models.errors import MachineFileError
@@ -22,14 +22,11 @@ from service.settings.webhooks import WebhookSettings, repeated_name
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 
-_STRICT = ConfigDict(extra="forbid", frozen=True)
 _ENV_PREFIX = "ROTORWATCH_"
 
 
-class HttpSettings(BaseModel):
+class HttpSettings(BaseModel, extra="forbid", frozen=True):
     """Where the HTTP API is served, to how many at once, and how long it waits for them."""
-
-    model_config = _STRICT
 
     host: str = Field(default="127.0.0.1", min_length=1, description="address to listen on")
     port: int = Field(default=8080, ge=0, le=65535, description="TCP port; 0 takes a free one, which is printed")
@@ -53,10 +50,8 @@ class HttpSettings(BaseModel):
     )
 
 
-class MachineEntry(BaseModel):
+class MachineEntry(BaseModel, extra="forbid", frozen=True):
     """One monitored machine."""
-
-    model_config = _STRICT
 
     file: str = Field(min_length=1, description="shipped machine by name, or path relative to the settings file")
     bundle: str | None = Field(
@@ -77,7 +72,7 @@ class MachineEntry(BaseModel):
         return load_machine_file(self.file)
 
 
-class QueueSettings(BaseModel):
+class QueueSettings(BaseModel, extra="forbid", frozen=True):
     """Blocks of one machine that have arrived and are not evaluated yet.
 
     With ``when_full = "drop"`` a monitor that cannot keep up loses blocks and counts them; the source is never slowed
@@ -85,17 +80,13 @@ class QueueSettings(BaseModel):
     simulated data as fast as it can, wrong for a live machine, because everything else on the same link waits too.
     """
 
-    model_config = _STRICT
-
     blocks: int = Field(default=1500, ge=1, le=1_000_000, description="most blocks that wait, per machine")
     mb: float = Field(default=64.0, gt=0, le=100_000, description="most megabytes that wait, per machine")
     when_full: Literal["drop", "wait"] = Field(default="drop", description="what happens to a block beyond that")
 
 
-class HistorySettings(BaseModel):
+class HistorySettings(BaseModel, extra="forbid", frozen=True):
     """Where reports, alarms and what a restart needs are kept, and for how long."""
-
-    model_config = _STRICT
 
     url: str | None = Field(
         default=None,
@@ -120,14 +111,12 @@ class HistorySettings(BaseModel):
         return self.database.endswith(":memory:")
 
 
-class RecordingSettings(BaseModel):
+class RecordingSettings(BaseModel, extra="forbid", frozen=True):
     """Where everything under the machines' keys is recorded, and what is kept; per machine, as far as sizes go.
 
     Whole files are kept or dropped. A file that reaches into the time around an alarm falls under the limits for alarms
     instead of the ordinary ones.
     """
-
-    model_config = _STRICT
 
     directory: str | None = Field(
         default=None, min_length=1, description="where recordings go, relative to the settings file; off without it"
@@ -161,10 +150,8 @@ class RecordingSettings(BaseModel):
         return self
 
 
-class ReplaySettings(BaseModel):
+class ReplaySettings(BaseModel, extra="forbid", frozen=True):
     """Replays of recordings that are started over HTTP; results are kept below the directory of the recordings."""
-
-    model_config = _STRICT
 
     enabled: bool | None = Field(
         default=None, description="whether they may be started; if left out, only if the HTTP API stays on loopback"
@@ -174,10 +161,8 @@ class ReplaySettings(BaseModel):
     kept: int = Field(default=20, ge=1, le=10_000, description="latest replays whose results are kept")
 
 
-class LogSettings(BaseModel):
+class LogSettings(BaseModel, extra="forbid", frozen=True):
     """What is logged to standard error, and how."""
-
-    model_config = _STRICT
 
     level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="least serious level shown")
     format: Literal["console", "json"] = Field(default="console", description="for people, or one JSON object a line")

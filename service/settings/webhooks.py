@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 from urllib.parse import SplitResult, urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from models.signals.link import is_loopback
 
@@ -23,10 +23,8 @@ WebhookKind = Literal[
 ]
 
 
-class WebhookSettings(BaseModel):
+class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=True):
     """One receiver of alarm events; an event is sent if machine, kind and severity are all among those wanted."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)
 
     name: str = Field(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$",

@@ -30,7 +30,8 @@ from models.machine import Machine
 from models.mistakes import did_you_mean, mistakes
 
 _SHIPPED = Path(__file__).parents[2] / "bundles"
-_Arrays = dict[str, np.ndarray[Any, np.dtype[Any]]]
+_Array = np.ndarray[Any, np.dtype[Any]]
+_Arrays = dict[str, _Array]
 _FORMAT = 2
 _PHYSICS = ("rotor", "operation", "condition", "rate_hz", "window")
 _BASIS = ("mean", "directions", "centre", "scale", "precision_factor")
@@ -258,13 +259,18 @@ def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> Equation
     parts = []
     for name in _ARRAYS:
         array = arrays.get(f"{entry.number}.{name}")
-        if array is None or array.shape != shapes[name] or array.dtype != np.float64 or not np.isfinite(array).all():
-            state = "missing" if array is None else f"{array.dtype}{array.shape}"
-            raise BundleError(f"{where}: weight {name} is {state}, expected finite float64{shapes[name]}")
+        array = _finite(array, np.dtype(np.float64), shapes[name], f"{where}: weight {name}")
         if name == "input_scale" and not np.all(array > 0):
             raise BundleError(f"{where}: weight input_scale has a value that is not above 0")
         parts.append(array)
     return EquationNetwork(equation, Network(*parts), Healthy(**dict(healthy)))
+
+
+def _finite(array: _Array | None, kind: np.dtype[Any], shape: tuple[int, ...], what: str) -> _Array:
+    if array is None or array.shape != shape or array.dtype != kind or not np.isfinite(array).all():
+        state = "missing" if array is None else f"{array.dtype}{array.shape}"
+        raise BundleError(f"{what} is {state}, expected finite {kind}{shape}")
+    return array
 
 
 def _amortised_arrays(amortised: AmortisedNetworks) -> _Arrays:
@@ -321,10 +327,7 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
             shapes[f"amortised.{number}.b{layer}"] = (n_out,)
         shapes[f"amortised.{number}.direct"] = (first, own)
     for name, shape in shapes.items():
-        array = arrays.get(name)
-        if array is None or array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
-            state = "missing" if array is None else f"{array.dtype}{array.shape}"
-            raise BundleError(f"{where}: {name} is {state}, expected finite float32{shape}")
+        _finite(arrays.get(name), np.dtype(np.float32), shape, f"{where}: {name}")
     basis = FeatureBasis(*(arrays[f"basis.{name}"] for name in _BASIS))
     layers = range(1, len(LAYERS) + 2)
     networks = tuple(
