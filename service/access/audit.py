@@ -13,12 +13,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 from models.errors import RotorwatchError
 from service.access.rates import MovingWindow
 from service.access.tokens import masked
 from service.history.records import AuditEntry
+from service.history.shared import AuditLog
 from service.terminal.logs import logger
 
 STARTED = "started"
@@ -27,13 +27,6 @@ STARTED = "started"
 _LONGEST = 500
 _REFUSALS_IN_ALL = 60
 _log = logger(part="access")
-
-
-class AuditLog(Protocol):
-    """Where entries go, for ever; calls may wait for a database."""
-
-    def append(self, entry: AuditEntry) -> object:
-        """Add an entry, which gets its number there."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 from models.errors import RotorwatchError
-from service.access.audit import AuditLog, AuditTrail, Visit
+from service.access.audit import AuditTrail, Visit
 from service.access.credentials import address_of, key_of, network_of, presented_text, unauthenticated
 from service.access.middleware import VISIT, AccessMiddleware
 from service.access.origin import SAFE_METHODS, check_body_type, check_origin
@@ -37,8 +37,9 @@ from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import Requirement, requires
 from service.access.routes import PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
-from service.access.tokens import PresentedToken, TokenStore, parse_token, token_is_valid
+from service.access.tokens import PresentedToken, parse_token, token_is_valid
 from service.history.records import TokenRecord
+from service.history.shared import AuditLog, TokenStore
 from service.settings.access import AccessSettings
 from service.terminal.logs import Limiter, logger
 

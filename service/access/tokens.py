@@ -7,7 +7,6 @@ import secrets
 import string
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from models.errors import MachineFileError
 from service.access.scopes import ANONYMOUS, Scope
@@ -23,22 +22,6 @@ _ANY_SECRET = re.compile(f"rw_([0-9A-Za-z]{{{_ID_LENGTH}}})_[0-9A-Za-z]+")  # on
 _LONGEST_NAME = 64
 _DAY_NS = 86_400 * 10**9
 _NO_HASH = bytes(hashlib.sha256().digest_size)
-
-
-class TokenStore(Protocol):
-    """Where tokens are kept; calls may wait for a database."""
-
-    def add(self, record: TokenRecord) -> None:
-        """Keep a new token."""
-
-    def find(self, token_id: str) -> TokenRecord | None:
-        """Return a token as it is now, revoked ones included."""
-
-    def all(self) -> tuple[TokenRecord, ...]:
-        """Every token there ever was."""
-
-    def revoke(self, token_id: str, at_ns: int) -> bool:
-        """Revoke a token; False if there is none that could be."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,21 +8,14 @@ from fastapi import HTTPException, Path, Query
 from pydantic import AfterValidator
 
 from models.alarm_names import ALARMS, LEVEL, is_alarm
-from models.machine import MachineFile
-from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
-from rotorwatch.records.health import Health
-from rotorwatch.records.machines import DetectableChanges, MachineDescription
 from rotorwatch.records.monitor import Readiness
-from service.analysis.snapshots.heading import LatestData
-from service.analysis.snapshots.machine import MachineSnapshots
-from service.api.routes.recordings import RecordingIndex
 from service.api.routes.replays import ReplayDesk
-from service.api.routes.service import MeasuredView
 from service.delivery.event_feed import EventFeed
-from service.history.machine import MachineStore
+from service.delivery.metrics.collector import Metrics
+from service.delivery.webhooks.webhooks import Webhooks
 from service.history.shared import AuditLog
-from service.monitor.alarms.operation import OperatorAction
-from service.monitor.reports import Identity
+from service.recordings.catalogue import Catalogue
+from service.stream.worker import MachineWorker
 
 PLACE = "/api/v1/machines/{site}/{machine}"
 _LATEST_NS = 2**63 - 1
@@ -48,62 +41,25 @@ AlarmName = Annotated[
 ]
 
 
-class MachineView(Protocol):
-    """What the API needs to know about one machine; `service.stream.worker.MachineWorker` is one."""
-
-    @property
-    def machine(self) -> MachineFile:
-        """The machine file."""
-
-    @property
-    def identity(self) -> Identity:
-        """Who speaks."""
-
-    @property
-    def history(self) -> MachineStore:
-        """What is kept of the machine."""
-
-    @property
-    def snapshots(self) -> MachineSnapshots:
-        """Makes snapshots of what the monitor holds."""
-
-    @property
-    def latest(self) -> LatestData:
-        """What the monitor holds."""
-
-    def description(self) -> MachineDescription:
-        """Identity, stream, keys, and the present state."""
-
-    def health(self) -> Health:
-        """Where the machine stands now."""
-
-    def alarms(self, *, include_normal: bool = False) -> AlarmStates:
-        """Return the alarms as they are now."""
-
-    def detectable(self, change: float | None) -> DetectableChanges:
-        """Return what would be found on the machine as it runs now."""
-
-    def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
-        """Do what an operator asks for, and say what happened.
-
-        Raises
-        ------
-        UnknownAlarm, OperationConflict, OperationRefused, NotInTime
-            If it was not done, or nobody knows.
-        """
-
-
-class ServiceView(MeasuredView, Protocol):
+class ServiceView(Protocol):
     """What the API needs to know about the service; `service.runtime.Runtime` is one."""
 
-    def machines(self) -> Sequence[MachineView]:
+    def machines(self) -> Sequence[MachineWorker]:
         """Every monitored machine."""
 
-    def machine(self, site: str, name: str) -> MachineView | None:
+    def machine(self, site: str, name: str) -> MachineWorker | None:
         """One machine, or None if it is not monitored."""
 
     def readiness(self) -> Readiness:
         """Whether the service can do its work."""
+
+    @property
+    def metrics(self) -> Metrics:
+        """The metrics."""
+
+    @property
+    def webhooks(self) -> Webhooks:
+        """Who is told of alarm events."""
 
     @property
     def feed(self) -> EventFeed:
@@ -114,7 +70,7 @@ class ServiceView(MeasuredView, Protocol):
         """Who asked for what."""
 
     @property
-    def catalogue(self) -> RecordingIndex | None:
+    def catalogue(self) -> Catalogue | None:
         """Recordings, or None if no directory for them is set."""
 
     @property
@@ -122,7 +78,7 @@ class ServiceView(MeasuredView, Protocol):
         """Where replays are started."""
 
 
-def found_machine(service: ServiceView, site: str, name: str) -> MachineView:
+def found_machine(service: ServiceView, site: str, name: str) -> MachineWorker:
     """Find a machine.
 
     Raises

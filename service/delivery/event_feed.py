@@ -15,13 +15,13 @@ import threading
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from starlette.concurrency import run_in_threadpool
 
 from models.errors import RotorwatchError
 from rotorwatch.records.health import Health
-from service.history.records import StoredEvent, StoreError
+from service.history.machine import MachineStore
+from service.history.records import StoreError
 
 Cursor = dict[str, int]
 """Sequence of the last alarm event that was delivered, for each ``site/machine``; -1 before the first."""
@@ -38,16 +38,6 @@ CURSOR_PATTERN = f"^({_ENTRY}(,{_ENTRY})*)?$"
 
 class CursorError(RotorwatchError):
     """A cursor is not of the form that this service gives."""
-
-
-class AlarmLog(Protocol):
-    """The log of one machine; `service.history.machine.MachineStore` is one."""
-
-    def last_sequence(self) -> int:
-        """Sequence of the latest event, which need not be committed yet; -1 if there is none."""
-
-    def events(self, *, after: int | None = None, limit: int = 100) -> tuple[StoredEvent, ...]:
-        """Committed events after a sequence, oldest first."""
 
 
 def cursor_text(cursor: Mapping[str, int]) -> str:
@@ -141,13 +131,13 @@ class EventFeed:
             self._lock.wait_for(lambda: not self._listeners, _LAST_S)
 
     async def follow(
-        self, logs: Mapping[str, AlarmLog], cursor: Cursor, admitted: Callable[[], Awaitable[bool]]
+        self, logs: Mapping[str, MachineStore], cursor: Cursor, admitted: Callable[[], Awaitable[bool]]
     ) -> AsyncIterator[str]:
         """Server-sent events from a cursor on, until the service or the right to listen ends.
 
         Parameters
         ----------
-        logs : mapping of str to AlarmLog
+        logs : mapping of str to MachineStore
             Logs of the machines that are listened to, by ``site/machine``.
         cursor : dict
             How far each has been heard, for all of `logs`.
@@ -188,7 +178,7 @@ class EventFeed:
                 self._listeners.discard(listener)
                 self._lock.notify_all()
 
-    async def _committed(self, place: str, log: AlarmLog, cursor: Cursor) -> AsyncIterator[str]:
+    async def _committed(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
         """What is in the log after the cursor, which moves along; nothing while the history cannot be read."""
         while cursor[place] < log.last_sequence():
             try:

@@ -14,7 +14,8 @@ from service.access.guard import Guard
 from service.access.problems import problem_responses
 from service.access.scopes import Caller
 from service.api.views import ServiceView
-from service.delivery.event_feed import CURSOR_PATTERN, AlarmLog, Cursor, CursorError, cursor_text, parsed_cursor
+from service.delivery.event_feed import CURSOR_PATTERN, Cursor, CursorError, cursor_text, parsed_cursor
+from service.history.machine import MachineStore
 
 _LONGEST = 20_000
 _FORM = {"pattern": CURSOR_PATTERN}  # described here, refused in words that say more
@@ -92,7 +93,7 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         )
 
 
-def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, AlarmLog]:
+def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, MachineStore]:
     there = {f"{one.machine.site}/{one.machine.name}": one.history for one in service.machines()}
     unknown = next((place for place in wanted if place not in there), None)
     if unknown is not None:
@@ -100,7 +101,7 @@ def _logs(service: ServiceView, wanted: list[str]) -> Mapping[str, AlarmLog]:
     return {place: log for place, log in there.items() if place in wanted or not wanted}
 
 
-def _cursor(logs: Mapping[str, AlarmLog], texts: tuple[str, ...], begin: str) -> Cursor:
+def _cursor(logs: Mapping[str, MachineStore], texts: tuple[str, ...], begin: str) -> Cursor:
     """Where to begin in each log; a machine that the first text does not name is new to the listener, who gets it all.
 
     Texts after the first that is there must be understood, and do not count.

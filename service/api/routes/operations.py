@@ -14,7 +14,7 @@ from service.access.audit import AuditNote
 from service.access.guard import Guard
 from service.access.problems import responses
 from service.access.scopes import Caller
-from service.api.views import PLACE, AlarmName, MachineName, MachineView, ServiceView, SiteName, found_machine
+from service.api.views import PLACE, AlarmName, MachineName, ServiceView, SiteName, found_machine
 from service.monitor.alarm_conversion import alarm_entries
 from service.monitor.alarms.alarm import Alarm as AlarmRecord
 from service.monitor.alarms.operation import (
@@ -24,6 +24,7 @@ from service.monitor.alarms.operation import (
     OperatorAction,
     UnknownAlarm,
 )
+from service.stream.worker import MachineWorker
 
 _IF_MATCH = r'^(\*|(W/)?"-?[0-9]{1,18}")$'
 _ETAG = {
@@ -145,7 +146,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         return OperationDone(alarm=_marked(_present(view, name), response), events=events)
 
 
-def _present(view: MachineView, name: str) -> Alarm:
+def _present(view: MachineWorker, name: str) -> Alarm:
     """An alarm as it is now; one that nothing has been seen of yet is normal.
 
     Raises

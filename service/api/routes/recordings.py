@@ -1,7 +1,6 @@
 """Recordings over HTTP: list, look at, download."""
 
-from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import FileResponse
@@ -11,25 +10,11 @@ from models.signals.recording import summarize_recording
 from rotorwatch.records.recordings import RecordingDetail, RecordingEntry, RecordingList
 from service.access.guard import Guard
 from service.access.problems import problem_answer, problem_responses, responses
-from service.recordings.catalogue import Recording
+from service.recordings.catalogue import Catalogue, Recording
 from service.recordings.replay.source import RecordingSource
 
 _NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
 _NONE = "no recordings: the settings name no directory for them ([recording] directory)"
-
-
-class RecordingIndex(Protocol):
-    """What the API needs to know about recordings; `service.recordings.catalogue.Catalogue` is one."""
-
-    @property
-    def directory(self) -> Path:
-        """Where they are."""
-
-    def recordings(self, site: str | None = None, machine: str | None = None) -> tuple[Recording, ...]:
-        """List recordings, sorted by site, machine and time."""
-
-    def find(self, recording_id: str) -> Recording | None:
-        """One recording, or None; reaches no file outside the directory."""
 
 
 _Site = Annotated[str | None, Query(description="only of this site")]
@@ -38,7 +23,7 @@ _SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this
 _UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
 
 
-def add_recording_routes(app: FastAPI, index: RecordingIndex | None, guard: Guard) -> None:
+def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) -> None:
     """Add the routes; without an index they answer with a problem that names the setting."""
 
     @app.get(
@@ -118,7 +103,7 @@ class _RecordingFile(FileResponse):
             await problem_answer(Request(scope), refused, _NO_RANGE[refused])(scope, receive, send)
 
 
-def found_recording(index: RecordingIndex | None, recording_id: str) -> Recording:
+def found_recording(index: Catalogue | None, recording_id: str) -> Recording:
     """Find a recording.
 
     Raises
@@ -132,7 +117,7 @@ def found_recording(index: RecordingIndex | None, recording_id: str) -> Recordin
     return found
 
 
-def _present(index: RecordingIndex | None) -> RecordingIndex:
+def _present(index: Catalogue | None) -> Catalogue:
     if index is None:
         raise HTTPException(404, _NONE)
     return index

@@ -25,7 +25,8 @@ from rotorwatch.records.replays import (
 )
 from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
-from service.api.routes.recordings import RecordingIndex, found_recording
+from service.api.routes.recordings import found_recording
+from service.recordings.catalogue import Catalogue
 from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
 from service.recordings.replay.machine import is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
@@ -49,11 +50,11 @@ class ReplayDesk:
     ----------
     settings : ServiceSettings
         Machines that may be named, endpoints for paced replays, and whether replays may be started.
-    index : RecordingIndex or None
+    index : Catalogue or None
         Recordings; None if no directory for them is set.
     """
 
-    def __init__(self, settings: ServiceSettings, index: RecordingIndex | None) -> None:
+    def __init__(self, settings: ServiceSettings, index: Catalogue | None) -> None:
         self._settings = settings
         self._index = index
         self._entries: dict[str, MachineEntry] | None = None

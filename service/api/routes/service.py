@@ -1,7 +1,5 @@
 """What is said of the monitor itself over HTTP: metrics for Prometheus, and how webhooks stand."""
 
-from typing import Protocol
-
 from fastapi import FastAPI, Response
 from fastapi.responses import PlainTextResponse
 from prometheus_client import CONTENT_TYPE_LATEST
@@ -9,7 +7,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from rotorwatch.records.monitor import WebhookList
 from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
-from service.delivery.webhooks.webhooks import Webhooks
+from service.api.views import ServiceView
 
 _EXAMPLE = (
     "# HELP rotorwatch_blocks_accepted_total Blocks accepted\n"
@@ -18,26 +16,7 @@ _EXAMPLE = (
 )
 
 
-class MetricsText(Protocol):
-    """Writes down the metrics; `service.delivery.metrics.collector.Metrics` is one."""
-
-    def text(self) -> bytes:
-        """Everything in the text format of Prometheus."""
-
-
-class MeasuredView(Protocol):
-    """What these routes need to know about the service; `service.runtime.Runtime` is one."""
-
-    @property
-    def metrics(self) -> MetricsText:
-        """The metrics."""
-
-    @property
-    def webhooks(self) -> Webhooks:
-        """Who is told of alarm events."""
-
-
-def add_service_routes(app: FastAPI, service: MeasuredView, guard: Guard) -> None:
+def add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
     """Add the routes."""
 
     @app.get(

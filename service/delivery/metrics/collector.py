@@ -18,6 +18,7 @@ from rotorwatch import __version__
 from rotorwatch.records.monitor import Readiness, WebhookList
 from service.delivery.metrics.machine import Observed, machine_families
 from service.delivery.metrics.requests import RequestCounts
+from service.delivery.webhooks.webhooks import Webhooks
 from service.history.records import StoreError
 from service.recordings.recorder import RecorderStatus
 from service.stream.worker import MachineWorker
@@ -25,13 +26,6 @@ from service.stream.worker import MachineWorker
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _PAGE = 1000
 _WEBHOOK_STATES = ("working", "failing", "disabled")
-
-
-class Webhooks(Protocol):
-    """Those who are told of alarm events."""
-
-    def statuses(self) -> WebhookList:
-        """How they stand."""
 
 
 class MeasuredService(Protocol):

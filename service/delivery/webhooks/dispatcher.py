@@ -23,8 +23,8 @@ from pydantic import ValidationError
 
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.monitor import WebhookStatus
-from service.delivery.event_feed import AlarmLog
 from service.delivery.webhooks.answer import Answer, Meaning, pause_s
+from service.history.machine import MachineStore
 from service.history.records import StoredEvent, StoreError
 from service.settings.webhooks import WebhookSettings
 from service.terminal.logs import Limiter, logger
@@ -64,7 +64,7 @@ class _Lane:
     """One machine's events on their way; `next` is the sequence of the one that comes next, None if not known yet."""
 
     place: str
-    log: AlarmLog
+    log: MachineStore
     newest: int
     next: int | None = None
     saved: int = -1
@@ -78,7 +78,7 @@ class Dispatcher:
 
     Parameters
     ----------
-    logs : mapping of str to AlarmLog
+    logs : mapping of str to MachineStore
         Of all machines, by ``site/machine``. A webhook that is new is told what comes after this moment.
     cursors : Cursors
         What is remembered is the sequence of the next event, so that a webhook that begins with an empty log (0) can be
@@ -95,7 +95,7 @@ class Dispatcher:
         self,
         settings: WebhookSettings,
         receiver: Post,
-        logs: Mapping[str, AlarmLog],
+        logs: Mapping[str, MachineStore],
         cursors: Cursors,
         *,
         clock: Callable[[], float] = time.monotonic,

@@ -7,10 +7,10 @@ from contextlib import closing
 
 from models.errors import RotorwatchError
 from rotorwatch.records.monitor import WebhookList
-from service.delivery.event_feed import AlarmLog
 from service.delivery.webhooks.answer import Meaning
 from service.delivery.webhooks.dispatcher import Cursors, Dispatcher
 from service.delivery.webhooks.receiver import Receiver
+from service.history.machine import MachineStore
 from service.monitor.alarm_conversion import rfc3339
 from service.settings.webhooks import WebhookSettings
 
@@ -32,12 +32,12 @@ class Webhooks:
         self._receivers = [(settings, Receiver(settings)) for settings in webhooks]
         self._dispatchers: tuple[Dispatcher, ...] = ()
 
-    def start(self, logs: Mapping[str, AlarmLog], cursors: Cursors) -> None:
+    def start(self, logs: Mapping[str, MachineStore], cursors: Cursors) -> None:
         """Begin to send.
 
         Parameters
         ----------
-        logs : mapping of str to AlarmLog
+        logs : mapping of str to MachineStore
             Of all machines, by ``site/machine``; webhooks that are new get what comes after this moment.
         cursors : Cursors
             How far the others have been served.
