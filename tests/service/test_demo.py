@@ -130,9 +130,11 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
     assert [command[0] for command in printed] == ["watch", "status"]
     watch = start("service.rotorwatch", *printed[0])
     lines += read_until(process, "c_bz raised", "demo failed")
-    status = ran("service.rotorwatch", *printed[1], "--json")  # at once: the demo goes on meanwhile
-    assert status.returncode == 1, status.stdout
-    assert "c_bz" in [one["name"] for one in json.loads(status.stdout)["machines"][0]["alarms"]]
+    status = ran("service.rotorwatch", *printed[1], "--json")
+    alarms = {one["name"]: one["raised"] for one in json.loads(status.stdout)["machines"][0]["alarms"]}
+    assert "c_bz" in alarms
+    # The demo goes on meanwhile: on a busy computer the machine is repaired before the answer comes.
+    assert status.returncode == int(any(alarms.values())), status.stdout
     lines += read_until(process, "demo passed", "demo failed")
     lines += read_until(process, "(e) changed by", "failed")
     watch.send_signal(signal.SIGINT)
