@@ -12,12 +12,14 @@ Names sort by time. The files' own indexes say everything else, so that files ma
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+from pydantic import Field
+
 from models.errors import RecordingError
 from models.signals.recording import summarize_recording
+from rotorwatch.records.recordings import RecordingEntry
 
 SUFFIX = ".mcap"
 PART = ".part"
@@ -30,42 +32,13 @@ _STAMP = re.compile(r"(\d{8}T\d{6}Z)")
 _STAMP_FORMAT = "%Y%m%dT%H%M%SZ"
 
 
-@dataclass(frozen=True, slots=True)
-class Recording:
+class Recording(RecordingEntry):
     """One recording of a directory.
 
-    Attributes
-    ----------
-    id : str
-        ``<site>/<machine>/<file name>``, as `Catalogue.find` takes it.
-    path : Path
-        The file.
-    start_ns, end_ns : int
-        Earliest and latest log time, nanoseconds since 1970-01-01 UTC; of an incomplete file the start that its name
-        states and the time at which it was last written.
-    messages : int or None
-        Number of messages; None if the file is incomplete or damaged.
-    size_bytes : int
-        Size of the file.
-    complete : bool
-        Whether it was closed in order. A file being written, or left by a crash, is not.
-    kept_because : str
-        Which alarm keeps the file beyond its ordinary time; empty if none.
-    problem : str
-        Why a complete file cannot be read; empty if it can.
+    Of an incomplete file, the start that its name states and the time at which it was last written stand for log times.
     """
 
-    id: str
-    site: str
-    machine: str
-    path: Path
-    start_ns: int
-    end_ns: int
-    messages: int | None
-    size_bytes: int
-    complete: bool
-    kept_because: str = ""
-    problem: str = ""
+    path: Path = Field(exclude=True)
 
 
 class Catalogue:
@@ -97,7 +70,7 @@ class Catalogue:
             for path in _entries(folder):
                 recording = self._recording(path) if _FILE.fullmatch(path.name) else None
                 if recording is not None:
-                    found.append(replace(recording, kept_because=kept.get(path.name, "")))
+                    found.append(recording.model_copy(update={"kept_because": kept.get(path.name, "")}))
         return tuple(found)
 
     def find(self, recording_id: str) -> Recording | None:
@@ -116,7 +89,7 @@ class Catalogue:
         recording = self._recording(folder / match["file"])
         if recording is None:
             return None
-        return replace(recording, kept_because=kept_reasons(folder).get(match["file"], ""))
+        return recording.model_copy(update={"kept_because": kept_reasons(folder).get(match["file"], "")})
 
     def _folders(self, site: str | None, machine: str | None) -> Iterator[Path]:
         for upper in _subfolders(self.directory, site):
@@ -146,17 +119,18 @@ class Catalogue:
             messages=None,
             size_bytes=stat.st_size,
             complete=path.suffix == SUFFIX,
+            kept_because="",
+            problem="",
         )
         if recording.complete:
             try:
                 summary = summarize_recording(path)
             except RecordingError as error:
-                recording = replace(recording, problem=str(error))
+                recording = recording.model_copy(update={"problem": str(error)})
             else:
                 count = sum(summary.messages.values())
-                recording = replace(recording, messages=count)
-                if count:
-                    recording = replace(recording, start_ns=summary.start_ns, end_ns=summary.end_ns)
+                times = {"start_ns": summary.start_ns, "end_ns": summary.end_ns} if count else {}
+                recording = recording.model_copy(update={"messages": count, **times})
         self._read[path] = (stat.st_mtime_ns, stat.st_size, recording)
         return recording
 

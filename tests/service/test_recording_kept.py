@@ -54,9 +54,11 @@ def stored(start_s: float, size_mb: float = 100.0, name: str = "", complete: boo
     """Five minutes that begin so many seconds before or after now."""
     start_ns = NOW_NS + round(start_s * NS)
     file = name or name_of(start_ns) + ("" if complete else ".part")
-    path = Path("/recordings/demo/lab") / file
-    size = round(size_mb * 1e6)
-    return Recording(f"demo/lab/{file}", "demo", "lab", path, start_ns, start_ns + 300 * NS, 9, size, complete)
+    return Recording(
+        id=f"demo/lab/{file}", site="demo", machine="lab", path=Path("/recordings/demo/lab") / file, start_ns=start_ns,
+        end_ns=start_ns + 300 * NS, messages=9, size_bytes=round(size_mb * 1e6), complete=complete, kept_because="",
+        problem="",
+    )  # fmt: skip
 
 
 def limits(**fields: float) -> RecordingSettings:

@@ -7,7 +7,7 @@ from fastapi.responses import FileResponse
 from starlette.types import Message, Receive, Scope, Send
 
 from models.signals.recording import summarize_recording
-from rotorwatch.records.recordings import RecordingDetail, RecordingEntry, RecordingList
+from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from service.access.guard import Guard
 from service.access.problems import problem_answer, problem_responses, responses
 from service.recordings.catalogue import Catalogue, Recording
@@ -42,7 +42,7 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
             for one in listed
             if (since_ns is None or one.end_ns >= since_ns) and (until_ns is None or one.start_ns < until_ns)
         )
-        return RecordingList(recordings=tuple(RecordingEntry.model_validate(_fields(one)) for one in kept))
+        return RecordingList(recordings=tuple(kept))
 
     @app.get(
         "/api/v1/recordings/{site}/{machine}/{name}",
@@ -58,7 +58,7 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         data = RecordingSource([found.path]).span() if keys else None
         return RecordingDetail.model_validate(
             {
-                **_fields(found),
+                **dict(found),
                 "keys": keys,
                 "data_start_ns": None if data is None else data.start_ns,
                 "data_end_ns": None if data is None else data.end_ns,
@@ -121,7 +121,3 @@ def _present(index: Catalogue | None) -> Catalogue:
     if index is None:
         raise HTTPException(404, _NONE)
     return index
-
-
-def _fields(recording: Recording) -> dict[str, object]:
-    return {name: getattr(recording, name) for name in RecordingEntry.model_fields}
