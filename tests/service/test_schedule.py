@@ -186,8 +186,8 @@ def test_a_fault_is_named_from_snapshots_and_nothing_is_missing() -> None:
     assert monitor.health().quality.gaps == 0
 
 
-@pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("at", [399, 400, 417])  # before the last block of a snapshot, before a snapshot, within one
+# Before the last block of a snapshot, before a snapshot, within one.
+@pytest.mark.parametrize(("at", "whole"), [(399, False), (400, True), (417, False)])
 def test_a_monitor_stopped_between_or_in_snapshots_goes_on_to_the_last_bit(at: int, whole: bool) -> None:
     sent = stream()[:600]
     expected = run(MachineMonitor(install(KIT, None)), sent)

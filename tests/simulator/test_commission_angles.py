@@ -40,7 +40,7 @@ def kit(*, mounted: bool, full: bool) -> tuple[Commissioning, HealthyRecording, 
     return commissioned(machine, recording), recording, machine
 
 
-@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize("full", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_probes_at_an_angle_are_commissioned_as_probes_in_y_and_z(full: bool, tmp_path: Path) -> None:
     plain, *_ = kit(mounted=False, full=full)
     turned, recording, machine = kit(mounted=True, full=full)
