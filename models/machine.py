@@ -118,6 +118,7 @@ class Schedule(BaseModel, extra="forbid", frozen=True):
 
 _SEGMENT_S, _LAG_FROM_S, _LAG_TO_S = 2.0, 0.01, 0.125
 _BINS = 20
+_LONGEST_HOP_S = 600.0
 
 
 class WindowSettings(BaseModel, extra="forbid", frozen=True):
@@ -365,6 +366,10 @@ class MachineFile(BaseModel, extra="forbid", frozen=True):
         """Refuse segments and lags that do not go into a hop."""
         window, schedule = self.window, self.schedule
         if schedule is None:
+            if window.hop_s > _LONGEST_HOP_S:  # all samples of a hop are held
+                raise ValueError(
+                    f"window.hop_s is {window.hop_s:g}, expected at most {_LONGEST_HOP_S:g}, or snapshots ([schedule])"
+                )
             if not _whole(2 * window.hop_s / window.segment_s):
                 raise ValueError(
                     f"window.hop_s {window.hop_s} must be a multiple of half of segment_s {window.segment_s}"

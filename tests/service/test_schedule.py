@@ -105,6 +105,15 @@ def test_the_simulator_sends_snapshots_of_the_same_motion() -> None:
         np.testing.assert_array_equal(one[0].samples, other.samples)
 
 
+def test_a_hop_of_a_stream_without_silence_is_no_day(tmp_path: Path) -> None:
+    fields = LAB.model_dump(mode="json")
+    day = {"length_s": 4 * 86400.0, "hop_s": 86400.0, "max_span_s": 5 * 86400.0}
+    with pytest.raises(
+        MachineFileError, match=r"window.hop_s is 86400, expected at most 600, or snapshots \(\[schedule\]\)"
+    ):
+        checked(Machine, fields | {"window": day}, tmp_path / "kit.toml")
+
+
 def test_silence_between_snapshots_is_no_gap_and_a_missing_snapshot_is_one() -> None:
     gate, per = Gate(KIT), round(ON_S / 0.1)
     sent = stream()[: 4 * per]
