@@ -139,11 +139,10 @@ def growth(
     n_errors : float
         Nor nearer than so many standard errors of a window.
     """
-    if _short(levels.edges_hz) != reference.edges_hz:
+    edges_hz, own, mean, high, error = _healthy(reference)
+    if levels.edges_hz.shape != edges_hz.shape or not np.allclose(levels.edges_hz, edges_hz, rtol=1e-3):
         return None
-    now, own = levels.rms[:, column], np.array(reference.mean)
-    mean, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
-    chance = np.sqrt(fdtri(levels.freedom, np.array(reference.freedom), 1 - _CHANCE))
+    now, chance = levels.rms[:, column], _by_chance(levels.freedom.tobytes(), reference.freedom)
     limit = np.max([np.maximum(ratio, chance) * mean, beyond_range * high, mean + n_errors * error], axis=0)
     looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2))) & (own > 0)
     if not looked_at.any():
@@ -153,6 +152,19 @@ def growth(
     at = int(np.argmax(np.where(looked_at, now / np.where(mean > 0, limit, 1.0), 0.0)))
     edges = levels.edges_hz
     return Growth((float(edges[at]), float(edges[at + 1])), float(now[at] / mean[at]), float(limit[at] / mean[at]))
+
+
+@lru_cache(maxsize=1024)
+def _healthy(reference: BandReference) -> tuple[FloatArray, ...]:
+    """Edges and means of the bands; mean, high and error of the loudest of each neighbourhood."""
+    around = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
+    return (np.array(reference.edges_hz), np.array(reference.mean), *around)
+
+
+@lru_cache(maxsize=1024)
+def _by_chance(freedom: bytes, healthy: tuple[float, ...]) -> FloatArray:
+    """Ratio of rms values that chance exceeds; dear, and the same in every full window."""
+    return np.asarray(np.sqrt(fdtri(np.frombuffer(freedom), np.array(healthy), 1 - _CHANCE)), dtype=np.float64)
 
 
 def _around(values: FloatArray) -> FloatArray:

@@ -25,6 +25,7 @@ _plots = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode="rich"
 _AtOption = Annotated[
     str | None, typer.Option("--at", metavar="TIME", help="The latest data up to then. Else up to the end.")
 ]
+_WindowOption = Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")]
 _ResolutionOption = Annotated[float, typer.Option("--resolution", metavar="HZ", help="Distance of the lines.")]
 _DensityOption = Annotated[
     bool, typer.Option("--density", help="Power spectral density, not amplitudes (displacement p-p, others rms).")
@@ -231,7 +232,7 @@ def spectrum(
     picture: _Picture,
     at: _AtOption = None,
     channel: _ChannelsOption = None,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")] = 20.0,
+    window: _WindowOption = 20.0,
     resolution: _ResolutionOption = 0.5,
     density: _DensityOption = False,
     scale: Annotated[
@@ -292,7 +293,7 @@ def full_spectrum(
     picture: _Picture,
     at: _AtOption = None,
     place: _PlaceOption = None,
-    window: Annotated[float, typer.Option("--window", metavar="S", help="Seconds it is taken over.")] = 20.0,
+    window: _WindowOption = 20.0,
     resolution: _ResolutionOption = 0.5,
     scale: Annotated[Literal["log", "linear"], typer.Option("--scale", help="Of amplitudes.")] = "linear",
     to_hz: _ToHzOption = None,

@@ -106,11 +106,12 @@ def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
 
 
 def test_the_doctor_waits_for_snapshots(tmp_path: Path) -> None:
-    run(*FAN, "--folder", str(tmp_path), "--snapshots", "0.5 30")
+    run(*FAN, "--folder", str(tmp_path), "--snapshots", "0.5 2")
     address = endpoint()
-    with publishing(tmp_path, address, 1200, 20.0):
-        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "5")
+    with publishing(tmp_path, address, 120, 2.0):
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address)
     assert done.returncode == 0, done.stdout + done.stderr
+    assert "listening for 12.5 s" in done.stdout  # ten, and a period with its snapshot
     assert "0.5 s in the latest snapshot, in blocks of 1280 samples" in done.stdout
     assert "DE-H 0.05" in done.stdout
 
