@@ -113,8 +113,8 @@ def check_steady(recordings: Sequence[HealthyRecording], windows: Mapping[str, S
             if not 1 / _STEADY_LEVEL <= ratio[worst] <= _STEADY_LEVEL:
                 state = windows[recording.name][0].as_mounted.states[worst]
                 moved.append(
-                    f"{recording.name}: the random vibration of {state} in the second half is {round(ratio[worst], 6):.2g} "
-                    "times that of the first"
+                    f"{recording.name}: the random vibration of {state} in the second half is "
+                    f"{round(ratio[worst], 6):.2g} times that of the first"
                 )
     if not moved:
         return told(verdict="passed", text="speed and level hold still within every recording")
