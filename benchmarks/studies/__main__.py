@@ -9,6 +9,7 @@ import typer
 from benchmarks.studies.ablation import ablation
 from benchmarks.studies.delay import delay
 from benchmarks.studies.evaluate import evaluate
+from benchmarks.studies.level_years import level_years
 from benchmarks.studies.levels import levels
 from benchmarks.studies.pages import write_page
 from benchmarks.studies.peers import peers
@@ -26,6 +27,7 @@ STUDIES = {
     "ablation": ablation,
     "delay": delay,
     "levels": levels,
+    "level_years": level_years,
     "reproduction": reproduction,
 }
 

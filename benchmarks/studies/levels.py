@@ -35,9 +35,9 @@ _FIRST_S = 5 * _LENGTH_S + 2.0
 _DOUBLED = ("overall", "1x", "2x")
 """Their place is part of the seed."""
 _KITS = ("rotor kit, commissioned at level full", "rotor kit, commissioned at level none")
-_REFERENCES = ("first windows", "commissioned")
-_SPREADS, _DRAWN = (0.1, 0.2), ("inside the reference's range", "same distribution")
-_VARYING = "velocity sensors, speed in the machine file"
+REFERENCES = ("first windows", "commissioned")
+SPREADS, DRAWN = (0.1, 0.2), ("inside the reference's range", "same distribution")
+VARYING = "velocity sensors, speed in the machine file"
 _BEARING, _IN_SNAPSHOTS = "accelerometers, 12.8 kHz", "accelerometers, 12.8 kHz, 0.1 s every 10 s"
 _KIT_BLOCK_S = 0.5
 
@@ -189,9 +189,9 @@ def _kit_doublings(options: Options, case: int, machine: str, number: int) -> It
 
 def _varying(options: Options, case: int, reference: str, varied: str, number: int) -> Iterator[dict[str, Value]]:
     """A healthy machine whose noise has another level in every window, log-normal as it had in the reference."""
-    spread = next(one for one in _SPREADS if varied.startswith(f"{one:g}"))
+    spread = next(one for one in SPREADS if varied.startswith(f"{one:g}"))
     condition = generator(options.seed, case, number, At.CONDITION)
-    scene = drawn(replace(KINDS[_VARYING], rate_hz=1280.0), condition, noise_over_1x=(1.0, 3.0))
+    scene = drawn(replace(KINDS[VARYING], rate_hz=1280.0), condition, noise_over_1x=(1.0, 3.0))
     learned, watched = (generator(options.seed, case, number, at) for at in (At.REFERENCE, At.EVALUATION))
     first = reference == "first windows"
     windows = 6 if first else 10 if options.small else 30
@@ -201,7 +201,7 @@ def _varying(options: Options, case: int, reference: str, varied: str, number: i
     known = seen[:5] if first else seen
     count = round(seconds / _LENGTH_S)
     later = np.exp(spread * watched.standard_normal(count))
-    if varied.endswith(_DRAWN[0]):
+    if varied.endswith(DRAWN[0]):
         later = watched.uniform(known.min(), known.max(), count)
     levels = later
     if first:
@@ -281,13 +281,14 @@ def _of(topic: str) -> Callable[[Sequence[Record]], list[Record]]:
     return partial(r.where, topic=topic)
 
 
-def _sum(column: str, rows: Sequence[Record]) -> float:
+def summed(column: str, rows: Sequence[Record]) -> float:
+    """Sum of a column."""
     return float(r.floats(row.get(column) for row in rows).sum())
 
 
-def _per_month(rows: Sequence[Record]) -> Estimate | None:
+def per_month(rows: Sequence[Record]) -> Estimate | None:
     """Alarms per machine and month, with the exact interval of a Poisson count."""
-    count, months = round(_sum("alarms", rows)), _sum("hours", rows) * 3600 / MONTH_S
+    count, months = round(summed("alarms", rows)), summed("hours", rows) * 3600 / MONTH_S
     if not months:
         return None
     low = 0.0 if not count else float(scipy.stats.chi2.ppf(0.025, 2 * count)) / 2
@@ -313,10 +314,10 @@ _TABLES = (
         "levels-varying",
         ("machine", "excitation"),
         {
-            "hours": partial(_sum, "hours"),
-            "level alarms": partial(_sum, "alarms"),
-            "per machine and month": _per_month,
-            "other alarms": partial(_sum, "other"),
+            "hours": partial(summed, "hours"),
+            "level alarms": partial(summed, "alarms"),
+            "per machine and month": per_month,
+            "other alarms": partial(summed, "other"),
         },
         _of("varying"),
         "Healthy machines whose excitation varies; spread of its logarithm, and what it is drawn from:",
@@ -339,8 +340,8 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
     doublings, by = _of("doubling")(records), ("machine", "doubled")
     yield r.within("a doubling raises an alarm within two windows", r.each(doublings, by, r.share("any")), 0.95, 1.0)
     yield r.within("the alarm of the level does", r.each(doublings, by, r.share("level")), 0.95, 1.0)
-    inside = [row for row in _of("varying")(records) if str(row["excitation"]).endswith(_DRAWN[0])]
-    yield r.at_most("level alarms per month, excitation inside the reference's range", _per_month(inside), 1.0)
+    inside = [row for row in _of("varying")(records) if str(row["excitation"]).endswith(DRAWN[0])]
+    yield r.at_most("level alarms per month, excitation inside the reference's range", per_month(inside), 1.0)
     bearing = _of("bearing")(records)
     yield r.at_least("a bearing's defect found below twice the healthy overall", r.share("found")(bearing), 0.95)
     yield r.at_most("an alarm before the defect begins", r.share("early")(bearing), 0.0)
@@ -352,7 +353,7 @@ def levels(options: Options) -> Study:
         *(("doubling", machine, "", 2.0) for machine in KINDS),
         *(("doubling", machine, "", 1.0) for machine in _KITS),
         *(("bearing", machine, "", 3.6) for machine in (_BEARING, _IN_SNAPSHOTS)),
-        *(("varying", of, f"{spread:g}, {how}", 0.5) for of in _REFERENCES for spread in _SPREADS for how in _DRAWN),
+        *(("varying", of, f"{spread:g}, {how}", 0.5) for of in REFERENCES for spread in SPREADS for how in DRAWN),
     ]
     cells = tuple(
         Cell(

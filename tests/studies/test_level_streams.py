@@ -6,10 +6,14 @@ import numpy as np
 import pytest
 
 from benchmarks.studies.level_streams import KINDS, At, Defect, Gains, drawn, generator
+from benchmarks.studies.level_years import Drawing, level_years
 from benchmarks.studies.levels import levels
 from benchmarks.studies.results import Record
 from benchmarks.studies.study import Options
 from models.diagnosis.verdict.calibration import MONTH_S
+from models.levels.judgement import LevelJudge
+from models.levels.reference import learn_levels
+from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 
 VELOCITY = "velocity sensors, speed in the machine file"
@@ -65,3 +69,28 @@ def test_alarms_per_month_have_the_exact_interval_of_a_poisson_count() -> None:
     nothing, some = of(rows(0)), of(rows(3))
     assert str(nothing) == "0 (0–1.84)"
     assert str(some) == "1.5 (0.309–4.38)"  # of 3: 0.6187 to 8.7673
+
+
+@pytest.mark.parametrize("topic", ["beside", "years"])
+def test_drawn_levels_are_those_of_a_simulation_in_time(topic: str) -> None:
+    study = level_years(Options(windows=1, seed=99, small=True))
+    cell = next(one for one in study.cells if one.keys["topic"] == topic)
+    rows = study.measure(None, cell, 0)
+    if topic == "years":
+        assert rows[0]["hours"] == pytest.approx(14 / 60)
+        assert not rows[0]["alarms"]
+    for row in rows if topic == "beside" else ():
+        assert abs(float(row["mean"] or 0.0)) < 0.06, row
+        assert 0.5 < float(row["scatter"] or 0.0) < 2, row
+
+
+def test_a_drawn_machine_that_grows_louder_is_beyond_its_limits() -> None:
+    scene = drawn(KINDS[VELOCITY], generator(1, 2, 3, At.CONDITION), noise_over_1x=(1.0, 3.0))
+    drawing, rng = Drawing.of(scene), np.random.default_rng(5)
+    healthy = learn_levels("test", [one.name for one in scene.machine.sensors], list(drawing.windows(rng, np.ones(5))))
+    judge = LevelJudge(drawing.plan, scene.machine.sensors, LevelSettings())
+    states = [
+        {limit.state for one in judge.judge(levels, healthy) for limit in one.limits if limit.measure == "overall"}
+        for levels in drawing.windows(rng, np.array([1.0, 4.0]))
+    ]
+    assert states == [{"normal"}, {"danger"}]
