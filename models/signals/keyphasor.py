@@ -4,6 +4,7 @@ Between two pulses the shaft is taken to turn uniformly. A pulse that is missing
 pulses around it; what cannot be told apart from a stop leaves the angle unknown there, which is said and not guessed.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,6 +129,23 @@ def pulse_train(times: FloatArray, pulses_per_turn: int = 1) -> PulseTrain:
         counts[gap + 1 :] += -counts[gap + 1] % pulses_per_turn
     missing = int(np.sum(turns[known] - 1))
     return PulseTrain(kept, counts, known, pulses_per_turn, missing, times.size - kept.size)
+
+
+def pulses_in_turn(trains: Sequence[PulseTrain]) -> PulseTrain:
+    """Join trains, at least one, that follow each other; between two of them the angle is not known."""
+    counts, end = [], 0
+    for train in trains:
+        counts.append(train.counts + end)
+        end = -(-int(counts[-1][-1] + 1) // train.pulses_per_turn) * train.pulses_per_turn
+    apart = np.zeros(1, dtype=np.bool_)
+    return PulseTrain(
+        np.concatenate([one.times for one in trains]),
+        np.concatenate(counts),
+        np.concatenate([part for one in trains for part in (apart, one.known)][1:]),
+        trains[0].pulses_per_turn,
+        sum(one.missing for one in trains),
+        sum(one.extra for one in trains),
+    )
 
 
 def shaft_angle(train: PulseTrain, at: FloatArray, *, reverse: bool = False) -> FloatArray:

@@ -1,14 +1,15 @@
 """The shaft angle of an imported file: from a keyphasor's pulses, or from a column of angles."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from models.machine import MachineFile
 from models.signals.block import FloatArray
 from models.signals.channels import Quantity, time_unit_ns
-from models.signals.keyphasor import EdgeDetector, PulseTrain, pulse_train, shaft_angle
+from models.signals.keyphasor import EdgeDetector, PulseTrain, pulse_train, pulses_in_turn, shaft_angle
 from service.interchange.clock import Clock
 from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Piece, Read, Signal, pieces
@@ -17,35 +18,25 @@ from service.interchange.source import Reference, Source, SourceError
 _TURN = 2 * np.pi
 
 
-def read_pulses(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> PulseTrain:
-    """Read all pulses of a file; a sampled signal is gone through for that alone.
+def pulse_times(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> FloatArray:
+    """Read when the pulses of a file came; a sampled signal is gone through for that alone.
 
     Returns
     -------
-    PulseTrain
+    ndarray, shape (n_pulses,)
         Nanoseconds since the first row of the file.
 
     Raises
     ------
     SourceError
-        If there are too few, or their times do not ascend.
+        If what should be times is none.
     """
     if keyphasor.pulse_times is not None:
         what = keyphasor.pulse_times
         entries = source.values(what)
         if entries.dtype.kind not in "fiu":
             raise SourceError(f"{source.path}: {what} holds {entries.dtype}, expected times of pulses")
-        times = clock.pulse_times(entries, time_unit_ns(keyphasor.unit))
-    else:
-        what = f"column {keyphasor.column}"
-        times = _edges(source, keyphasor, clock, mapping)
-    try:
-        return pulse_train(times, keyphasor.pulses_per_revolution)
-    except ValueError as error:
-        raise SourceError(f"{source.path}: keyphasor {what}: {error}") from error
-
-
-def _edges(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping) -> FloatArray:
+        return clock.pulse_times(entries, time_unit_ns(keyphasor.unit))
     signal = Signal("keyphasor", Reference(keyphasor.column or "", keyphasor.index), 1.0, 0.0, 0, False)
     detector = EdgeDetector(keyphasor.threshold or 0.0, keyphasor.hysteresis, rising=keyphasor.edge == "rising")
     found = [np.empty(0)]
@@ -54,6 +45,29 @@ def _edges(source: Source, keyphasor: Keyphasor, clock: Clock, mapping: Mapping)
             detector.interrupt()
         found.append(detector.feed(piece.time_ns, piece.samples[:, 0]))
     return np.concatenate(found)
+
+
+def read_pulses(path: Path, runs: Sequence[FloatArray], keyphasor: Keyphasor) -> PulseTrain:
+    """Judge the pulses of a file, or of the files of a folder, each by those of its own run.
+
+    Parameters
+    ----------
+    path : Path
+        What errors name.
+    runs : sequence of ndarray
+        Times of the pulses between which nothing is missing.
+
+    Raises
+    ------
+    SourceError
+        If no run has two pulses, or their times do not ascend.
+    """
+    try:
+        longest = [max(runs, key=len)] if all(run.size < 2 for run in runs) else [run for run in runs if run.size > 1]
+        return pulses_in_turn([pulse_train(run, keyphasor.pulses_per_revolution) for run in longest])
+    except ValueError as error:
+        what = keyphasor.pulse_times or f"column {keyphasor.column}"
+        raise SourceError(f"{path}: keyphasor {what}: {error}") from error
 
 
 @dataclass(slots=True)

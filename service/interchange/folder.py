@@ -6,10 +6,14 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
+import numpy as np
+
 from models.machine import MachineFile
+from models.signals.block import FloatArray
+from service.interchange.angle import pulse_times
 from service.interchange.clock import Clock, clock_for
 from service.interchange.formats import format_of, open_source
-from service.interchange.mapping import Mapping
+from service.interchange.mapping import Keyphasor, Mapping
 from service.interchange.samples import Gap, Piece, Read, pieces, signals_of
 from service.interchange.source import SourceError
 
@@ -94,6 +98,42 @@ def snapshot_files(folder: Path, mapping: Mapping, machine: MachineFile) -> tupl
 def _natural(path: Path) -> list[tuple[int, str]]:
     """Key that sorts 2 before 10."""
     return [(int(part) if part.isdigit() else -1, part) for part in re.split(r"(\d+)", path.name)]
+
+
+def runs_of_pulses(
+    begun: FloatArray,
+    files: Sequence[SnapshotFile],
+    first: Clock,
+    mapping: Mapping,
+    machine: MachineFile,
+    keyphasor: Keyphasor,
+) -> list[FloatArray]:
+    """Times of the pulses of a first file and of others, on its clock; those of files without a break in one run.
+
+    Parameters
+    ----------
+    begun : ndarray, shape (n_pulses,)
+        Of the first file.
+    files : sequence of SnapshotFile
+        The others.
+
+    Raises
+    ------
+    SourceError
+        If a file cannot be used.
+    """
+    runs = [begun]
+    for file in files:
+        with open_source(file.path, mapping) as source:
+            columns = [one.reference for one in signals_of(source, mapping, machine)]
+            clock = clock_for(source, columns, mapping.time, machine, file.start_ns)
+            own = pulse_times(source, keyphasor, clock, mapping) + float(clock.origin_ns - first.origin_ns)
+        before = runs[-1]
+        if before.size > 1 and own.size and own[0] - before[-1] < 1.5 * float(np.median(np.diff(before[-9:]))):
+            runs[-1] = np.concatenate([before, own])
+        else:
+            runs.append(own)
+    return runs
 
 
 def joined(

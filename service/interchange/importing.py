@@ -14,10 +14,10 @@ from pathlib import Path
 from models.machine import MachineFile
 from models.signals.keyphasor import PulseTrain
 from models.signals.recording import RecordingWriter
-from service.interchange.angle import AngleColumn, read_pulses
+from service.interchange.angle import AngleColumn, pulse_times, read_pulses
 from service.interchange.blocks import BlockMaker, Written
 from service.interchange.clock import Clock, clock_for
-from service.interchange.folder import SnapshotFile, joined, snapshot_files
+from service.interchange.folder import SnapshotFile, joined, runs_of_pulses, snapshot_files
 from service.interchange.formats import open_source
 from service.interchange.mapping import Mapping
 from service.interchange.overlap import Integration, Overlap, Resampling
@@ -78,8 +78,6 @@ def import_file(
     RecordingError
         If the recording cannot be written.
     """
-    if mapping.keyphasor is not None and path.is_dir():
-        raise SourceError(f"{path}: [keyphasor] cannot be used with a folder, expected one file")
     files = snapshot_files(path, mapping, machine) if path.is_dir() else (SnapshotFile(path, None),)
     with open_source(files[0].path, mapping) as source:
         signals = signals_of(source, mapping, machine)
@@ -88,7 +86,11 @@ def import_file(
         if keyphasor is not None and keyphasor.column is not None:
             columns = [*columns, *_sampled(keyphasor.column, keyphasor.index, columns)]
         clock = clock_for(source, columns, mapping.time, machine, files[0].start_ns)
-        pulses = None if keyphasor is None else read_pulses(source, keyphasor, clock, mapping)
+        pulses = None
+        if keyphasor is not None:
+            begun = pulse_times(source, keyphasor, clock, mapping)
+            runs = runs_of_pulses(begun, files[1:], clock, mapping, machine, keyphasor)
+            pulses = read_pulses(path, runs, keyphasor)
         read = Read()
         parts: Iterator[Piece] = pieces(source, signals, clock, mapping, read)
         if len(files) > 1:

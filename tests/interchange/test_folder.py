@@ -24,9 +24,12 @@ y1 = { column = "x", unit = "um" }
 y1_dot = { column = "v", unit = "mm/s" }
 theta = { column = "a", unit = "rad" }
 """
-NUMBERED = NAMED.replace("rate_hz", 'start = "2026-01-31T12:00:00Z"\nrate_hz')
+START = 'start = "2026-01-31T12:00:00Z"\nrate_hz'
+NUMBERED = NAMED.replace("rate_hz", START)
 DATED = NAMED.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"\nstart = "unix"')
-WITH_PULSES = f"{NAMED}\n[keyphasor]\npulse_times = 'a'\n".replace("theta =", "# =")
+KEYPHASOR = f"{NAMED}\n[keyphasor]\n".replace("theta =", "# =")
+PULSE_TIMES = f'{KEYPHASOR}pulse_times = "p"\nunit = "s"\n'
+PULSES = f'{KEYPHASOR}column = "k"\nthreshold = 0.5\n'
 _TIME, *_COLUMNS = signals(COUNT * FILES)
 
 
@@ -46,7 +49,12 @@ def write(folder: Path, name: Callable[[int], str], numbers: range = range(FILES
         rows = slice(number * COUNT, (number + 1) * COUNT)
         x, v, a = (column[rows] for column in _COLUMNS)
         t = START_NS + round(number * every_s * 1e9) + np.arange(COUNT) * 500_000
-        np.savez(folder / name(number), x=x, v=v, a=a, t=t)
+        passed = np.flatnonzero(np.diff(a) < 0)
+        share = (2 * np.pi - a[passed]) / (a[passed + 1] + 2 * np.pi - a[passed])
+        # A pulse signal that crosses one half where the angle passes zero.
+        k = np.where(a < np.pi, np.minimum(a, 0.5), np.maximum(a - 2 * np.pi, -0.5)) + 0.5
+        p = (passed + share) / RATE_HZ
+        np.savez(folder / name(number), x=x, v=v, a=a, t=t, k=k, p=p, q=t[0] + np.rint(p * 1e9).astype(np.int64))
     return folder
 
 
@@ -62,6 +70,24 @@ def test_snapshots_come_in_with_their_times_and_none_is_lost(
     told = "\n".join(summary_lines(done))
     assert f"files: {FILES} files, {FILES * COUNT} rows at 2000 Hz" in told
     assert "gaps: none" in told
+
+
+@pytest.mark.parametrize("mapping", [PULSE_TIMES, PULSES])
+@pytest.mark.parametrize("every_s", [EVERY_S, ON_S])
+def test_pulses_of_a_keyphasor_give_the_angle_in_every_file(tmp_path: Path, mapping: str, every_s: float) -> None:
+    kit = KIT if every_s == EVERY_S else None
+    if kit is None:
+        mapping = mapping.replace("rate_hz = 2000.0", 'column = "t"\nunit = "ns"\nstart = "unix"')
+        mapping = mapping.replace('pulse_times = "p"', 'pulse_times = "q"').replace('unit = "s"\n', 'unit = "ns"\n')
+    name = by_date if every_s == EVERY_S else by_number
+    done, recording = imported(tmp_path, write(tmp_path / "files", name, every_s=every_s), mapping, kit)
+    found = stretches(recording, kit)
+    assert len(found) == (FILES if every_s == EVERY_S else 1)
+    angle = np.concatenate([one.samples[:, 2] for one in found])
+    assert len(angle) == FILES * COUNT
+    apart = np.abs(np.angle(np.exp(1j * (angle - _COLUMNS[2]))))
+    assert apart.max() < 0.01
+    assert done.unknown_angle == 0
 
 
 def test_a_snapshot_that_is_missing_is_told(tmp_path: Path) -> None:
@@ -84,7 +110,11 @@ def test_files_that_follow_each_other_are_one_stretch(tmp_path: Path) -> None:
     [
         (NAMED, EVERY_S, "acc_1.npz: nothing tells when the first row was sampled"),
         (DATED, 1.0, "acc_2.npz: begins 1 s before the end of acc_1.npz"),
-        (WITH_PULSES, EVERY_S, "cannot be used with a folder"),
+        (
+            PULSES.replace("= 0.5", "= 5").replace("rate_hz", START),
+            EVERY_S,
+            "column k: 0 pulses, expected at least two",
+        ),
         (f'format = "tdms"\n{NAMED}', EVERY_S, "not a TDMS file, or damaged"),
     ],
 )
