@@ -35,7 +35,9 @@ __all__ = [
     "IN_MEMORY",
     "LAB",
     "OPEN",
+    "PATIENT",
     "ROOT",
+    "SHORT",
     "START_NS",
     "Feed",
     "Program",
@@ -56,6 +58,10 @@ LAB = load_machine("lab")
 START_NS = 1_767_225_600_000_000_000
 IN_MEMORY = HistorySettings(url="sqlite:///:memory:")
 OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
+PATIENT = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
+"""For `machine_file`: no silence is one."""
+SHORT = (("length_s = 60.0", "length_s = 20.0"), ("off_delay_s = 60.0", "off_delay_s = 20.0"))
+"""For `machine_file`: windows are full, and alarms cleared, after a third of the time."""
 _ALONE = {
     "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
     "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",

@@ -8,10 +8,9 @@ import pytest
 
 from models.machine import Machine, load_machine
 from simulator.scenario import parse_fault
-from tests.service.live import Program, endpoint, machine_file, program, scenario_blocks, send, until
+from tests.service.live import PATIENT, SHORT, Program, endpoint, machine_file, program, scenario_blocks, send, until
 
 ALARMS = "/api/v1/machines/demo/lab/alarms"
-PATIENT = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]")
 FAULT = parse_fault("c_bz=0.5@0")
 
 
@@ -55,13 +54,13 @@ def states(at: Program) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
-    file, address = machine_file(tmp_path, PATIENT), endpoint()
+    file, address = machine_file(tmp_path, PATIENT, *SHORT), endpoint()
     machine: Machine = load_machine(file)
-    stream = scenario_blocks(160.0, FAULT)
+    stream = scenario_blocks(80.0, FAULT)
     with running(tmp_path, address, file) as first:
         first.wait_for("HTTP API")
-        send(address, stream[:850], machine)
-        until(lambda: first.health().quality.accepted_blocks == 850, "all blocks")
+        send(address, stream[:450], machine)
+        until(lambda: first.health().quality.accepted_blocks == 450, "all blocks")
         do(first, "acknowledge", "c_bz", "unacknowledged")
         do(first, "shelve", "model", "normal", duration_s=3600)
         do(first, "remove-from-service", "data-stuck", "normal")
@@ -80,13 +79,13 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert states(second) == {"c_bz": "acknowledged", "model": "shelved", "data-stuck": "out-of-service"}
         health = second.health()
         assert health.restart.startswith(
-            "went on where it stood at 2026-01-01T00:01:25.000000Z; the window is not there"
+            "went on where it stood at 2026-01-01T00:00:45.000000Z; the window is not there"
         )
         assert health.filled == 0.0
         assert health.state in {"alert", "danger"}
         # What no cache holds any more is missing; what comes then raises nothing twice.
-        send(address, stream[880:], machine)
-        until(lambda: second.health().quality.accepted_blocks == len(stream) - 880, "the rest")
+        send(address, stream[480:], machine)
+        until(lambda: second.health().quality.accepted_blocks == len(stream) - 480, "the rest")
         after = second.health()
         assert after.quality.gaps == 1
         assert "3 s of data are missing (30 blocks)" in after.quality.last_gap
@@ -97,11 +96,11 @@ def test_alarms_and_what_operators_did_survive_kill_9(tmp_path: Path) -> None:
         assert second.stop() == 0
 
     # Another machine file: what was accumulated does not fit, the alarms do.
-    changed = machine_file(tmp_path, PATIENT, ("on_delay_s = 5.0", "on_delay_s = 6.0"))
+    changed = machine_file(tmp_path, PATIENT, *SHORT, ("on_delay_s = 5.0", "on_delay_s = 6.0"))
     with running(tmp_path, address, changed) as third:
         third.wait_for("HTTP API")
         health = third.health()
-        assert health.restart.startswith("alarms are as they were at 2026-01-01T00:02:40")
+        assert health.restart.startswith("alarms are as they were at 2026-01-01T00:01:20")
         assert "the window fills anew: machine file was " in health.restart
         assert health.filled == 0.0
         assert states(third)["c_bz"] == "acknowledged"
