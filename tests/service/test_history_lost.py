@@ -14,11 +14,11 @@ from service.history.store import Store
 from service.rotorwatch import app
 from service.runtime import running as running_here
 from service.settings.service import HistorySettings
-from tests.service.live import endpoint, machine_file, settings, until
+from tests.service.live import PATIENT, endpoint, machine_file, settings, until
 from tests.service.monitored import client
 from tests.service.test_alarm_trouble import Bench, bench, block
 from tests.service.test_store import AUDIT, T0, alarm_event
-from tests.service.test_survives import PATIENT, do, running
+from tests.service.test_survives import do, running
 
 TOKEN = TokenRecord("aaaa", "control room", ("read",), b"hash", T0, None, None)
 

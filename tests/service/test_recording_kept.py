@@ -25,6 +25,7 @@ from service.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from tests.service.live import (
     LAB,
+    PATIENT,
     Feed,
     Program,
     endpoint,
@@ -37,7 +38,7 @@ from tests.service.live import (
 )
 from tests.service.replaying import recording
 from tests.service.test_store import alarm_event
-from tests.service.test_survives import PATIENT, do, log
+from tests.service.test_survives import do, log
 from tests.service.test_survives import running as monitor_running
 
 NS = 1_000_000_000
