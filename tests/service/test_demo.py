@@ -6,8 +6,8 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -15,36 +15,11 @@ import pytest
 
 from service.commands.demo import FAULTS, Outcome
 from simulator.scenario import load_scenario
-from tests.service.live import endpoint, until
+from tests.service.live import ROOT, Program, endpoint, program, until
 from tests.service.preloaded import ran
 
-ROOT = Path(__file__).parents[2]
-HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "130"))
-
-
-_started: list[subprocess.Popen[str]] = []
-
-
-@pytest.fixture(autouse=True)
-def _none_is_left() -> Iterator[None]:
-    yield
-    while _started:
-        process = _started.pop()
-        process.kill()
-        process.communicate()
-
-
-def start(*arguments: str, environment: dict[str, str] | None = None) -> subprocess.Popen[str]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        cwd=ROOT,
-        env=environment,
-    )
-    _started.append(process)
-    return process
+HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "80"))
+WHOLE, QUICK = ("service.rotorwatch", "demo"), ("tests.service.quick_demo",)
 
 
 def children_of(pid: int) -> list[int]:
@@ -60,23 +35,14 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
-def demo(folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    """A demo whose temporary files would all be in a folder."""
-    folder.mkdir()
-    environment = os.environ | {"TMPDIR": str(folder), "COLUMNS": "100"}
+@contextmanager
+def demo(folder: Path, *arguments: str) -> Iterator[Program]:
+    """A demo, which leaves no temporary file."""
+    (folder / "tmp").mkdir()
     paced = ("--http-port", "0", "--pace", "20")
-    return start("service.rotorwatch", "demo", *paced, *arguments, environment=environment)
-
-
-def read_until(process: subprocess.Popen[str], *texts: str) -> list[str]:
-    """Lines up to the first that has one of the texts."""
-    lines: list[str] = []
-    assert process.stdout is not None
-    for line in process.stdout:
-        lines.append(line)
-        if any(text in line for text in texts):
-            return lines
-    raise AssertionError(f"{texts} never came:\n{''.join(lines)}")
+    with program(folder, *arguments, *paced, TMPDIR=str(folder / "tmp"), COLUMNS="100") as one:
+        yield one
+    assert list((folder / "tmp").iterdir()) == []
 
 
 def check_lines(output: str) -> None:
@@ -89,64 +55,50 @@ def check_lines(output: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("fault", "seed"),
-    [
-        pytest.param("k_by", 101, marks=pytest.mark.long),
-        *(
-            pytest.param(*one, marks=pytest.mark.long)
-            for one in (("c_by", 102), ("k_bz", 103), ("c_bz", 104), ("e", 105))
-        ),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("seed", "fault"), list(enumerate(FAULTS, 101)))
 def test_the_demo_names_exactly_the_injected_fault(fault: str, seed: int, tmp_path: Path) -> None:
-    process = demo(tmp_path / "tmp", "--fault", fault, "--seed", str(seed), "--once")
-    output, _ = process.communicate(timeout=600)
-    assert process.returncode == 0, output
+    with demo(tmp_path, *WHOLE, "--fault", fault, "--seed", str(seed), "--once") as one:
+        assert one.process.wait(600) == 0, one.output()
+    output = one.output()
     assert re.search(rf"ALERT: .*\({fault}\) changed by", output)
     assert f"/alarms: {fault} raised" in output
     assert "demo passed" in output
     assert output.count("  healthy\n") >= 10  # one line per window, the healthy stretch among them
     check_lines(output)
-    assert list((tmp_path / "tmp").iterdir()) == []
 
 
 @pytest.mark.slow
 @pytest.mark.long
 def test_nothing_is_raised_where_nothing_breaks(tmp_path: Path) -> None:
-    process = demo(tmp_path / "tmp", "--fault", "none", "--once")
-    output, _ = process.communicate(timeout=600)
-    assert process.returncode == 0, output
-    assert "injected nothing; named nothing" in output
-    assert "ALERT" not in output
-    check_lines(output)
+    with demo(tmp_path, *WHOLE, "--fault", "none", "--once") as one:
+        assert one.process.wait(600) == 0, one.output()
+    assert "injected nothing; named nothing" in one.output()
+    assert "ALERT" not in one.output()
+    check_lines(one.output())
 
 
 @pytest.mark.slow
 def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path: Path) -> None:
-    process = demo(tmp_path / "tmp", "--fault", "c_bz")
-    lines = read_until(process, "found")
-    printed = [line.split()[1:] for line in lines if re.match(r"  \S*rotorwatch.* (watch|status) --", line)]
-    assert [command[0] for command in printed] == ["watch", "status"]
-    watch = start("service.rotorwatch", *printed[0])
-    lines += read_until(process, "c_bz raised", "demo failed")
-    status = ran("service.rotorwatch", *printed[1], "--json")
-    alarms = {one["name"]: one["raised"] for one in json.loads(status.stdout)["machines"][0]["alarms"]}
-    assert "c_bz" in alarms
-    # The demo goes on meanwhile: on a busy computer the machine is repaired before the answer comes.
-    assert status.returncode == int(any(alarms.values())), status.stdout
-    lines += read_until(process, "demo passed", "demo failed")
-    lines += read_until(process, "(e) changed by", "failed")
-    watch.send_signal(signal.SIGINT)
-    watched, _ = watch.communicate(timeout=120)
-    assert "(c_bz) changed by" in watched
-    process.send_signal(signal.SIGINT)
-    rest, _ = process.communicate(timeout=300)
-    assert process.returncode == 130
-    output = "".join(lines) + rest
+    with demo(tmp_path, *QUICK, "--fault", "c_bz") as one:
+        one.wait_for("found")
+        lines = one.output().splitlines()
+        printed = [line.split()[1:] for line in lines if re.match(r"  \S*rotorwatch.* (watch|status) --", line)]
+        assert [command[0] for command in printed] == ["watch", "status"]
+        with program(tmp_path, "service.rotorwatch", *printed[0]) as watch:
+            one.wait_for("c_bz raised")
+            status = ran("service.rotorwatch", *printed[1], "--json")
+            alarms = {one["name"]: one["raised"] for one in json.loads(status.stdout)["machines"][0]["alarms"]}
+            assert "c_bz" in alarms
+            # The demo goes on meanwhile: on a busy computer the machine is repaired before the answer comes.
+            assert status.returncode == int(any(alarms.values())), status.stdout
+            one.wait_for("(e) changed by")
+            watch.stop(signal.SIGINT)
+        assert "(c_bz) changed by" in watch.output()
+        assert one.stop(signal.SIGINT) == 130
+    output = one.output()
     check_lines(output)
     assert output.index("c_bz by −30%") < output.index("demo passed") < output.index("repaired") < output.index("e by")
-    assert list((tmp_path / "tmp").iterdir()) == []
 
 
 @pytest.mark.slow
@@ -162,17 +114,14 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
 def test_however_the_demo_ends_it_leaves_nothing_behind(
     number: signal.Signals, whose: str, code: int, tmp_path: Path
 ) -> None:
-    process = demo(tmp_path / "tmp")
-    read_until(process, "healthy")
-    children = children_of(process.pid)
-    assert len(children) == 2  # simulator and monitor
-    os.kill(process.pid if whose == "demo" else min(children), number)
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == code, output
-    if whose == "monitor":
-        assert "the monitor was killed (SIGKILL)" in output
-    until(lambda: not [child for child in children if Path(f"/proc/{child}").exists()], "the end of both", 120)
-    assert list((tmp_path / "tmp").iterdir()) == []
+    with demo(tmp_path, *WHOLE) as one:
+        until(lambda: len(children_of(one.process.pid)) == 2, "simulator and monitor")
+        children = children_of(one.process.pid)
+        os.kill(one.process.pid if whose == "demo" else min(children), number)
+        assert one.process.wait(300) == code, one.output()
+        if whose == "monitor":
+            assert "the monitor was killed (SIGKILL)" in one.errors()
+        until(lambda: not [child for child in children if Path(f"/proc/{child}").exists()], "the end of both", 120)
 
 
 def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:
@@ -209,34 +158,23 @@ def test_a_healthy_machine_at_full_speed_raises_nothing_and_loses_nothing(tmp_pa
 
     ROTORWATCH_HEALTHY_S=3600 python -m pytest tests/service/test_demo.py -k full_speed
     """
-    settings = tmp_path / "batch.toml"
-    settings.write_text(
-        '[http]\nport = 0\n[access]\nopen_on_loopback = true\n[history]\nurl = "sqlite:///history.sqlite"\n'
-        '[queue]\nwhen_full = "wait"\n[[machines]]\nfile = "lab"\nbundle = "lab"\n',
-        encoding="utf-8",
-    )
     where = endpoint()
-    monitor = start("service.rotorwatch", "run", "--config", str(settings), "--listen", where)
-    assert monitor.stdout is not None
-    url = next(line for line in monitor.stdout if line.startswith("HTTP API")).split()[-1]
-    simulator = start(
-        "simulator.rotorsim", "publish", "healthy", "--seed", "106", "--duration", str(HEALTHY_S), "--pace", "max",
-        "--connect", where, "--wait-for-subscriber", "60",
-    )  # fmt: skip
-    output, _ = simulator.communicate(timeout=840)
-    assert simulator.returncode == 0, output
-    base = f"{url}/api/v1/machines/demo/lab"
-    deadline = time.monotonic() + 180
-    while (health := httpx.get(f"{base}/health", timeout=180.0).json())["quality"]["accepted_blocks"] < 10 * HEALTHY_S:
-        assert time.monotonic() < deadline, health["quality"]
-        time.sleep(0.2)
-    quality = health["quality"]
-    assert (quality["refused_blocks"], quality["gaps"], quality["queue_dropped_blocks"]) == ({}, 0, 0)
-    reports = httpx.get(f"{base}/reports", params={"limit": 1000}, timeout=180.0).json()["reports"]
-    assert [report["state"] for report in reports].count("healthy") == (HEALTHY_S - 60) // 5
-    events = httpx.get(f"{base}/alarms/events", timeout=180.0).json()["events"]
-    assert [one["data"]["name"] for one in events] in ([], ["stream-lost"])  # the silence after the end
-    assert json.loads(httpx.get(f"{base}/alarms", params={"all": True}, timeout=180.0).text)["alarms"]
+    with program(tmp_path, "service.rotorwatch", "run", "--listen", where, "--http-port", "0") as monitor:
+        monitor.url()
+        simulator = ran(
+            "simulator.rotorsim", "publish", "healthy", "--seed", "106", "--duration", str(HEALTHY_S), "--pace", "max",
+            "--connect", where, "--wait-for-subscriber", "60",
+        )  # fmt: skip
+        assert simulator.returncode == 0, simulator.stdout
+        until(lambda: monitor.health().quality.accepted_blocks == 10 * HEALTHY_S, "all blocks")
+        quality = monitor.health().quality
+        assert (quality.refused_blocks, quality.gaps, quality.queue_dropped_blocks) == ({}, 0, 0)
+        base = f"{monitor.url()}/api/v1/machines/demo/lab"
+        reports = httpx.get(f"{base}/reports", params={"limit": 1000}, timeout=180.0).json()["reports"]
+        assert [report["state"] for report in reports].count("healthy") == (HEALTHY_S - 60) // 5
+        events = httpx.get(f"{base}/alarms/events", timeout=180.0).json()["events"]
+        assert [one["data"]["name"] for one in events] in ([], ["stream-lost"])  # the silence after the end
+        assert httpx.get(f"{base}/alarms", params={"all": True}, timeout=180.0).json()["alarms"]
 
 
 @pytest.mark.parametrize(

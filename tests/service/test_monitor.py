@@ -1,6 +1,7 @@
 """The data path of one machine, fed by the simulator's blocks without any transport."""
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -16,17 +17,10 @@ from models.signals.wire import encode_block
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Scenario, load_scenario
+from simulator.scenario import Event, load_scenario
 from simulator.stream import blocks
 
 SEED = 7_700_002
-
-
-def scenario(name: str, duration_s: float, seed: int = SEED) -> Scenario:
-    loaded, _ = load_scenario(name)
-    events = [event for event in loaded.events if event.at_s < duration_s]
-    fields = loaded.model_dump() | {"duration_s": duration_s, "seed": seed, "events": [e.model_dump() for e in events]}
-    return Scenario.model_validate(fields)
 
 
 def monitor() -> MachineMonitor:
@@ -46,14 +40,15 @@ def feed(target: MachineMonitor, stream: Sequence[SampleBlock]) -> tuple[list[Re
 
 
 @cache
-def stream(name: str, duration_s: float, block_s: float = 0.1) -> list[SampleBlock]:
-    _, machine = load_scenario(name)
-    return [block for block, _ in blocks(scenario(name, duration_s), machine, block_s=block_s)]
+def stream(duration_s: float, *events: Event) -> list[SampleBlock]:
+    loaded, machine = load_scenario("healthy")
+    made = loaded.overridden(duration_s=duration_s, seed=SEED, faults=events)
+    return [block for block, _ in blocks(made, machine)]
 
 
 def healthy(duration_s: float) -> list[SampleBlock]:
     """The first blocks of one stream, which no test may write to."""
-    return stream("healthy", 180.0)[: round(10 * duration_s)]
+    return stream(180.0)[: round(10 * duration_s)]
 
 
 @cache
@@ -61,23 +56,34 @@ def first_window() -> Report:
     return feed(monitor(), healthy(63.0))[0][-1]
 
 
+@cache
+def _watching() -> MachineMonitor:
+    target = monitor()
+    assert feed(target, healthy(65.0))[0][-1].state is HealthState.HEALTHY
+    return target
+
+
+def watching() -> MachineMonitor:
+    """A monitor that has seen the first 65 s."""
+    return deepcopy(_watching())
+
+
 @pytest.mark.slow
 def test_reports_do_not_depend_on_the_blocks() -> None:
     """Tenths of a second, uneven lengths, 1.9 s blocks, and encoded bytes: the same reports to the last bit."""
-    fine = healthy(73.0)
+    fine = healthy(68.0)
     expected, _ = feed(monitor(), fine)
     assert [report.state for report in expected[:11]] == [HealthState.WARMING] * 11
-    assert [report.state for report in expected[11:]] == [HealthState.HEALTHY] * 3
-    coarse, _ = feed(monitor(), stream("healthy", 73.0, block_s=1.9))
-    assert coarse == expected
+    assert [report.state for report in expected[11:]] == [HealthState.HEALTHY] * 2
     samples = np.concatenate([block.samples for block in fine])
-    cuts = np.cumsum(np.random.default_rng(0).integers(10, 3000, 200))
-    cuts = np.array([0, *cuts[cuts < samples.shape[0]], samples.shape[0]])
-    uneven = [
-        SampleBlock(fine[0].start_ns + int(begin) * 500_000, number, 1, 2000.0, samples[begin:end])
-        for number, (begin, end) in enumerate(pairwise(cuts))
-    ]
-    assert feed(monitor(), uneven)[0] == expected
+    for lengths in (np.full(40, 3800), np.random.default_rng(0).integers(10, 3000, 200)):
+        cuts = np.cumsum(lengths)
+        cuts = np.array([0, *cuts[cuts < samples.shape[0]], samples.shape[0]])
+        others = [
+            SampleBlock(fine[0].start_ns + int(begin) * 500_000, number, 1, 2000.0, samples[begin:end])
+            for number, (begin, end) in enumerate(pairwise(cuts))
+        ]
+        assert feed(monitor(), others)[0] == expected
     target = monitor()
     decoded = [target.step_payload(*encode_block(block, target.machine.descriptor.schema_hash)) for block in fine]
     assert [window for reports in decoded for report in reports for window in report.windows] == expected
@@ -102,9 +108,7 @@ def test_every_parameter_and_equation_is_accounted_for() -> None:
 
 def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
     everything = healthy(180.0)
-    target = monitor()
-    before, _ = feed(target, everything[:650])
-    assert before[-1].state is HealthState.HEALTHY
+    target = watching()
     after, events = feed(target, everything[1050:])  # 40 s are lost: too much for the window's span
     quality = target.health().quality
     assert quality.gaps == 1
@@ -128,9 +132,8 @@ def test_a_gap_is_reported_and_is_neither_a_fault_nor_healthy() -> None:
 @pytest.mark.parametrize(("run", "told"), [(1, ["data-clock"]), (2, [])], ids=["clock set", "publisher started anew"])
 def test_a_publisher_started_anew_is_no_clock_that_was_set(step_s: int, run: int, told: list[str]) -> None:
     """Whatever its time: a restart is stated as one, and the window fills anew."""
-    everything = healthy(135.0)
-    target = monitor()
-    feed(target, everything[:650])
+    everything = healthy(129.0)
+    target = watching()
     later = [
         replace(one, start_ns=one.start_ns + step_s * 10**9, run=run, sequence=number if run == 2 else one.sequence)
         for number, one in enumerate(everything[650:])
@@ -168,10 +171,8 @@ def test_undecodable_bytes_are_a_refusal_like_any_other() -> None:
 
 
 def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
-    loaded, machine = load_scenario("healthy")
-    fields = loaded.model_dump() | {"duration_s": 75.0, "seed": SEED, "events": [{"at_s": 0, "speed_rpm": 2000}]}
-    stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
-    windows, events = feed(MachineMonitor(install(machine, None)), stream_)
+    _, machine = load_scenario("healthy")
+    windows, events = feed(MachineMonitor(install(machine, None)), stream(75.0, Event(at_s=0.0, speed_rpm=2000.0)))
     assert windows[-1].state is HealthState.NOT_EVALUABLE
     assert "speed is 2000 rpm, off 1320 rpm by 51.5 %, evaluated is at most 20 %" in windows[-1].reason
     assert windows[-1].parameters == ()
@@ -180,11 +181,9 @@ def test_a_speed_out_of_range_is_not_evaluable_and_never_an_alarm() -> None:
 
 @pytest.mark.slow
 def test_an_unsteady_speed_is_not_evaluable() -> None:
-    loaded, machine = load_scenario("healthy")
-    ramp = {"at_s": 20, "ramp_s": 30, "speed_rpm": 1580}
-    fields = loaded.model_dump() | {"duration_s": 140.0, "seed": SEED, "events": [ramp]}
-    stream_ = [block for block, _ in blocks(Scenario.model_validate(fields), machine)]
-    windows, events = feed(MachineMonitor(install(machine, None)), stream_)
+    _, machine = load_scenario("healthy")
+    ramp = Event(at_s=20.0, ramp_s=10.0, speed_rpm=1580.0)
+    windows, events = feed(MachineMonitor(install(machine, None)), stream(98.0, ramp))
     states = [window.state for window in windows]
     assert states[11] is HealthState.NOT_EVALUABLE
     assert "speed went from 1320 to 1580 rpm within the window" in windows[11].reason
@@ -198,7 +197,7 @@ def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
     seen: list[Report] = []
     events: list[AlarmEvent] = []
     rng = np.random.default_rng(1)
-    for block in healthy(131.0):  # two windows: long enough for an alarm
+    for block in healthy(73.0):  # three full windows: long enough for an alarm
         samples = block.samples.copy()
         match kind:
             case "stuck angle":
@@ -217,7 +216,7 @@ def test_sick_channels_are_stated_and_never_become_a_fault(kind: str) -> None:
         assert report.verdict.accepted
         seen += report.windows
         events += report.events
-    assert len(seen) == 25
+    assert len(seen) == 14
     assert all(event.alarm.name.startswith("data-") for event in events)
     assert {window.state for window in seen[11:]} <= {HealthState.NOT_EVALUABLE, HealthState.DATA_HEALTH}
     assert all(window.reason for window in seen[11:])
@@ -236,7 +235,7 @@ def test_parameters_that_the_sensors_cannot_see_are_not_read() -> None:
 
 
 def test_one_wild_sample_does_not_blind_the_monitor() -> None:
-    everything = healthy(131.0)
+    everything = healthy(73.0)
     wild = everything[0].samples.copy()
     wild[50, 0] = 1e30
     windows, events = feed(monitor(), [replace(everything[0], samples=wild), *everything[1:]])
@@ -267,10 +266,11 @@ def test_without_a_bundle_the_equations_say_so() -> None:
 
 @pytest.mark.slow
 def test_a_stiffness_fault_is_named_sized_and_the_only_alarm() -> None:
-    windows, events = feed(monitor(), stream("k_by", 230.0))
+    softer = Event(at_s=65.0, parameter="k_by", relative_change=-0.25)
+    windows, events = feed(monitor(), stream(133.0, softer))
     assert [(event.kind, event.alarm.name) for event in events] == [("raised", "k_by")]
-    # 140 s after the start the stiffness drops; two hops later there is clean data, one hop later the delay is over.
-    assert (events[0].time_ns - windows[0].end_ns) / 1e9 + 6.0 <= 140.0 + 21.0
+    # After two hops there is clean data, one hop later the delay is over.
+    assert (events[0].time_ns - windows[0].end_ns) / 1e9 + 6.0 <= 65.0 + 21.0
     assert events[0].alarm.change == pytest.approx(-0.25, abs=0.03)
     named = {tuple(finding.name for finding in window.verdict.changed) for window in windows if window.verdict}
     assert named == {(), ("k_by",)}

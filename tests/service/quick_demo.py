@@ -1,0 +1,10 @@
+"""The demo with shorter stretches between its events: ``python -m tests.service.quick_demo`` and its options."""
+
+import sys
+
+from service.commands import demo
+from service.rotorwatch import app
+
+if __name__ == "__main__":
+    demo._HEALTHY_S, demo._BROKEN_S, demo._REPAIRED_S = 70.0, 45.0, 65.0
+    app(["demo", *sys.argv[1:]])
