@@ -42,7 +42,7 @@ def briefly() -> Iterator[None]:
     """Fewer steps and fewer draws for the principal directions, where nothing is asked of how accurate networks are."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
-        patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 300)
+        patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 96)
         yield
 
 
@@ -53,7 +53,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 
     folder: Path = tmp_path_factory.mktemp("trained") / "bundle"
     with briefly():
-        train_for(SHORT, folder, 4, DRAWS, SEED, 1)
+        train_for(SHORT, folder, 2, DRAWS, SEED, 1)
     return load_bundle(folder, SHORT)
 
 
@@ -70,14 +70,14 @@ def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_t
     assert bundle.amortised is not None
     assert {one.equation for one in bundle.amortised.networks} == {"28", "29", "30", "31"}
     made = bundle.manifest.training
-    assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 4, 2, DRAWS)
+    assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 2, 1, DRAWS)
 
 
 def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_told(bundle: Bundle) -> None:
     from models.diagnosis.networks.training import train_network  # noqa: PLC0415
 
     equation, told = EQUATIONS[1], list[float]()
-    material = windows(SHORT, Purpose.TRAINING, 1, 4, equation.kept_nominal)
+    material = windows(SHORT, Purpose.TRAINING, 1, 2, equation.kept_nominal)
     with briefly():
         again = train_network(equation, material, SHORT, SEED, told.append)
     first = next(one for one in bundle.networks if one.equation.number == equation.number)
@@ -143,10 +143,10 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
     from models.diagnosis.networks.training import calibrate, train_network  # noqa: PLC0415
 
     equation = EQUATIONS[0]
-    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 16, equation.kept_nominal), SHORT, SEED)
-    trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 8, equation.kept_nominal), SHORT)
+    network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 12, equation.kept_nominal), SHORT, SEED)
+    trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 6, equation.kept_nominal), SHORT)
     draw = Draw(SHORT, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
-    readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(8)]
+    readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(6)]
     k_by = np.array([reading[0].relative_change for reading in readings], dtype=np.float64)
     assert np.median(k_by) == pytest.approx(-0.2, abs=0.04)
     assert all((reading[0].z or 0.0) < -2 for reading in readings)
@@ -159,7 +159,7 @@ def test_calibration_finds_the_true_size_of_the_errors() -> None:
     shipped = load_bundle("lab", LAB).amortised
     assert shipped is not None
     draws = (Draw(LAB, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
-    held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(8)] for draw in draws]
+    held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(5)] for draw in draws]
     calibrated = calibrate_networks(LAB, replace(shipped, calibration={}), held_out)
     assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
     assert all(0.1 < scale < 8 for one in calibrated.calibration.values() for scale in one.z_scale)
