@@ -11,7 +11,7 @@ from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording,
 
 SLOW = LAB.operation.speed_rpm
 FAST = 1.15 * SLOW
-LENGTH_S = 70.0
+LENGTH_S = 45.0
 
 
 def made_of(*conditions: tuple[str, int, tuple[Event, ...]]) -> Commissioning:

@@ -68,7 +68,7 @@ def test_partial_knowledge_identifies_the_rotor_within_its_errors() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("level", MACHINES)
+@pytest.mark.parametrize("level", ["partial", "none", pytest.param("full", marks=pytest.mark.long)])
 def test_what_was_commissioned_comes_back_from_its_file(level: str, tmp_path: Path) -> None:
     made, machine = made_at(level), MACHINES[level]
     assert made.commissioned is not None
@@ -97,6 +97,11 @@ def test_a_bundle_is_refused_for_another_machine_or_when_damaged(tmp_path: Path)
     fewer = NOTHING.model_copy(update={"sensors": NOTHING.sensors[1:]})
     with pytest.raises(BundleError, match=r"sensors in the machine file of demo/lab differ.*commission"):
         load_commissioned(tmp_path, fewer)
+    first, *others = NOTHING.model_dump()["sensors"]
+    rolled = NOTHING.model_dump() | {"sensors": [first | {"slow_roll_um_pp": 5.0, "slow_roll_phase_lag_deg": 40.0}]}
+    rolled["sensors"] += others
+    with pytest.raises(BundleError, match="sensors"):
+        load_commissioned(tmp_path, MachineFile.model_validate(rolled))
     with pytest.raises(BundleError, match=r"is not a commissioned bundle.*or name no bundle"):
         install(NOTHING, tmp_path / "nowhere")
     assert install(NOTHING, None).watching
@@ -145,20 +150,8 @@ def test_the_valid_band_of_what_is_derived_is_stated() -> None:
     assert 50 <= int(found[2]) <= NOTHING.window.band_hz[1]
     displacements = [n for n, channel in enumerate(NOTHING.sensors) if channel.quantity != "velocity"]
     few = NOTHING.model_copy(update={"sensors": tuple(NOTHING.sensors[n] for n in displacements)})
-    blocks = [replace(block, samples=block.samples[:, displacements]) for block in stream(HEALTHY_S, 41)[:1300]]
+    blocks = [replace(block, samples=block.samples[:, displacements]) for block in stream(HEALTHY_S, 41)[:700]]
     (less,) = commissioned(few, recording(few, blocks)).report.notes
     deeper = re.search(r"up to (\d) derivatives", less)
     assert deeper is not None
     assert int(deeper[1]) > int(found[1])
-
-
-def test_a_commissioning_holds_for_the_slow_roll_vectors_it_was_made_with(tmp_path: Path) -> None:
-    made = commissioned(NOTHING, healthy(NOTHING, 200, 5_402)).commissioned
-    assert made is not None
-    (tmp_path / FILE).write_text(made.model_dump_json(), encoding="utf-8")
-    assert load_commissioned(tmp_path, NOTHING).identity == made.identity
-    fields = NOTHING.model_dump()
-    first, *others = fields["sensors"]
-    fields["sensors"] = [first | {"slow_roll_um_pp": 5.0, "slow_roll_phase_lag_deg": 40.0}, *others]
-    with pytest.raises(BundleError, match="sensors"):
-        load_commissioned(tmp_path, MachineFile.model_validate(fields))

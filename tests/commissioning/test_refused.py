@@ -106,7 +106,7 @@ def test_vibration_that_grows() -> None:
 
 @pytest.mark.slow
 def test_a_machine_that_changed_meanwhile() -> None:
-    made = made_of(stream(190.0, 55, Event(at_s=95.0, parameter="k_by", relative_change=-0.3)))
+    made = made_of(stream(140.0, 55, Event(at_s=70.0, parameter="k_by", relative_change=-0.3)))
     assert refused(made)
     _, text, _ = verdict_of(made, "halves agree")
     assert text.startswith("bearing stiffness, horizontal differs between the halves")
@@ -130,7 +130,7 @@ def test_another_machine_that_hums() -> None:
 @pytest.mark.slow
 def test_a_healthy_recording_has_no_foreign_line() -> None:
     """Which the check says of the recording before anything is learned from it."""
-    for seed in (57, 58, 59):
+    for seed in (52, 58):
         assert check_lines([recording(NOTHING, stream(HEALTHY_S, seed))]).verdict == "passed"
 
 

@@ -68,8 +68,15 @@ def renewed(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("recorded", [True, False], ids=["recorded", "whole"])
-@pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.parametrize(
+    ("machine", "recorded"),
+    [
+        ("phase reference", True),
+        ("no phase reference", False),
+        pytest.param("phase reference", False, marks=pytest.mark.long),
+        pytest.param("no phase reference", True, marks=pytest.mark.long),
+    ],
+)
 def test_a_monitor_stopped_at_any_block_goes_on_to_the_last_bit(machine: str, recorded: bool) -> None:
     """Statistics, readings, verdicts and alarms; stopped in warming, at hops, between them, around gap and fault."""
     blocks, expected = stream(machine), uninterrupted(machine)

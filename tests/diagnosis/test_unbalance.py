@@ -42,9 +42,10 @@ def e_of(window: WindowStatistics) -> tuple[Parameter, UnbalanceVector]:
     return diagnosis.parameters[-1], diagnosis.unbalance
 
 
-@pytest.mark.parametrize("degrees", [-170.0, -90.0, 40.0, 180.0])
-@pytest.mark.parametrize("e", [-0.5, 0.0, 1.0])
-def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(degrees: float, e: float) -> None:
+@pytest.mark.parametrize(
+    ("e", "degrees"), [(-0.5, -170.0), (-0.5, 40.0), (0.0, -90.0), (0.0, 180.0), (1.0, -170.0), (1.0, 40.0)]
+)
+def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: float, degrees: float) -> None:
     reading, vector = e_of(turned(drawn(1, e), degrees))
     assert vector.magnitude_change == pytest.approx(e, abs=4.5 * vector.magnitude_error)
     assert vector.turned_deg is not None
@@ -94,11 +95,11 @@ def test_vectors_that_no_unbalance_makes_are_not_read_as_one() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
 def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
-    """Size and direction of 12 windows: rms of all 24 z within 1 + 4/√48, of each alone within 1 + 4/√24, but for a
+    """Size and direction of 8 windows: rms of all 16 z within 1 + 4/√32, of each alone within 1 + 4/√16, but for a
     tenth.
     """
     z = []
-    for number in range(12):
+    for number in range(8):
         _, vector = e_of(turned(drawn(100 + number, 0.3, layout), 60.0))
         assert vector.turned_deg is not None
         assert vector.turned_error_deg is not None
@@ -108,9 +109,9 @@ def test_the_parts_of_the_vector_have_honest_errors(layout: Layout) -> None:
                 (vector.turned_deg - 60) / vector.turned_error_deg,
             )
         )
-    assert np.sqrt(np.mean(np.square(z))) < 1.7
-    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 2.0)
-    assert np.all(np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(12) * 1.1)
+    assert np.sqrt(np.mean(np.square(z))) < 1.8
+    assert np.all(np.sqrt(np.mean(np.square(z), axis=0)) < 2.1)
+    assert np.all(np.abs(np.mean(z, axis=0)) < 4 / np.sqrt(8) * 1.1)
 
 
 SEED_OF_VARYING_SPEED = 900

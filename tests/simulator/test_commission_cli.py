@@ -30,12 +30,14 @@ def run(folder: Path, *arguments: str | Path) -> Result:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("commission")
     (place / "machine.toml").write_text(NOTHING_KNOWN, encoding="utf-8")
-    for name, duration_s, seed in (("monday", 80.0, 81), ("friday", 70.0, 82), ("short", 20.0, 83)):
+    for name, duration_s, seed in (("monday", 70.0, 81), ("friday", 40.0, 82), ("short", 20.0, 83)):
         record(LAB, ((block, ()) for block in stream(duration_s, seed)), place / f"{name}.mcap")
     return place
 
 
-def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reason(folder: Path) -> None:
+def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reason(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arguments = ("--machine", "machine.toml", "--healthy", "monday.mcap", "friday.mcap", "--out", "kit")
     variables = {**os.environ, "COLUMNS": "200"}
     found = ran("simulator.rotortrain", "commission", *arguments, cwd=folder, environment=variables)
@@ -45,7 +47,7 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
     first = load_commissioned(folder / "kit", machine)
     assert (first.version, first.replaces, first.level) == (1, None, "none")
     assert [one.name for one in first.recordings] == ["monday.mcap", "friday.mcap"]
-    assert [one.used_s for one in first.recordings] == [75.0, 65.0]
+    assert [one.used_s for one in first.recordings] == [65.0, 35.0]
     assert len({one.sha256 for one in first.recordings}) == 2
     report = json.loads((folder / "kit" / "report.json").read_text(encoding="utf-8"))
     assert report["identity"] == first.identity
@@ -56,6 +58,7 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
     assert "kit holds version 1 of the commissioning of demo/lab: say why it is replaced" in again.stderr
     assert load_commissioned(folder / "kit", machine) == first
 
+    monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they were drawn above
     again = run(folder, *arguments, "--why", "bearing exchanged")
     assert again.exit_code == 0, again.stderr
     second = load_commissioned(folder / "kit", machine)
@@ -63,7 +66,10 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
     assert json.loads((folder / "kit" / "commissioned-1.json").read_text(encoding="utf-8"))["version"] == 1
 
 
-def test_a_recording_that_is_not_fit_is_refused_with_what_to_record(folder: Path) -> None:
+def test_a_recording_that_is_not_fit_is_refused_with_what_to_record(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())
     found = run(folder, "--machine", "machine.toml", "--healthy", "short.mcap", "--out", "never")
     assert found.exit_code == 3
     assert "too short: 15 s of usable data" in " ".join(found.stdout.split())

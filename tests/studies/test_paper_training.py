@@ -42,12 +42,14 @@ def training(rig: Machine) -> list[WindowStatistics]:
 
 @pytest.fixture(scope="module")
 def healthy(rig: Machine) -> list[WindowStatistics]:
-    return _windows(rig, range(10, 22))
+    return _windows(rig, range(10, 16))
 
 
 @pytest.fixture(scope="module")
 def networks(rig: Machine, training: list[WindowStatistics]) -> list[PaperNetwork]:
-    return [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("benchmarks.studies.paper_training._STEPS", 300)
+        return [train_paper_network(equation, training, rig, seed=1) for equation in PAPER_EQUATIONS]
 
 
 def test_rows_are_the_papers_from_lag_zero(rig: Machine, training: list[WindowStatistics]) -> None:
@@ -59,9 +61,10 @@ def test_rows_are_the_papers_from_lag_zero(rig: Machine, training: list[WindowSt
 
 
 def test_training_fits_its_own_windows_and_is_repeatable(
-    rig: Machine, networks: list[PaperNetwork], training: list[WindowStatistics]
+    rig: Machine, networks: list[PaperNetwork], training: list[WindowStatistics], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = networks[0]
+    monkeypatch.setattr("benchmarks.studies.paper_training._STEPS", 300)
     again = train_paper_network(PAPER_EQUATIONS[0], training, rig, seed=1)
     assert np.array_equal(first.network.W1, again.network.W1)
     assert np.mean([mean_squared_deviation(first, window, rig) for window in training]) < 0.05
@@ -70,9 +73,9 @@ def test_training_fits_its_own_windows_and_is_repeatable(
 def test_diagnostician_names_equations_and_no_sizes(
     rig: Machine, networks: list[PaperNetwork], healthy: list[WindowStatistics]
 ) -> None:
-    limits = calibrate_paper(networks, healthy, rig, false_alarm_rate=0.1)
+    limits = calibrate_paper(networks, healthy, rig, false_alarm_rate=0.2)
     paper = PaperDiagnostician(rig, networks, limits)
-    # As calibrated: of the twelve windows exactly the largest score is at the limit, none above it.
+    # As calibrated: of the six windows exactly the largest score is at the limit, none above it.
     assert not any(paper.flagged_equations(paper.diagnose(window)) for window in healthy)
     changed = Draw(rig, _SEED, Purpose.TRAINING, faults={"k_by": -0.6}, layout=Layout.ONE_SOURCE, fixed_condition=True)
     diagnosis = paper.diagnose(simulate_window(changed, 50))
