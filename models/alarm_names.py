@@ -10,6 +10,7 @@ from models.physics.rotor import PARAMETER_TEXT
 from rotorwatch.records.sensor_faults import FaultKind
 
 MODEL = "model"  # the alarm that says: outside the model
+CHANGED = "changed"  # the alarm that says: a parameter has changed, and it is not sure which
 SHAPE = "shape"  # the alarm that says: where no equation can be evaluated, a channel's vibration is not as it was
 STREAM_LOST = "stream-lost"  # the alarm that says: no data come any more
 LEVEL = "level:"  # begins the name of the alarm on a channel's vibration levels; the channel's name follows
@@ -43,6 +44,12 @@ ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
             "machine",
             "the model describes the machine again",
             "something has changed that no parameter describes, or a sensor is at fault",
+        ),
+        CHANGED: AlarmKind(
+            "changed, not sure what",
+            "machine",
+            "what has changed has a name, or nothing has changed any more",
+            "several parameters explain it",
         ),
         SHAPE: AlarmKind(
             "vibration changed",

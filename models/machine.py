@@ -245,6 +245,9 @@ class SuppressRule(BaseModel, extra="forbid", frozen=True):
         )
 
 
+_NAME_CONFIDENCE = 0.9
+
+
 class AlarmSettings(BaseModel, extra="forbid", frozen=True):
     """When a parameter change becomes an alarm; all times are data time."""
 
@@ -259,6 +262,15 @@ class AlarmSettings(BaseModel, extra="forbid", frozen=True):
     )
     on_delay_s: float = Field(default=10.0, ge=0, le=86400, description="how long it must last before the alarm")
     off_delay_s: float = Field(default=60.0, ge=0, le=86400, description="how long it must be gone before it clears")
+    name_confidence: float = Field(
+        default=_NAME_CONFIDENCE,
+        ge=0.5,
+        lt=1,
+        # Identities stay as they were before it was there.
+        exclude_if=lambda value: value == _NAME_CONFIDENCE,
+        description="how probable it must be that a parameter is among the changed ones for an alarm to name it; "
+        "below, the alarm is changed, with the candidates",
+    )
     gap_s: float = Field(
         default=1.0, ge=0, le=86400, description="shortest gap in the data that is an alarm; shorter ones are counted"
     )

@@ -134,6 +134,16 @@ class Finding(BaseModel):
     stretch_s: float = Field(description="length of that stretch", examples=[10.0])
 
 
+class Candidate(BaseModel):
+    """A parameter that may have changed."""
+
+    model_config = JSON
+
+    name: ParameterName
+    text: ParameterText
+    probability: float = Field(description="that it is among those that changed", examples=[0.97])
+
+
 class Verdict(BaseModel):
     """What has changed, from stretches of data of all lengths that end with this hop; alarms are decided on it."""
 
@@ -150,6 +160,9 @@ class Verdict(BaseModel):
     detected: bool = Field(description="something changed, whether or not it is clear yet what", examples=[True])
     confidence: float = Field(
         description="probability of exactly this set of parameters among all sets", examples=[0.996]
+    )
+    candidates: tuple[Candidate, ...] = Field(
+        default=(), description="parameters that may have changed, the most probable first; those below 5 % left out"
     )
     low_confidence: bool = Field(
         description="take what is said of parameters with reserve: outside the model, or several sets explain the data",

@@ -5,6 +5,7 @@ found to have changed, ``_`` not evaluated.
 Events: ``^`` raised, ``!`` escalated, ``v`` cleared.
 """
 
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
 from typing import cast
 
@@ -17,7 +18,7 @@ from models.diagnosis.window import WindowStatistics
 from models.machine import AlarmSettings, load_machine
 from rotorwatch.records.alarms import Severity
 from rotorwatch.records.sensor_faults import FaultKind
-from rotorwatch.records.windows import SensorFault
+from rotorwatch.records.windows import Candidate, Finding, Parameter, SensorFault, Verdict
 from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.alarms.data_path import DataPathAlarms
@@ -156,3 +157,54 @@ def test_every_kind_of_fault_of_a_sensor_raises_its_alarm(kind: FaultKind) -> No
     (event,) = book.take()
     assert event.text == f"ALERT: data health, {kind.text}: y1 is at fault"
     assert book.severity is None
+
+
+def judged(hops: Sequence[Mapping[str, float]], *, settled: bool = True, outside: bool = False) -> list[str]:
+    """What alarms say of hops, each with the probability of every parameter; the likelier half is what has changed."""
+    book = AlarmBook(SETTINGS)
+    for number, probability in enumerate(hops):
+        changed = [name for name in probability if probability[name] > 0.5]
+        book.found(
+            Verdict(
+                changed=tuple(Finding(name=name, text=name, since_ns=0, found_ns=0, stretch_s=60) for name in changed),
+                text="",
+                detected=bool(changed),
+                confidence=0.5,
+                candidates=tuple(Candidate(name=name, text=name, probability=p) for name, p in probability.items()),
+                low_confidence=False,
+                outside_model=outside,
+                outside_confidence=None,
+                decided_s=60.0,
+                settled=settled,
+                current=tuple(
+                    Parameter(name=name, text=name, by="", relative_change=0.2, standard_error=0.03)
+                    for name in probability
+                ),
+            ),
+            "",
+            "",
+            number * 5_000_000_000,
+        )
+    return [f"{event.kind} {event.alarm.name}" for event in book.take()]
+
+
+NOT_SURE, SURE = {"c_by": 0.4, "c_bz": 0.6}, {"c_by": 0.03, "c_bz": 0.97}
+
+
+def test_a_name_needs_to_be_as_good_as_certain() -> None:
+    assert judged([SURE] * 3) == ["raised c_bz"]
+    assert judged([NOT_SURE] * 3) == ["raised changed"]
+    assert judged([SURE, NOT_SURE] * 3) == []  # neither for as long as the on-delay
+    assert judged([NOT_SURE] * 3, outside=True) == ["raised model"]
+    assert judged([SURE | {"c_by": 0.6}] * 3) == ["raised c_bz"]  # one name is there: the other is waited for
+
+
+def test_what_is_not_sure_gets_its_name_as_soon_as_it_is() -> None:
+    assert judged([NOT_SURE] * 3 + [SURE] * 6) == ["raised changed", "raised c_bz", "cleared changed"]
+
+
+def test_a_name_that_is_taken_back_is_cleared_however_large_its_reading() -> None:
+    nothing = {"c_by": 0.02, "c_bz": 0.04}
+    assert judged([SURE] * 3 + [nothing] * 3) == ["raised c_bz"]
+    assert judged([SURE] * 3 + [nothing] * 4) == ["raised c_bz", "cleared c_bz"]
+    assert judged([SURE] * 3 + [nothing] * 9, settled=False) == ["raised c_bz"]  # too little data to take it back

@@ -30,7 +30,7 @@ from models.errors import CheckpointError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
-from rotorwatch.records.windows import Finding, Parameter, Verdict
+from rotorwatch.records.windows import Candidate, Finding, Parameter, Verdict
 
 # Stretches shorter than the window in which larger changes are looked for. Their standard errors are right as stated:
 # on 150 healthy stretches of each length and either layout of sources (rotor kit, seed 301) z of no parameter scatters
@@ -40,6 +40,7 @@ _DOUBLINGS = 6
 _LOWER = np.tril_indices(len(PARAMETERS))  # elements of an information matrix that are remembered: it is symmetric
 # Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data.
 _CONTRADICTION_RATE = 1e-7
+_PROBABLE = 0.05  # least probability of a parameter that is told as one that may have changed
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,6 +286,7 @@ class SequentialTest:
             text=_in_words(findings, isolation, detected=detected, read=bool(current)),
             detected=detected,
             confidence=isolation.confidence,
+            candidates=() if unexplained else _candidates(isolation),
             low_confidence=isolation.low_confidence,
             outside_model=isolation.outside,
             outside_confidence=isolation.outside_confidence,
@@ -420,6 +422,16 @@ class SequentialTest:
 def finding(name: str, since_ns: int, found_ns: int, stretch_s: float) -> Finding:
     """A parameter that changed, and the stretch that found it first; see `Finding`."""
     return Finding(name=name, text=PARAMETER_TEXT[name], since_ns=since_ns, found_ns=found_ns, stretch_s=stretch_s)
+
+
+def _candidates(isolation: Isolation) -> tuple[Candidate, ...]:
+    """Parameters that may be among the changed ones."""
+    likely = sorted(zip(isolation.probability, PARAMETERS, strict=True), key=lambda one: -one[0])
+    return tuple(
+        Candidate(name=name, text=PARAMETER_TEXT[name], probability=probability)
+        for probability, name in likely
+        if probability >= _PROBABLE
+    )
 
 
 def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bool, read: bool) -> str:

@@ -5,7 +5,9 @@ dead band, and where nothing was read, neither is asked for: missing data neithe
 for long enough (on-delay, off-delay, in data time) happens, and `service.monitor.alarms.life_cycle` says what becomes
 of the alarm.
 
-Beyond the limit is a parameter that the sequential test names as changed, by more than its limit.
+Beyond the limit is a parameter that the sequential test names as changed, by more than its limit, and as good as
+certainly: where others explain the data too, the alarm is `changed`, with the candidates. It is small again when it has
+come back, or when a whole window after the change says that it is not this parameter.
 """
 
 import math
@@ -13,7 +15,7 @@ from dataclasses import dataclass, replace
 
 from pydantic import TypeAdapter
 
-from models.alarm_names import ALARMS, MODEL, alarm_kind, is_alarm
+from models.alarm_names import ALARMS, CHANGED, MODEL, alarm_kind, is_alarm
 from models.errors import CheckpointError
 from models.machine import AlarmSettings, SuppressRule
 from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity, Shelf
@@ -27,6 +29,9 @@ from service.monitor.alarms.operation import (
     OperatorAction,
     UnknownAlarm,
 )
+
+_TAKEN_BACK = 0.5
+"""Probability below which a parameter that was named is no longer taken to have changed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +114,8 @@ class AlarmBook:
             End of the hop.
         """
         named = {finding.name for finding in verdict.changed}
+        probability = {one.name: one.probability for one in verdict.candidates}
+        sure = {name for name in named if probability.get(name, 0.0) >= self._settings.name_confidence}
         start_ns = end_ns - round(verdict.decided_s * 1e9)
         evidence = Evidence(start_ns=start_ns, end_ns=end_ns, confidence=verdict.confidence)
         for reading in verdict.current:
@@ -118,11 +125,30 @@ class AlarmBook:
                     reading.relative_change,
                     reading.standard_error,
                     end_ns,
-                    named=reading.name in named,
+                    named=reading.name in sure,
+                    taken_back=verdict.settled
+                    and reading.name not in named
+                    and probability.get(reading.name, 0.0) < _TAKEN_BACK,
                     low_confidence=verdict.outside_model,
                     evidence=evidence,
                     note="" if reading.vector is None else reading.vector.text,
                 )
+        if verdict.current:
+            # Outside the model no candidate need be right, and `model` says so.
+            nameless = set() if sure or verdict.outside_model else named
+            changes = [
+                (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
+                for one in verdict.current
+                if one.name in nameless
+            ]
+            self.update_state(
+                CHANGED,
+                any(change > limits.raise_above for change, limits in changes),
+                end_ns,
+                " or ".join(f"{one.text} ({one.name}) {one.probability:.0%}" for one in verdict.candidates),
+                evidence=evidence,
+                danger=any(change > limits.danger_above for change, limits in changes),
+            )
         if verdict.current or unexplained:
             note = unexplained or (f"best explained by: {suspect}" if suspect else "")
             outside = verdict.outside_model
@@ -136,6 +162,7 @@ class AlarmBook:
         time_ns: int,
         *,
         named: bool,
+        taken_back: bool = False,
         low_confidence: bool = False,
         evidence: Evidence | None = None,
         note: str = "",
@@ -152,6 +179,8 @@ class AlarmBook:
             Data time of the end of the hop.
         named : bool
             Whether the parameter is among those found to have changed.
+        taken_back : bool
+            Whether a whole window after the change says that it is not.
         low_confidence : bool
             Whether the data are outside the model.
         evidence : Evidence, optional
@@ -175,7 +204,7 @@ class AlarmBook:
             evidence=evidence,
             note=note,
         )
-        beyond, small = named and size > limits.raise_above, size < limits.clear_below
+        beyond, small = named and size > limits.raise_above, taken_back or size < limits.clear_below
         danger = beyond and size > limits.danger_above
         return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
