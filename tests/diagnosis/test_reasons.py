@@ -167,4 +167,5 @@ def test_a_suspect_that_cannot_be_is_none() -> None:
     assert suspect("inertia of the disc", 4.96) == "inertia of the disc"
     assert suspect("mass of the disc", 0.07) == "mass of the disc (+7.0%)"
     assert suspect("shaft stiffer in y than in z", 1.2) == ""
+    assert suspect("shaft stiffer in y than in z", -0.0003) == ""  # as true as that no machine is built
     assert suspect("mass of the disc", 0.07, z=4.0) == "gain of y1 (+10.0%)"

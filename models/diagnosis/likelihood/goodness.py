@@ -26,6 +26,7 @@ _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 _UNEQUAL = "shaft stiffer in y than in z"
 _MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
 _LEAST_SUSPECT_Z = 5.0
+_LEAST_SUSPECT = 5e-4  # a smaller one would read as ±0.0 %, and no machine is built as true as that
 _LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
 # An alternative of which less than this is left beside the model's own parameters cannot be told from them.
 _LEAST_INFORMATION = 1e-4
@@ -71,7 +72,8 @@ class Goodness:
         if not self.alternatives:
             return ""
         best = max(self.alternatives, key=lambda one: abs(one.z))
-        if abs(best.z) <= _LEAST_SUSPECT_Z or impossible(best.change, best.quantity):
+        small = abs(best.change) < _LEAST_SUSPECT
+        if abs(best.z) <= _LEAST_SUSPECT_Z or small or impossible(best.change, best.quantity):
             return ""
         if best.name == _UNEQUAL and impossible(-best.change, best.quantity):
             return ""  # what y gains z loses
