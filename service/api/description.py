@@ -1,11 +1,13 @@
 """The application's description of itself (OpenAPI), with whole examples; nothing else can be asked for."""
 
+import threading
 from collections.abc import Mapping
 from typing import Any
 
 from fastapi import FastAPI, Request
+from fastapi.dependencies.models import Dependant
 from fastapi.exceptions import RequestValidationError
-from fastapi.routing import iter_route_contexts
+from fastapi.routing import APIRoute, iter_route_contexts
 
 from service.access.problems import share_problems
 
@@ -22,26 +24,26 @@ class DescribedApp(FastAPI):
     def __init__(self, **arguments: Any) -> None:
         super().__init__(generate_unique_id_function=lambda route: route.name, **arguments)
         self._arguments: Mapping[Any, frozenset[str]] | None = None
+        self._describing = threading.Lock()
 
     def arguments(self, endpoint: object) -> frozenset[str]:
         """Names of the query arguments that an endpoint takes."""
         if self._arguments is None:
-            paths = self.openapi()["paths"]
             self._arguments = {
-                context.endpoint: frozenset(
-                    one["name"]
-                    for method in context.methods or ()
-                    for one in paths.get(context.path_format, {}).get(method.lower(), {}).get("parameters", [])
-                    if one["in"] == "query"
-                )
+                context.endpoint: frozenset(_queried(context.dependant))
                 for context in iter_route_contexts(self.routes)
+                if isinstance(context.original_route, APIRoute)
             }
         return self._arguments.get(endpoint, frozenset())
 
     def openapi(self) -> dict[str, Any]:
-        """Return the description; made once."""
-        if self.openapi_schema is not None:
+        """Return the description; made once, while others who ask wait for it: half made it is not to be seen."""
+        with self._describing:
+            if self.openapi_schema is None:
+                self.openapi_schema = self._described()
             return self.openapi_schema
+
+    def _described(self) -> dict[str, Any]:
         description = super().openapi()
         for context in iter_route_contexts(self.routes):
             routes = description["paths"].get(context.path_format, {})
@@ -74,6 +76,11 @@ def only_known_arguments(request: Request) -> None:
     ]
     if faults:
         raise RequestValidationError(faults)
+
+
+def _queried(dependant: Dependant) -> set[str]:
+    """Names of the query arguments of a route, those of what it depends on included."""
+    return {one.alias for one in dependant.query_params}.union(*map(_queried, dependant.dependencies))
 
 
 def _restore(described: dict[str, Any], declared: dict[int | str, dict[str, Any]]) -> None:

@@ -18,7 +18,7 @@ from service.stream.transport import Link
 
 PLACE = "demo/lab"
 ALARM = "data-gap"
-_PAUSE_S = 0.01
+_PAUSE_S = 0.02
 
 
 def say(what: object) -> None:

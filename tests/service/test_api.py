@@ -2,6 +2,8 @@
 
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from time import sleep
 
 import httpx
 import pytest
@@ -15,6 +17,7 @@ from rotorwatch.records.history import AlarmEventList, AuditList, ReadingList, R
 from rotorwatch.records.machines import DetectableChanges, MachineConfiguration, MachineDescription, MachineList
 from rotorwatch.records.monitor import Alive, Readiness
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
+from service.api.description import DescribedApp
 from service.runtime import Runtime
 from service.stream.worker import MachineWorker
 from tests.service.live import START_NS
@@ -262,6 +265,18 @@ def test_spectra_and_orbits(http: httpx.Client) -> None:
     assert orbits.path_start_ns is not None
     left_s = START_NS / 1e9 + 92.0 - (orbits.path_start_ns / 1e9 + orbits.pulses_s[-1])
     assert left_s == pytest.approx(60 / 1320, abs=0.001) or 0 <= left_s < 60 / 1320
+
+
+def test_the_description_is_made_once_and_seen_whole_by_all_who_ask_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def finish(made: dict[str, object]) -> None:
+        sleep(0.05)  # for as long as it is not whole, others ask
+        made["times finished"] = int(str(made.get("times finished", 0))) + 1
+
+    monkeypatch.setattr("service.api.description.share_problems", finish)
+    app = DescribedApp(title="described")
+    with ThreadPoolExecutor(8) as callers:
+        seen = list(callers.map(lambda _: dict(app.openapi()), range(8)))
+    assert [one.get("times finished") for one in seen] == [1] * 8
 
 
 def test_service_routes(http: httpx.Client) -> None:

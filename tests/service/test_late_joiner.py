@@ -16,8 +16,8 @@ from service.history.records import Retention
 from service.history.store import Store
 from tests.service.live import ROOT, endpoint, until
 
-KILLS = int(os.environ.get("ROTORWATCH_KILLS", "12"))
-MONITOR_KILLS = 3
+KILLS = int(os.environ.get("ROTORWATCH_KILLS", "8"))
+MONITOR_KILLS = 1
 
 
 @contextmanager
