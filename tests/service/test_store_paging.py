@@ -51,7 +51,7 @@ def within(times: Sequence[int], since: int | None, until: int | None) -> list[i
     ]
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(times=TIMES, cuts=st.lists(st.integers(0, 25), max_size=3), since=BOUND, until=BOUND, limit=LIMIT)
 def test_pages_are_everything_once(
     store: Store, times: list[int], cuts: list[int], since: int | None, until: int | None, limit: int
