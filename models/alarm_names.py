@@ -46,10 +46,10 @@ ALARMS: Mapping[str, AlarmKind] = MappingProxyType(
             "something has changed that no parameter describes, or a sensor is at fault",
         ),
         CHANGED: AlarmKind(
-            "changed, not sure what",
+            "changed, not certain what",
             "machine",
             "what has changed has a name, or nothing has changed any more",
-            "several parameters explain it",
+            "what has changed is not certain yet",
         ),
         SHAPE: AlarmKind(
             "vibration changed",

@@ -199,6 +199,10 @@ def test_a_name_needs_to_be_as_good_as_certain() -> None:
     assert judged([SURE | {"c_by": 0.6}] * 3) == ["raised c_bz"]  # one name is there: the other is waited for
 
 
+def test_what_has_its_alarm_raises_no_other_when_it_becomes_less_sure() -> None:
+    assert judged([SURE] * 3 + [NOT_SURE] * 6) == ["raised c_bz"]
+
+
 def test_what_is_not_sure_gets_its_name_as_soon_as_it_is() -> None:
     assert judged([NOT_SURE] * 3 + [SURE] * 6) == ["raised changed", "raised c_bz", "cleared changed"]
 

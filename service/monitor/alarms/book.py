@@ -134,8 +134,9 @@ class AlarmBook:
                     note="" if reading.vector is None else reading.vector.text,
                 )
         if verdict.current:
-            # Outside the model no candidate need be right, and `model` says so.
-            nameless = set() if sure or verdict.outside_model else named
+            # Outside the model no candidate need be right, and `model` says so; and one cause has one alarm.
+            told = verdict.outside_model or any(self.present(name) for name in probability)
+            nameless = set() if sure or told else named
             changes = [
                 (abs(one.relative_change or 0.0), self._settings.for_parameter(one.name))
                 for one in verdict.current
