@@ -21,7 +21,7 @@ from service.analysis.figures.style import Look
 from service.analysis.orbit import phase_lag_deg, read_orbits
 from service.analysis.recorded import Recorded
 from service.analysis.spectrum import read_spectrum, read_waterfall, shown_as
-from service.analysis.trend import read_trend, trend_of
+from service.analysis.trend import Trend, read_trend, trend_of
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
 from simulator.scenario import load_scenario, parse_fault
@@ -45,6 +45,13 @@ def lines(faulty: Path) -> list[dict[str, object]]:
     source = RecordingSource([faulty])
     OfflineReplay(source, LAB.keys, install(LAB, "lab"), lambda line: found.append(json.loads(line))).run()
     return found
+
+
+@pytest.fixture(scope="module")
+def computed(faulty: Path) -> Trend:
+    """Its trend, computed from the samples."""
+    source = RecordingSource([faulty])
+    return read_trend(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1))
 
 
 def reports_of(lines: list[dict[str, object]]) -> list[Report]:
@@ -275,10 +282,8 @@ def test_no_full_window_is_said(faulty: Path) -> None:
         latest_window(Recorded(source, LAB.keys, source.start_ns, START_NS + 30 * S), LAB)
 
 
-def test_a_computed_trend_is_that_of_the_reports(faulty: Path, lines: list[dict[str, object]]) -> None:
-    source = RecordingSource([faulty])
-    reports = reports_of(lines)
-    found = read_trend(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1))
+def test_a_computed_trend_is_that_of_the_reports(computed: Trend, lines: list[dict[str, object]]) -> None:
+    found, reports = computed, reports_of(lines)
     assert found.end_ns.tolist() == [report.end_ns for report in reports]
     assert found.states == tuple(report.state for report in reports)
     assert found.limits == LAB.alarms
@@ -313,7 +318,7 @@ def test_a_trend_of_a_publisher_that_was_started_again_earlier_shows_the_later_r
 
 
 def test_a_trend_of_recorded_reports_needs_no_samples(
-    tmp_path: Path, faulty: Path, lines: list[dict[str, object]]
+    tmp_path: Path, computed: Trend, lines: list[dict[str, object]]
 ) -> None:
     """Recorded reports are shown as they are; a machine file asks for new ones, and needs the samples."""
     messages = []
@@ -322,17 +327,19 @@ def test_a_trend_of_recorded_reports_needs_no_samples(
         messages.append(RecordedMessage(str(line["topic"]), text, b"", "application/json", START_NS + number, START_NS))
     messages.append(RecordedMessage(LAB.keys.report, b"{}", b"", "application/json", START_NS + 1000, START_NS))
     path = write(tmp_path / "reports.mcap", [*messages, *messages[:3]])
-    source, samples = RecordingSource([path]), RecordingSource([faulty])
+    source = RecordingSource([path])
     keys = source.machine(reports=True)
     assert keys == LAB.keys
     recorded = read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1))
-    computed = read_trend(Recorded(samples, keys, samples.start_ns, samples.end_ns + 1))
     assert (recorded.origin, recorded.limits) == ("as recorded", LAB.alarms)
     assert recorded.end_ns.tolist() == computed.end_ns.tolist()
     assert [alarm.time_ns for alarm in recorded.alarms] == [alarm.time_ns for alarm in computed.alarms]
     for one, other in zip(recorded.parameters, computed.parameters, strict=True):
         np.testing.assert_array_equal(one.change, other.change)
         np.testing.assert_array_equal(one.high, other.high)
+    levels = read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1), levels=True)
+    assert (levels.parameters, levels.levels[0].title) == ((), "y1   um pp")  # instead of parameters
+    assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in levels.levels)
     with pytest.raises(RotorwatchError, match="no sample blocks to compute them from"):
         read_trend(Recorded(source, keys, source.start_ns, source.end_ns + 1), "lab")
     with pytest.raises(MachineFileError, match="machines with reports or sample blocks: demo/lab"):
@@ -346,10 +353,3 @@ def test_a_trend_of_nothing_says_what_was_looked_for(faulty: Path) -> None:
     bare = [Report.model_validate(example(Report) | {"levels": [], "parameters": [], "verdict": None, "reason": ""})]
     with pytest.raises(RotorwatchError, match=r"neither parameter nor level was read .*: 1 reports, while the window"):
         trend_of(bare, (), None, "as recorded")
-
-
-def test_levels_are_shown_instead_of_parameters_where_they_are_asked_for(faulty: Path) -> None:
-    source = RecordingSource([faulty])
-    found = read_trend(Recorded(source, LAB.keys, source.start_ns, source.end_ns + 1), levels=True)
-    assert (found.parameters, found.levels[0].title) == ((), "y1   um pp")
-    assert all(np.isfinite(one.level).all() and np.isnan(one.danger).all() for one in found.levels)

@@ -16,7 +16,9 @@ from rotorwatch.records.health import Health, Report
 from service.terminal.lines import alarm_event_line, alarm_state_lines, health_line, report_line
 from simulator.scenario import parse_fault
 from tests.service.live import (
+    PATIENT,
     ROOT,
+    SHORT,
     Feed,
     endpoint,
     machine_file,
@@ -165,7 +167,7 @@ def test_help_shows_the_names_of_tables() -> None:
 
 def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
     address = endpoint()
-    file = machine_file(tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"))
+    file = machine_file(tmp_path, PATIENT, *SHORT)
     watching = ("service.rotorwatch", "watch", "--connect", address, "--windows")
     with (
         service(address, file, when_full="wait") as (runtime, worker),
@@ -176,11 +178,11 @@ def test_watch_and_status_show_an_alarm(tmp_path: Path) -> None:
         assert calm.returncode == 0
         assert "warming" in calm.stdout
         until(lambda: "state is warming" in text.output() and "/health" in lines.output(), "watchers at work")
-        send(address, scenario_blocks(77.0, parse_fault("k_bz=-0.3@0")), worker.machine)
+        send(address, scenario_blocks(37.0, parse_fault("k_bz=-0.3@0")), worker.machine)
         text.wait_for("ALERT: bearing stiffness, vertical (k_bz) changed by −")
         until(lambda: "org.rotorwatch.alarm.raised" in lines.output(), "alarm event as JSON")
-        until(lambda: "00:01:12  demo/lab  alert" in text.output(), "line of the last window")
-        assert "00:01:02  demo/lab  " in text.output()
+        until(lambda: "00:00:32  demo/lab  alert" in text.output(), "line of the last window")
+        assert "00:00:22  demo/lab  " in text.output()
         assert not [line for line in text.output().splitlines() if "healthy" in line and "changed: " in line]
 
         late = program(tmp_path, "service.rotorwatch", "watch", "--connect", address)

@@ -61,7 +61,7 @@ class Topics:
 def test_live_says_exactly_what_the_monitor_says_offline_and_silence_clears_nothing(tmp_path: Path) -> None:
     file = machine_file(tmp_path, SHORT_SILENCE)
     machine = load_machine(file)
-    stream = scenario_blocks(85.0, parse_fault("c_bz=0.5@0"))
+    stream = scenario_blocks(70.0, parse_fault("c_bz=0.5@0"))
     offline = MachineMonitor(install(machine, "lab"))
     reports = [offline.step(block) for block in stream]
     windows = tuple(window for report in reports for window in report.windows)
