@@ -258,7 +258,7 @@ def program(
     within: tuple[str, ...] = (),
     **environment: str,
 ) -> Iterator[Program]:
-    """Run ``python -m ARGUMENTS`` from the checkout, or elsewhere in an environment of its own, `alone`.
+    """Run ``python -m ARGUMENTS`` from the checkout or elsewhere; `alone` is an environment of its own.
 
     The words `within` come before the command. It is gone when the block is left.
     """
@@ -267,7 +267,7 @@ def program(
     variables = {**({**os.environ, **_ALONE} if alone is None else alone), "COLUMNS": "200", **environment}
     process: subprocess.Popen[bytes] | Preloaded
     with out.open("wb") as out_file, err.open("wb") as err_file:
-        if within or alone is not None:
+        if within:
             process = subprocess.Popen(
                 [*within, sys.executable, "-m", *arguments],
                 cwd=cwd,

@@ -15,6 +15,7 @@ from service.commands import access as access_commands
 from service.settings.service import HistorySettings
 from tests.service.guarded import Guarded, guarded
 from tests.service.live import ROOT, endpoint, program
+from tests.service.preloaded import ran
 
 
 @pytest.fixture
@@ -192,12 +193,11 @@ def test_the_hint_knows_where_the_history_is_and_shows_no_password(
 def test_status_says_why_a_token_is_refused(tmp_path: Path) -> None:
     with guarded(tmp_path) as monitor, monitor.client() as client:
         wanted = client.get("/").json()["detail"]
-        asked = [sys.executable, "-m", "service.rotorwatch", "status", "--url", monitor.url]
         wrong = "rw_000000000000_" + 43 * "0"
         plain = {name: value for name, value in os.environ.items() if name != "ROTORWATCH_TOKEN"}
-        without = subprocess.run(asked, cwd=ROOT, env=plain, capture_output=True, text=True, check=False)
-        mistaken = subprocess.run(
-            asked, cwd=ROOT, env=plain | {"ROTORWATCH_TOKEN": wrong}, capture_output=True, text=True, check=False
+        without, mistaken = (
+            ran("service.rotorwatch", "status", "--url", monitor.url, environment=plain | more)
+            for more in ({}, {"ROTORWATCH_TOKEN": wrong})
         )
     assert (without.returncode, mistaken.returncode) == (4, 4)
     assert wanted in without.stderr

@@ -123,7 +123,10 @@ def test_of_two_runs_the_later_one_is_shown(twice: Path) -> None:
     assert ((fall.start_ns - START_NS) / S).tolist() == [0, 5, 10, 15, 20]
 
 
-@pytest.mark.parametrize("kind", ["spectrum", "orbit", "waterfall"])
+@pytest.mark.parametrize(
+    "kind",
+    ["orbit", pytest.param("spectrum", marks=pytest.mark.long), pytest.param("waterfall", marks=pytest.mark.long)],
+)
 def test_pictures_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
     where = ("--at", "31") if kind != "waterfall" else ("--from", "8", "--to", "31")
     seconds = () if kind == "orbit" else ("--window", "4")

@@ -109,7 +109,7 @@ def raised(monitor: MachineMonitor) -> set[str]:
 
 def test_two_publishers_on_one_key_are_named() -> None:
     monitor = MachineMonitor(install(LAB, None))
-    ours = scenario_blocks(75.0)
+    ours = scenario_blocks(68.0)
     theirs = [replace(one, run=2, samples=one.samples[::-1].copy()) for one in ours]
     for number, (a, b) in enumerate(zip(ours, theirs, strict=True)):
         monitor.step_payload(*encode_block(a, ""))
@@ -276,13 +276,13 @@ def test_a_flood_of_bad_messages_costs_no_good_block(tmp_path: Path) -> None:
         thread = threading.Thread(target=flood)
         thread.start()
         try:
-            for _ in range(80):
+            for _ in range(30):
                 feed.put_good()
                 stop.wait(0.1)  # a block is a tenth of a second
         finally:
             stop.set()
             thread.join()
-        until(lambda: worker.health().quality.accepted_blocks == 80, "all good blocks")
+        until(lambda: worker.health().quality.accepted_blocks == 30, "all good blocks")
         health = worker.health()
         assert (health.quality.gaps, health.quality.queue_dropped_blocks) == (0, 0)
         assert sum(health.quality.refused_blocks.values()) > 1000  # how many come through is the network's affair
@@ -370,7 +370,7 @@ def test_what_others_say_in_the_monitors_name_stays_on_the_network(tmp_path: Pat
         token.undeclare()  # type: ignore[no-untyped-call]
 
 
-DURATION_S = 74.0
+DURATION_S = 68.0
 SEED = 7_730_001
 
 
@@ -390,7 +390,7 @@ def watched(name: str, kind: Foreign, seed: int) -> tuple[list[Report], set[str]
 
 def judge(name: str, kind: Foreign, seed: int) -> None:
     windows, raised = watched(name, kind, seed)
-    assert len(windows) >= 3
+    assert len(windows) >= 2
     assert not raised & set(PARAMETERS)
     assert raised
     assert all(alarm == MODEL or alarm.startswith(DATA) for alarm in raised)

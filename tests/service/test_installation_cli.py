@@ -98,7 +98,7 @@ def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     address = endpoint()
     with publishing(tmp_path, address, 120, 2.0):
-        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "5")
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "sampling rate 2560 Hz, expected 2560" in done.stdout
     assert "DE-H 0.057" in done.stdout
@@ -120,7 +120,7 @@ def test_the_doctor_says_what_is_wrong(tmp_path: Path) -> None:
     run(*FAN, "--folder", str(tmp_path))
     address = endpoint()
     with publishing(tmp_path, address, 120, 2.0, rate_hz=2000.0):
-        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "5")
+        done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
     assert done.returncode == 1
     assert "rate_hz" in done.stdout
     assert "blocks would be refused" in done.stdout

@@ -235,7 +235,7 @@ def test_a_dead_sensor_elsewhere_is_told_and_the_rotor_is_diagnosed_as_before() 
     )
     rig = LAB.model_copy(update={"sensors": (*LAB.sensors, casing)})
     monitor, alone = MachineMonitor(install(rig, None)), MachineMonitor(install(LAB, None))
-    for block in scenario_blocks(92.0):
+    for block in scenario_blocks(72.0):
         wider = np.pad(block.samples.astype(np.float32), ((0, 0), (0, 1)))
         monitor.step(replace(block, samples=wider))
         alone.step(block)
