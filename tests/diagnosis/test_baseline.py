@@ -79,8 +79,8 @@ def test_little_healthy_data_widens_every_interval_and_they_still_hold() -> None
 
 @pytest.mark.slow
 def test_sensor_noise_does_not_bias() -> None:
-    clean = BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 3, noise=1e-4)))
-    noisy = recorded(ROTOR, OTHER, 2, 3, noise=0.05, noise_memory_s=0.002)
+    clean = BaselineDiagnostician(learn_baseline(recorded(ROTOR, Excitation(), 1, 2, noise=1e-4)))
+    noisy = recorded(ROTOR, OTHER, 2, 2, noise=0.05, noise_memory_s=0.002)
     z = np.array([[z_of(clean.diagnose(window))[name] for name in parameters_of()[:4]] for window in noisy])
     assert np.all(np.abs(z.mean(axis=0)) < 2), z
 

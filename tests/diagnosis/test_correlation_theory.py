@@ -36,14 +36,14 @@ def condition() -> Scenario:
 
 @pytest.fixture(scope="module")
 def windows(condition: Scenario) -> list[WindowStatistics]:
-    return [simulated(condition, SEED + number) for number in range(16)]
+    return [simulated(condition, SEED + number) for number in range(12)]
 
 
 @pytest.mark.slow
 def test_correlation_functions_agree_with_theory(condition: Scenario, windows: list[WindowStatistics]) -> None:
-    """Sixteen independent windows: every correlation at every lag within 5.5 standard errors of their mean.
+    """Twelve independent windows: every correlation at every lag within 5.5 standard errors of their mean.
 
-    8064 correlated comparisons with t-distributed deviations of 15 degrees of freedom: 5.5 is exceeded once in ten
+    8064 correlated comparisons with t-distributed deviations of 11 degrees of freedom: 5.5 is exceeded twice in ten
     thousand runs of a single one, so a handful may be; 0.1 % of them.
     """
     speed = next(event.speed_rpm for event in condition.events if event.speed_rpm is not None) * 2 * np.pi / 60
@@ -52,7 +52,7 @@ def test_correlation_functions_agree_with_theory(condition: Scenario, windows: l
     index = [STATE_INDEX[name] for name in windows[0].states]
     theory = np.stack([correlation(A, R0, lag)[np.ix_(index, index)] for lag in windows[0].lags_s])
     estimates = np.stack([window.correlation for window in windows])
-    error = estimates.std(axis=0, ddof=1) / 4
+    error = estimates.std(axis=0, ddof=1) / np.sqrt(12)
     deviation = np.abs(estimates.mean(axis=0) - theory) / error
     assert np.mean(deviation > 5.5) < 1e-3
     scale = np.sqrt(np.diagonal(R0)[index])
@@ -66,7 +66,7 @@ def test_synchronous_vectors_agree_with_theory(condition: Scenario, windows: lis
     index = [STATE_INDEX[name] for name in windows[0].states]
     expected = (q1 - 1j * q2)[index]
     found = np.stack([window.synchronous for window in windows if window.synchronous is not None])
-    error = np.sqrt(np.var(found, axis=0, ddof=1) / 16)
+    error = np.sqrt(np.var(found, axis=0, ddof=1) / 12)
     assert np.all(np.abs(found.mean(axis=0) - expected) < 5 * error)
     assert np.all(error < 0.05 * np.abs(expected))
     assert windows[0].speed_rad_s == pytest.approx(speed, rel=1e-6)
@@ -74,7 +74,7 @@ def test_synchronous_vectors_agree_with_theory(condition: Scenario, windows: lis
 
 @pytest.mark.slow
 def test_errors_fall_with_the_square_root_of_time(windows: list[WindowStatistics]) -> None:
-    """Spread of a 60 s estimate against that of its 5 s parts: √12, within what 16 · 12 values can tell (± 30 %)."""
+    """Spread of a 60 s estimate against that of its 5 s parts: √12, within what 12 · 12 values can tell (± 30 %)."""
     whole = np.stack([window.correlation for window in windows]).std(axis=0, ddof=1)
     parts = np.stack([window.hop_correlation for window in windows])
     inner = np.sqrt(parts.var(axis=1, ddof=1).mean(axis=0))

@@ -1,5 +1,6 @@
 """Each fault of a sensor is found, named where it can be, and healthy sensors are left alone."""
 
+import itertools
 from dataclasses import replace
 from functools import cache
 
@@ -84,10 +85,15 @@ def only(findings: tuple[SensorFault, ...]) -> SensorFault:
     return findings[0]
 
 
-@pytest.mark.parametrize("name", ["lab", "heavy", "light"])
-@pytest.mark.parametrize("one_source", [False, True])
+@pytest.mark.parametrize(
+    ("name", "one_source"),
+    [
+        *itertools.product(("lab", "heavy"), (False, True)),
+        *(pytest.param("light", one_source, marks=pytest.mark.long) for one_source in (False, True)),
+    ],
+)
 def test_healthy_sensors_are_left_alone_under_any_excitation(name: str, one_source: bool) -> None:
-    for window in windows_of(plan_of(name), recorded(name, 31, 2, one_source=one_source)):
+    for window in windows_of(plan_of(name), recorded(name, 31, one_source=one_source)):
         assert sensor_findings(window) == ()
         assert sensor_findings(window, reference_of(name)) == ()
 
@@ -111,14 +117,14 @@ def test_a_channel_that_shows_only_its_quantisation_is_dead() -> None:
 
 
 def test_a_shaft_angle_that_does_not_turn_is_named() -> None:
-    samples = recorded("lab", 2).copy()
+    samples = recorded("lab", 1).copy()
     samples[80_000:, -1] = samples[80_000, -1]
     assert ("theta",) in [finding.states for finding in found_in(samples) if finding.kind == "stuck"]
 
 
 def test_steps_of_a_converter_are_no_fault() -> None:
     """Sixteen bits over a range ten times the motion, and twelve."""
-    samples = recorded("lab", 3).copy()
+    samples = recorded("lab", 1).copy()
     for step_parts in (2**16 / 20, 2**12 / 20):
         step = samples[:, :8].std(axis=0) / step_parts
         coarse = samples.copy()
@@ -128,7 +134,7 @@ def test_steps_of_a_converter_are_no_fault() -> None:
 
 @pytest.mark.parametrize("deviations", [1.5, 2.0])
 def test_a_clipped_sensor_is_named(deviations: float) -> None:
-    samples = recorded("lab", 4).copy()
+    samples = recorded("lab", 1).copy()
     x = samples[:, column("y2")]
     limit = deviations * x.std()
     assert np.mean(np.abs(x) > limit) > 0.02
@@ -139,7 +145,7 @@ def test_a_clipped_sensor_is_named(deviations: float) -> None:
 
 
 def test_a_step_of_the_mean_is_an_offset_and_a_slow_drift_is_allowed() -> None:
-    samples, at = recorded("lab", 5).copy(), column("z1")
+    samples, at = recorded("lab", 1).copy(), column("z1")
     rms = samples[:, at].std()
     samples[:, at] += np.linspace(0, 1.5 * rms, len(samples))
     assert found_in(samples) == ()
@@ -152,7 +158,7 @@ def test_a_step_of_the_mean_is_an_offset_and_a_slow_drift_is_allowed() -> None:
 
 
 def test_an_offset_from_the_start_needs_the_reference_and_a_moved_shaft_is_none() -> None:
-    samples, at = recorded("lab", 5).copy(), column("y1")
+    samples, at = recorded("lab", 1).copy(), column("y1")
     samples[:, at] += 1e-3
     assert found_in(samples) == ()
     assert only(found_in(samples, reference_of("lab"))).kind == "offset"
@@ -162,7 +168,7 @@ def test_an_offset_from_the_start_needs_the_reference_and_a_moved_shaft_is_none(
 
 @pytest.mark.parametrize(("state", "gain"), [("y1", 0.9), ("z2", 1.2), ("y2_dot", 0.8), ("z1_dot", 0.9)])
 def test_a_wrong_gain_is_measured_and_the_pair_named(state: str, gain: float) -> None:
-    samples = recorded("lab", 6).copy()
+    samples = recorded("lab", 1).copy()
     samples[:, column(state)] *= gain
     place = state.partition("_")[0]
     finding = only(found_in(samples))
@@ -176,8 +182,8 @@ def test_sensors_that_always_disagreed_are_healthy_and_a_new_gain_is_the_channel
     """Commissioned with a velocity 4 % too large and 0.2 ms late; then the displacement loses a tenth."""
     usual = np.ones(9)
     usual[column("y1_dot")] = 1.04
-    reference = learn_sensor_reference(windows_of(plan_of("lab"), recorded("lab", 7, 3) * usual))
-    samples = recorded("lab", 8).copy() * usual
+    reference = learn_sensor_reference(windows_of(plan_of("lab"), recorded("lab", 900, 2) * usual))
+    samples = recorded("lab", 1).copy() * usual
     assert found_in(samples, reference) == ()
     samples[:, column("y1")] *= 0.8
     findings = found_in(samples, reference)
@@ -186,7 +192,7 @@ def test_sensors_that_always_disagreed_are_healthy_and_a_new_gain_is_the_channel
 
 
 def test_a_gain_that_drifts_within_the_window_is_found_and_put_down_to_its_channel() -> None:
-    samples = recorded("lab", 9).copy()
+    samples = recorded("lab", 1).copy()
     samples[:, column("y2")] *= np.linspace(1, 0.7, len(samples))
     finding = only(found_in(samples))
     assert finding.kind == "gain"
@@ -195,7 +201,7 @@ def test_a_gain_that_drifts_within_the_window_is_found_and_put_down_to_its_chann
 
 @pytest.mark.parametrize(("state", "late"), [("y1", 1), ("z2_dot", 2), ("z1", 10)])
 def test_a_delayed_sensor_is_named_with_its_delay(state: str, late: int) -> None:
-    samples = recorded("lab", 10).copy()
+    samples = recorded("lab", 1).copy()
     samples[late:, column(state)] = samples[:-late, column(state)]
     finding = only(found_in(samples))
     assert (finding.kind, finding.states) == ("delay", (state,))
@@ -204,18 +210,18 @@ def test_a_delayed_sensor_is_named_with_its_delay(state: str, late: int) -> None
 
 @pytest.mark.parametrize(("one", "other"), [("y1", "z1"), ("y1", "y2"), ("y2_dot", "z2_dot")])
 def test_swapped_channels_are_found_and_the_reference_tells_which(one: str, other: str) -> None:
-    samples = recorded("lab", 11).copy()
+    samples = recorded("lab", 1).copy()
     samples[:, [column(one), column(other)]] = samples[:, [column(other), column(one)]]
     finding = only(found_in(samples))
     assert finding.kind == "swapped"
     assert {one, other} < set(finding.states)
     assert len(finding.states) == 4
-    reference = learn_sensor_reference(windows_of(plan_of("lab"), recorded("lab", 12)))
+    reference = learn_sensor_reference(windows_of(plan_of("lab"), recorded("lab", 900, 2)))
     assert {one, other} <= implicated(found_in(samples, reference))
 
 
 def test_a_sensor_that_shows_something_else_is_not_believed() -> None:
-    samples = recorded("lab", 13).copy()
+    samples = recorded("lab", 1).copy()
     rng = np.random.default_rng(0)
     samples[:, column("z1_dot")] = samples[:, column("z1_dot")].std() * rng.standard_normal(len(samples))
     finding = only(found_in(samples))
@@ -252,7 +258,7 @@ def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() ->
     """Found where the 1x part stands out enough, and never put down to another channel."""
     plan, columns = displacements_only()
     found: list[float] = []
-    for seed in range(23, 28):
+    for seed in (1, 23, 24):
         samples = recorded("lab", seed)[:, columns].copy()
         (healthy,) = windows_of(plan, samples)
         assert sensor_findings(healthy) == ()
@@ -261,7 +267,7 @@ def test_with_displacements_alone_a_gain_that_jumps_in_one_channel_is_found() ->
         findings = sensor_findings(window)
         assert implicated(findings) <= {plan.states[1]}
         found += [finding.value or 0.0 for finding in findings]
-    assert len(found) >= 2
+    assert len(found) >= 1
     np.testing.assert_allclose(found, -0.3, atol=0.1)
 
 

@@ -61,7 +61,7 @@ def windows_of(name: str, samples: FloatArray, *, displacements: bool = False) -
 @cache
 def reference_of(name: str, *, displacements: bool = False) -> SensorReference:
     """Learned with one source: what moves the machine later is another matter."""
-    samples = recorded(name, 900, 3, directions=1)
+    samples = recorded(name, 900, 2, directions=1)
     return learn_sensor_reference(windows_of(name, samples, displacements=displacements))
 
 
@@ -124,14 +124,14 @@ def test_of_two_sensors_of_a_motion_the_noisy_one_is_named_with_its_noise(state:
 
 def test_with_one_sensor_for_each_motion_noise_is_found_where_it_lies_over_the_machine() -> None:
     for state in ("y2", "z2"):
-        finding = only(found_in(with_noise(recorded("lab", 921), state, 0.8), displacements=True))
+        finding = only(found_in(with_noise(recorded("lab", 920), state, 0.8), displacements=True))
         assert (finding.kind, finding.states) == ("noise", (state,))
         assert finding.value == pytest.approx(in_band(0.8), rel=0.3)
 
 
 @pytest.mark.parametrize("displacements", [False, True])
 def test_mains_hum_in_one_channel_is_noise(displacements: bool) -> None:
-    finding = only(found_in(with_hum(recorded("lab", 922), "z2", 0.08), displacements=displacements))
+    finding = only(found_in(with_hum(recorded("lab", 920), "z2", 0.08), displacements=displacements))
     assert (finding.kind, finding.states) == ("noise", ("z2",))
     assert finding.value == pytest.approx(0.08, rel=0.25)
     assert ("50 Hz" in finding.text) == displacements
@@ -141,12 +141,12 @@ def test_mains_hum_in_one_channel_is_noise(displacements: bool) -> None:
     ("line_hz", "hums"), [(50.1, True), (60.0, True), (100.2, True), (3 * 22.0, False), (87.3, False), (37.0, False)]
 )
 def test_a_line_that_one_sensor_sees_is_the_mains_or_the_machines(line_hz: float, hums: bool) -> None:
-    found = found_in(with_hum(recorded("lab", 924), "z2", 0.1, line_hz), displacements=True)
+    found = found_in(with_hum(recorded("lab", 920), "z2", 0.1, line_hz), displacements=True)
     assert [(one.kind, one.states) for one in found] == ([("noise", ("z2",))] if hums else [])
 
 
 def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() -> None:
-    samples = recorded("lab", 922).copy()
+    samples = recorded("lab", 920).copy()
     t_s = np.arange(len(samples)) / machine_of("lab").rate_hz
     for place, size in zip(DISPLACEMENTS, (0.05, 0.1, 0.15, 0.1), strict=True):
         samples[:, column(place)] += size * samples[:, column(place)].std() * np.sin(2 * np.pi * 50 * t_s)
@@ -154,7 +154,7 @@ def test_a_line_that_the_machine_shows_in_all_channels_is_none_of_a_sensors() ->
 
 
 def test_noise_that_rises_in_all_channels_is_no_single_sensors() -> None:
-    samples = recorded("lab", 923)
+    samples = recorded("lab", 920)
     assert only(found_in(with_noise(samples, "y1", 0.25))).kind == "noise"
     for state in plan_of("lab").states:
         samples = with_noise(samples, state, 0.25, seed=column(state))
@@ -162,14 +162,13 @@ def test_noise_that_rises_in_all_channels_is_no_single_sensors() -> None:
 
 
 def test_a_little_more_noise_is_not_worth_a_finding() -> None:
-    assert found_in(with_noise(recorded("lab", 924), "y1", 0.04)) == ()
+    assert found_in(with_noise(recorded("lab", 920), "y1", 0.04)) == ()
 
 
 CHANGES = {"k_by": -0.25, "c_by": -0.5, "e": 1.0}
 
 
-@pytest.mark.parametrize("at_s", [0.0, 31.0])
-@pytest.mark.parametrize("parameter", list(CHANGES))
+@pytest.mark.parametrize(("parameter", "at_s"), [("k_by", 31.0), ("c_by", 31.0), ("e", 31.0), ("e", 0.0)])
 def test_a_fault_of_the_machine_is_none_of_its_sensors(parameter: str, at_s: float) -> None:
     event = Event(at_s=at_s, parameter=parameter, relative_change=CHANGES[parameter])
     samples = recorded("lab", 925, events=(event,))
@@ -239,7 +238,7 @@ def jittering(theta: FloatArray) -> FloatArray:
 def test_a_wrong_shaft_angle_is_named(
     spoilt: Callable[[FloatArray], FloatArray], kind: str, value: float, displacements: bool
 ) -> None:
-    samples = recorded("lab", 926).copy()
+    samples = recorded("lab", 920).copy()
     samples[:, -1] = np.mod(spoilt(np.unwrap(samples[:, -1])), 2 * np.pi)
     finding = only(found_in(samples, displacements=displacements))
     assert (finding.kind, finding.states) == (kind, ("theta",))

@@ -75,7 +75,7 @@ repetitions = st.lists(st.tuples(st.integers(0, 10_000), st.integers(0, 80)), ma
 N = 40
 
 
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(lateness(N), repetitions)
 def test_reordering_and_repetition_change_nothing(late: list[int], again: list[tuple[int, int]]) -> None:
     stream = [block(number) for number in range(N)]
@@ -87,7 +87,7 @@ def test_reordering_and_repetition_change_nothing(late: list[int], again: list[t
 
 
 @pytest.mark.slow
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(lateness(N), repetitions, st.sets(st.integers(1, N - 1), max_size=12))
 def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tuple[int, int]], lost: set[int]) -> None:
     whole = [block(number) for number in range(N)]
@@ -97,7 +97,7 @@ def test_of_missing_blocks_nothing_else_is_lost(late: list[int], again: list[tup
 
 
 @pytest.mark.slow
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(
     lateness(3 * N),
     repetitions,
@@ -144,7 +144,7 @@ def test_any_block_may_be_repeated_anywhere() -> None:
             assert accepted(ordered(arriving)) == expected, (which, after)
 
 
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(lateness(N), repetitions, st.lists(st.integers(0, N), max_size=3))
 def test_restarts_of_the_monitor_change_nothing(
     late: list[int], again: list[tuple[int, int]], stops: list[int]
@@ -167,7 +167,7 @@ def test_restarts_of_the_monitor_change_nothing(
     assert found == accepted(stream)
 
 
-@settings(max_examples=120)
+@settings(max_examples=60)
 @given(
     st.lists(
         st.tuples(st.integers(0, 12), st.integers(0, 2), st.integers(-30, 30), st.sampled_from([0, 1, 2**64 - 2])),
