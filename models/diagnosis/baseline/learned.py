@@ -14,7 +14,7 @@ from models.diagnosis.baseline.lag_moments import (
     row_window,
     shared_covariance,
 )
-from models.diagnosis.baseline.relation import Contribution, Relation, RowChange, change_of, lags_of, learn_row
+from models.diagnosis.baseline.relation import Contribution, Relation, RowChange, beyond_memory, change_of, learn_row
 from models.diagnosis.baseline.rows import ROWS, Row, not_measured, state_of
 from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
 from models.diagnosis.window import WindowStatistics
@@ -227,18 +227,14 @@ def _learn(
     if reason:
         return None, [], reason
     try:
-        relation, contributions = learn_row(row, _moments(row, windows, states))
+        references = references_of(states)
+        prepared: list[RowWindow] = [row_window(row, window, states, references) for window in windows]
+        relation, contributions = learn_row(row, *beyond_memory(row, prepared))
     except EstimationError as error:
         return None, [], str(error)
     except np.linalg.LinAlgError:
         return None, [], f"{row.title}: the healthy recording does not determine it; a channel may hardly move"
     return relation, contributions, ""
-
-
-def _moments(row: Row, windows: Sequence[WindowStatistics], states: tuple[str, ...]) -> list[LagMoments]:
-    references = references_of(states)
-    prepared: list[RowWindow] = [row_window(row, window, states, references) for window in windows]
-    return [one.beyond(lag) for one, lag in zip(prepared, lags_of(row, prepared), strict=True)]
 
 
 def references_of(states: tuple[str, ...]) -> tuple[str, ...]:

@@ -234,21 +234,27 @@ def _start(row: Row, parts: Sequence[LagMoments]) -> FloatArray:
     return b
 
 
-def lags_of(row: Row, windows: Sequence[RowWindow]) -> list[float]:
-    """Shortest lag of every window, beyond its excitation's memory, from first fits.
+def beyond_memory(row: Row, windows: Sequence[RowWindow]) -> tuple[list[LagMoments], tuple[Fit, Fit] | None]:
+    """Moments of every window beyond its excitation's memory, from first fits; and what `fit_row` makes of them.
 
     The colour of the force is known as well as the relation is. Of the fits without and with the optional terms the one
-    that remembers longer is believed, twice.
+    that remembers longer is believed, twice. None if the moments have changed since the last fit.
     """
-    parts = [window.beyond(LAG_FROM_S) for window in windows]
-    lags = [0.0] * len(windows)
+    parts, lags, used = (
+        [window.beyond(LAG_FROM_S) for window in windows],
+        [0.0] * len(windows),
+        [LAG_FROM_S] * len(windows),
+    )
     for _ in range(_LAG_ROUNDS):
-        for fit in fit_row(row, parts):
+        fits = fit_row(row, parts)
+        for fit in fits:
             combination = np.concatenate([[1.0], -fit.coefficients])
             found = [lag_beyond_memory(window, combination) for window in windows]
             lags = [max(one, other) for one, other in zip(lags, found, strict=True)]
-        parts = [window.beyond(lag) for window, lag in zip(windows, lags, strict=True)]
-    return lags
+        if lags == used:
+            return parts, fits
+        parts, used = [window.beyond(lag) for window, lag in zip(windows, lags, strict=True)], lags
+    return parts, None
 
 
 def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
@@ -258,13 +264,17 @@ def fit_row(row: Row, parts: Sequence[LagMoments]) -> tuple[Fit, Fit]:
     return _fit(parts, full.coefficients, _prior(row, start, minimal=True)), full
 
 
-def learn_row(row: Row, parts: Sequence[LagMoments], *, widened: bool = True) -> tuple[Relation, list[Contribution]]:
+def learn_row(
+    row: Row, parts: Sequence[LagMoments], fits: tuple[Fit, Fit] | None = None, *, widened: bool = True
+) -> tuple[Relation, list[Contribution]]:
     """Learn the relation of a row.
 
     Parameters
     ----------
     parts : sequence of LagMoments
         One of each healthy window; windows do not overlap, each is in one condition, they may differ from each other.
+    fits : tuple of Fit, optional
+        What `fit_row` makes of them, where that is known.
     widened : bool
         Whether the covariance is widened to what the windows object to (`flatness`), which takes most of the time.
 
@@ -276,7 +286,7 @@ def learn_row(row: Row, parts: Sequence[LagMoments], *, widened: bool = True) ->
     # Without the optional terms where that fits; their uncertainty counts in either case. With one source, y2 - y1 and
     # the disc's acceleration can take each other's place, and the estimate wanders along that direction further than
     # its covariance says, to where the terms' own noise hides the misfit.
-    minimal, full = fit_row(row, parts)
+    minimal, full = fit_row(row, parts) if fits is None else fits
     chosen, covariance = full, full.covariance
     prior = _prior(row, _start(row, parts), minimal=False)
     if minimal.fits:
