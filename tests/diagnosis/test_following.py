@@ -43,36 +43,26 @@ def values(diagnosis: Diagnosis) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.slow
-def test_a_followed_window_reads_what_a_search_reads() -> None:
-    for layout in Layout:
-        _, windows = slid(layout)
-        assert len(windows) == 7
-        following, searching = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB)
-        for window in windows:
-            (followed, followed_error), (searched, error) = (
-                values(fit.diagnose(window)) for fit in (following, searching)
-            )
-            assert np.all(np.abs(followed - searched) < 0.7 * error)  # each is converged to 0.15 errors
-            np.testing.assert_allclose(followed_error, error, rtol=0.1)
-
-
-def test_a_stretch_without_news_is_read_at_a_glance() -> None:
-    for layout in Layout:
-        window, windows = slid(layout)
-        fit = LikelihoodFit(LAB, follow=True)
-        for full in windows:
-            fit.diagnose(full)
-        for hops in (2, 4, 7):
-            stretch = window.statistics(hops)
-            assert stretch is not None
-            seen = fit.glance(stretch)
-            assert seen is not None
-            assert seen.misfit_z is None
-            near = LikelihoodFit(LAB)
-            near.start_near(fit)
-            (glanced, glanced_error), (searched, error) = values(seen), values(near.diagnose(stretch))
-            assert np.all(np.abs(glanced - searched) < 0.8 * error)
-            np.testing.assert_allclose(glanced_error, error, rtol=0.15)
+@pytest.mark.parametrize("layout", [Layout.ONE_SOURCE, pytest.param(Layout.INDEPENDENT, marks=pytest.mark.long)])
+def test_followed_or_at_a_glance_a_window_reads_what_a_search_reads(layout: Layout) -> None:
+    sliding, windows = slid(layout)
+    assert len(windows) == 7
+    following, searching = LikelihoodFit(LAB, follow=True), LikelihoodFit(LAB)
+    for window in windows:
+        (followed, followed_error), (searched, error) = (values(fit.diagnose(window)) for fit in (following, searching))
+        assert np.all(np.abs(followed - searched) < 0.7 * error)  # each is converged to 0.15 errors
+        np.testing.assert_allclose(followed_error, error, rtol=0.1)
+    for hops in (2, 4, 7):
+        stretch = sliding.statistics(hops)
+        assert stretch is not None
+        seen = following.glance(stretch)
+        assert seen is not None
+        assert seen.misfit_z is None
+        near = LikelihoodFit(LAB)
+        near.start_near(following)
+        (glanced, glanced_error), (searched, error) = values(seen), values(near.diagnose(stretch))
+        assert np.all(np.abs(glanced - searched) < 0.8 * error)
+        np.testing.assert_allclose(glanced_error, error, rtol=0.15)
 
 
 def test_news_is_not_read_at_a_glance() -> None:

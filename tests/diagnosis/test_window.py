@@ -308,18 +308,14 @@ def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank(measured: b
     """15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""
     plan = plan_for(LAB, lagged=False)
     plan = plan if measured else without_angle(plan)
-    z, misfit = [], []
-    for seed in (40, 41):
-        samples = run_of_lab(seed, 0.15)
-        (window,) = feed(SlidingWindow(plan), samples if measured else samples[:, :-1])
-        assert window.removed_by_hop
-        assert window.speed_source == ("phase reference" if measured else "estimated")
-        assert window.speed_range[1] / window.speed_range[0] > 1.12
-        diagnosis = LikelihoodFit(LAB).diagnose(window)
-        z.append([reading.z for reading in diagnosis.parameters[:4]])
-        misfit.append(diagnosis.misfit_z)
-    assert np.all(np.abs(np.mean(np.array(z, dtype=float), axis=0)) < 3 / np.sqrt(2)), z
-    assert np.all(np.array(misfit, dtype=float) < 4), misfit
+    samples = run_of_lab(40, 0.15)
+    (window,) = feed(SlidingWindow(plan), samples if measured else samples[:, :-1])
+    assert window.removed_by_hop
+    assert window.speed_source == ("phase reference" if measured else "estimated")
+    assert window.speed_range[1] / window.speed_range[0] > 1.12
+    diagnosis = LikelihoodFit(LAB).diagnose(window)
+    assert all(abs(reading.z or 99.0) < 3 for reading in diagnosis.parameters[:4])
+    assert (diagnosis.misfit_z or 0.0) < 4
 
 
 @pytest.mark.slow

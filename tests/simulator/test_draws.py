@@ -53,10 +53,10 @@ def test_another_excitation_changes_nothing_else(excitation: Excitation) -> None
 
 
 def test_a_drifting_level_doubles_or_halves_the_vibration() -> None:
-    """Twelve windows of independent seeds: rms of the last over that of the first tenth, about (0.5 or 2)^0.9."""
+    """Six windows of independent seeds: rms of the last over that of the first tenth, about (0.5 or 2)^0.9."""
     machine = LAB.model_copy(update={"rotor": LAB.rotor.model_copy(update={"e_m": 1e-9})})
     ends = []
-    for number in range(12):
+    for number in range(6):
         scenario = draw_condition(_plain(excitation=Excitation.DRIFT), number)
         # Forces as drawn, without unbalance or sensor noise: what is left is the excitation's level.
         quiet = scenario.model_copy(update={"sensors": scenario.sensors.model_copy(update={"noise_relative": 0.0})})

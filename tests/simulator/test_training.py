@@ -28,7 +28,7 @@ SEED = 7_700_003
 LAB = load_machine("lab")
 SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
 """Most of the time of a training goes into simulating its windows."""
-DRAWS = 400
+DRAWS = 240
 """Of which a training makes eight batches."""
 
 
