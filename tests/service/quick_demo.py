@@ -6,5 +6,5 @@ from service.commands import demo
 from service.rotorwatch import app
 
 if __name__ == "__main__":
-    demo._HEALTHY_S, demo._BROKEN_S, demo._REPAIRED_S = 70.0, 45.0, 65.0
+    demo._HEALTHY_S, demo._BROKEN_S, demo._REPAIRED_S = 65.0, 45.0, 45.0
     app(["demo", *sys.argv[1:]])

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,7 @@ def test_a_running_speed_in_the_machine_file_is_followed_in_the_vibration() -> N
     assert [one.x1 for one in health.latest.levels] == pytest.approx([0.4 / np.sqrt(2), 1.1 / np.sqrt(2)], rel=0.02)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_a_machine_that_doubles_after_its_first_windows_raises_the_alarm_of_its_channel(seed: int) -> None:
     monitor = MachineMonitor(install(FAN, None))
     _, events = run(monitor, blocks(seed, 140, growth=(90.0, 2.0)))
@@ -139,11 +140,19 @@ def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
         assert book.present("level:DE-H") == raised, level
 
 
+@cache
+def grown() -> tuple[SampleBlock, ...]:
+    return tuple(blocks(5, 100, growth=(85.0, 3.0)))
+
+
+@cache
+def straight() -> tuple[list[str], list[tuple[EventKind, str, float]]]:
+    return run(MachineMonitor(install(FAN, None)), iter(grown()))
+
+
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit(whole: bool) -> None:
-    straight = MachineMonitor(install(FAN, None))
-    expected = run(straight, blocks(5, 100, growth=(85.0, 3.0)))
-    stream = list(blocks(5, 100, growth=(85.0, 3.0)))
+    stream = grown()
     first = MachineMonitor(install(FAN, None))
     before = run(first, iter(stream[:90]))
     state = first.state(whole=whole)
@@ -154,7 +163,7 @@ def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit(whole: bool) -> Non
         for number, block in enumerate(stream[:90]):
             second._window.recall(block.samples, block.start_ns, newest=number == 89)
     after = run(second, iter(stream[90:]))
-    assert (before[0] + after[0], before[1] + after[1]) == expected
+    assert (before[0] + after[0], before[1] + after[1]) == straight()
 
 
 def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
