@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -188,16 +189,27 @@ def check_sources(windows: Mapping[str, Sequence[WindowStatistics]]) -> Check:
     alone = [recording for recording, own in windows.items() if own and all(one_source(window) for window in own)]
     if len(alone) < len(windows):
         return told(verdict="passed", text="several independent forces move the machine")
-    if len(alone) > 1:
+    if not _alike([windows[name] for name in alone]):
         text = f"one source moves everything in each of {len(alone)} recordings; together they can tell more"
         return told(verdict="passed", text=text)
+    where = "in the only recording" if len(alone) == 1 else f"in the same way in all {len(alone)} recordings"
     return told(
         verdict="limited",
-        text="one source moves everything, in the only recording: what else holds the shaft cannot be told "
+        text=f"one source moves everything, {where}: what else holds the shaft cannot be told "
         "for certain, and some later readings may be off by more than their intervals say",
         advice="add a recording of another condition: another speed or load, or a day on which something else shakes "
         "the machine",
     )
+
+
+def _alike(recordings: Sequence[Sequence[WindowStatistics]]) -> bool:
+    """Whether recordings with one source each have it in common: at one speed, all their windows look like one."""
+    speeds = [window.speed_rad_s for own in recordings for window in own if np.isfinite(window.speed_rad_s)]
+    if speeds and max(speeds) > (1 + SAME_SPEED) * min(speeds):
+        return False
+    # As loud as each other, so that none decides alone.
+    spectra = [window.spectrum / np.einsum("fii->", window.spectrum).real for own in recordings for window in own]
+    return one_source(replace(recordings[0][0], spectrum=np.mean(spectra, axis=0)))
 
 
 def check_determined(reasons: Sequence[str], *, only_shapes: bool = False) -> Check:

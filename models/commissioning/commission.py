@@ -19,7 +19,7 @@ from models.commissioning.commissioned import (
     knowledge_of,
 )
 from models.commissioning.healthy import HealthyRecording
-from models.commissioning.levels import LEVELS, Learned, Piece, Progress, pieces_of
+from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, Learned, Piece, Progress, pieces_of
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.networks.equations import EQUATIONS, missing
 from models.diagnosis.readings import Diagnosis
@@ -302,12 +302,10 @@ _ONLY_LEVELS = Check(
 
 
 def _not_learned(level: KnowledgeLevel, text: str) -> Check:
-    return Check(
-        name="can be learned",
-        verdict="refused",
-        text=f"at level {level}: {text}",
-        advice="record longer, at more than one speed or load, and while more than the unbalance moves the machine",
-    )
+    advice = "record longer, at more than one speed or load, and while more than the unbalance moves the machine"
+    if level is KnowledgeLevel.PARTIAL:
+        advice += f"; {NO_SUCH_ROTOR}"
+    return Check(name="can be learned", verdict="refused", text=f"at level {level}: {text}", advice=advice)
 
 
 def _report(

@@ -115,6 +115,12 @@ def _learn_full(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
     return Learned((check,), read, read, machine, notes=_integrated(pieces, machine))
 
 
+NO_SUCH_ROTOR = (
+    "where the machine is not one bearing and an overhung disc, leave [rotor] out of the machine file: it is then "
+    "compared with its own healthy windows"
+)
+
+
 def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
     windows = [piece.window for piece in pieces]
     identified = identify(machine, windows, partial(progress, "identifying the rotor"))
@@ -128,6 +134,8 @@ def _learn_partial(machine: MachineFile, pieces: Sequence[Piece], progress: Prog
         machine=filled, names=identified.names, covariance=tuple(tuple(row) for row in identified.covariance.tolist())
     )
     check = check_agreement([each for _, _, each in read], "the identified rotor")
+    if check.verdict == "refused":
+        check = check.model_copy(update={"advice": f"{check.advice}; {NO_SUCH_ROTOR}"})
     notes = _integrated(pieces, identified.machine)
     return Learned((check,), read, read, identified.machine, record, notes=notes)
 
