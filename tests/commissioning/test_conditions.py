@@ -1,9 +1,12 @@
 """Several healthy recordings: one baseline where they agree, one for each speed where the bearing depends on it."""
 
+from functools import cache
+
 import pytest
 
 from models.commissioning.commission import Commissioning
 from models.commissioning.commissioned import Installed
+from models.commissioning.healthy import HealthyRecording
 from rotorwatch.records.windows import Parameter
 from service.monitor.evaluation import Evaluation, evaluator_for
 from simulator.scenario import Event
@@ -14,10 +17,14 @@ FAST = 1.15 * SLOW
 LENGTH_S = 45.0
 
 
+@cache
+def recorded(name: str, seed: int, *events: Event) -> HealthyRecording:
+    return recording(NOTHING, stream(LENGTH_S, seed, *events), name)
+
+
 def made_of(*conditions: tuple[str, int, tuple[Event, ...]]) -> Commissioning:
     """Commission on recordings: name, seed, and what makes them differ."""
-    recordings = [recording(NOTHING, stream(LENGTH_S, seed, *events), name) for name, seed, events in conditions]
-    return commissioned(NOTHING, *recordings)
+    return commissioned(NOTHING, *(recorded(name, seed, *events) for name, seed, events in conditions))
 
 
 def at(speed_rpm: float) -> Event:
@@ -74,7 +81,7 @@ def test_a_bearing_that_depends_on_the_speed_has_a_baseline_for_each() -> None:
 @pytest.mark.slow
 def test_recordings_that_differ_at_one_speed_are_refused() -> None:
     softer = Event(at_s=0.0, parameter="k_by", relative_change=-0.3)
-    made = made_of(("monday.mcap", 91, (at(SLOW),)), ("friday.mcap", 92, (at(SLOW), softer)))
+    made = made_of(("slow.mcap", 91, (at(SLOW),)), ("friday.mcap", 92, (at(SLOW), softer)))
     assert made.commissioned is None
     verdict, text = verdict_of(made)
     assert verdict == "refused"

@@ -290,7 +290,7 @@ states = st.builds(
 )
 
 
-@settings(max_examples=60, suppress_health_check=[HealthCheck.data_too_large])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.data_too_large])
 @given(states)
 def test_the_state_of_the_sequential_test_is_restored_exactly(state: SequentialState) -> None:
     hops = [from_bytes(to_bytes(hop_arrays(came))) for _, came in sorted(state.hops().items())]
@@ -326,7 +326,7 @@ of_any_kind: st.SearchStrategy[np.ndarray] = st.one_of([arrays_of.arrays(kind, s
 named = st.dictionaries(st.text("abcdefghij_/.file", min_size=1, max_size=12), of_any_kind, max_size=5)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(named)
 def test_arrays_come_back_as_they_were(arrays: dict[str, np.ndarray]) -> None:
     data = to_bytes(arrays)
@@ -344,7 +344,7 @@ def test_how_an_array_lies_in_memory_is_kept() -> None:
     assert not again.flags.c_contiguous
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(st.data())
 def test_damaged_bytes_are_refused(data: st.DataObject) -> None:
     whole = to_bytes({"level": np.arange(5.0), "names": np.array(["y1", "z1"])})

@@ -446,7 +446,7 @@ def test_names_that_would_break_a_key_are_refused(name: str) -> None:
         MachineKeys("demo", name)
 
 
-@given(name=st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", fullmatch=True))
+@pytest.mark.parametrize("name", ["a", "7", "Z-", "0_x-9", "Pump_7-north", "q" * 64])
 def test_plain_names_are_accepted(name: str) -> None:
     assert MachineKeys(name, name).root == f"{PREFIX}/{name}/{name}"
 
