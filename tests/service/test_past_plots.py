@@ -91,7 +91,7 @@ def run(*arguments: str | Path) -> tuple[int, str]:
     return found.exit_code, found.output
 
 
-@pytest.mark.parametrize("kind", ["trend", "bode", "polar", "centreline"])
+@pytest.mark.parametrize("kind", ["trend", "polar", "centreline"])
 def test_pictures_of_the_history(settings: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "picture.png"
     code, said = run(kind, "--history", settings, "--out", out)

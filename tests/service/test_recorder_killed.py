@@ -18,7 +18,7 @@ from tests.service.live import LAB, Program, endpoint, program, until
 from tests.service.preloaded import ran
 
 KEY = LAB.keys.stream
-ROUNDS, BESIDE = 2, 5
+ROUNDS, BESIDE = 2, 3
 WINDOW = 100  # most messages that the sender is ahead of what the slowest recorder has called safe
 CHUNK_BYTES = 256 * 1024 + 20_000  # a chunk ends with the message that fills it
 NS = 1_000_000_000
