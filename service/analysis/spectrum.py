@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import welch
 
 from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
@@ -373,6 +372,8 @@ def summed_power(
     int
         How many segments.
     """
+    from scipy.signal import welch  # noqa: PLC0415  # slow to import; only for these spectra
+
     overlap = segment // 2
     count = (samples.shape[0] - overlap) // (segment - overlap)
     _, mean = welch(
