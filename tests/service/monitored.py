@@ -30,7 +30,7 @@ M = TypeVar("M", bound=BaseModel)
 
 @contextmanager
 def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtime, MachineWorker]]:
-    """The lab machine without a third of its horizontal bearing stiffness, 92 s of data, alarms after 10 s."""
+    """The lab machine without a third of its horizontal bearing stiffness, 78 s of data, alarms after 10 s."""
     address = endpoint()
     file = machine_file(
         folder,
@@ -42,8 +42,8 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
     recording = plan.recording.model_copy(update={"directory": folder / "recordings"})
     with running(plan.model_copy(update={"access": access, "recording": recording})) as runtime:
         worker = runtime.machines()[0]
-        send(address, scenario_blocks(92.0, parse_fault("k_by=-0.33@0")), load_machine(file))
-        until(lambda: worker.health().quality.accepted_blocks == 920, "all blocks")
+        send(address, scenario_blocks(78.0, parse_fault("k_by=-0.33@0")), load_machine(file))
+        until(lambda: worker.health().quality.accepted_blocks == 780, "all blocks")
         yield runtime, worker
 
 

@@ -107,7 +107,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         ("[operation]", "[ingest]\nno_data_after_s = 3600.0\n\n[operation]"),
     )
     scenario, machine = load_scenario("healthy")
-    scenario = scenario.overridden(duration_s=80.0, seed=3, faults=(parse_fault("k_by=-0.33@5"),))
+    scenario = scenario.overridden(duration_s=70.0, seed=3, faults=(parse_fault("k_by=-0.33@5"),))
     names = {getattr(KEYS, name): name for name in DOCUMENT["channels"] if name != "alarm_log"}
 
     def take(key: str, text: bytes) -> None:
@@ -123,7 +123,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         )
         plan = PublishSettings(link=link, pace=None, wait_for_subscriber_s=20.0, linger_s=0.0, drain_s=20.0)
         publish(load_machine(file), blocks(scenario, machine, start_ns=START_NS, run=1), plan)
-        until(lambda: worker.health().quality.accepted_blocks == 800, "all blocks")
+        until(lambda: worker.health().quality.accepted_blocks == 700, "all blocks")
         until(lambda: len(found.get("alarm_event", [])) == worker.alarms().sequence + 1 > 0, "alarm events")
         until(lambda: len(found.get("report", [])) == worker.tally.windows, "reports")
         for name, selector in (

@@ -29,7 +29,7 @@ from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
 from service.runtime import Runtime
 from service.stream.worker import MachineWorker
-from tests.service.live import LAB, Feed, endpoint, open_session, service, until
+from tests.service.live import LAB, Feed, endpoint, machine_file, open_session, service, until
 
 HASH = LAB.descriptor.schema_hash
 
@@ -99,9 +99,14 @@ BAD: dict[str, tuple[Reason, Callable[[Feed], None], str]] = {
 
 
 @pytest.fixture(scope="module")
-def fed() -> Iterator[tuple[Runtime, MachineWorker, Feed]]:
+def fed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Runtime, MachineWorker, Feed]]:
     address = endpoint()
-    with service(address) as (runtime, worker), open_session(address) as session:
+    # What is missing is waited for no longer than silence may last.
+    quick = ("[operation]", "[ingest]\nno_data_after_s = 1.0\nblock_to_s = 0.5\n\n[operation]")
+    with (
+        service(address, machine_file(tmp_path_factory.mktemp("machine"), quick)) as (runtime, worker),
+        open_session(address) as session,
+    ):
         feed = Feed(session)
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks > 0, "first block")

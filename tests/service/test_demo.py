@@ -18,7 +18,7 @@ from simulator.scenario import load_scenario
 from tests.service.live import ROOT, Program, endpoint, program, until
 from tests.service.preloaded import ran
 
-HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "80"))
+HEALTHY_S = int(os.environ.get("ROTORWATCH_HEALTHY_S", "75"))
 WHOLE, QUICK = ("service.rotorwatch", "demo"), ("tests.service.quick_demo",)
 
 
@@ -43,6 +43,10 @@ def demo(folder: Path, *arguments: str) -> Iterator[Program]:
     with program(folder, *arguments, *paced, TMPDIR=str(folder / "tmp"), COLUMNS="100") as one:
         yield one
     assert list((folder / "tmp").iterdir()) == []
+
+
+def none_is_left(processes: list[int]) -> None:
+    until(lambda: not any(Path(f"/proc/{process}").exists() for process in processes), "the end of all", 120)
 
 
 def check_lines(output: str) -> None:
@@ -95,7 +99,11 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
             one.wait_for("(e) changed by")
             watch.stop(signal.SIGINT)
         assert "(c_bz) changed by" in watch.output()
-        assert one.stop(signal.SIGINT) == 130
+        children = children_of(one.process.pid)
+        os.kill(min(children), signal.SIGKILL)
+        assert one.process.wait(300) == 1
+        assert "the monitor was killed (SIGKILL)" in one.errors()
+        none_is_left(children)
     output = one.output()
     check_lines(output)
     assert output.index("c_bz by −30%") < output.index("demo passed") < output.index("repaired") < output.index("e by")
@@ -103,25 +111,25 @@ def test_the_machine_is_repaired_and_breaks_again_while_others_look_on(tmp_path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "whose", "code"),
+    ("number", "code", "running"),
     [
-        pytest.param(signal.SIGINT, "demo", 130, marks=pytest.mark.long),
-        pytest.param(signal.SIGTERM, "demo", 130, marks=pytest.mark.long),
-        pytest.param(signal.SIGKILL, "demo", -signal.SIGKILL, marks=pytest.mark.long),
-        (signal.SIGKILL, "monitor", 1),
+        (signal.SIGINT, 130, 1),
+        *(
+            pytest.param(number, code, 2, marks=pytest.mark.long)
+            for number, code in ((signal.SIGINT, 130), (signal.SIGTERM, 130), (signal.SIGKILL, -signal.SIGKILL))
+        ),
     ],
 )
 def test_however_the_demo_ends_it_leaves_nothing_behind(
-    number: signal.Signals, whose: str, code: int, tmp_path: Path
+    number: signal.Signals, code: int, running: int, tmp_path: Path
 ) -> None:
+    """While the monitor starts, and later beside the simulator."""
     with demo(tmp_path, *WHOLE) as one:
-        until(lambda: len(children_of(one.process.pid)) == 2, "simulator and monitor")
+        until(lambda: len(children_of(one.process.pid)) == running, "programs")
         children = children_of(one.process.pid)
-        os.kill(one.process.pid if whose == "demo" else min(children), number)
+        one.process.send_signal(number)
         assert one.process.wait(300) == code, one.output()
-        if whose == "monitor":
-            assert "the monitor was killed (SIGKILL)" in one.errors()
-        until(lambda: not [child for child in children if Path(f"/proc/{child}").exists()], "the end of both", 120)
+        none_is_left(children)
 
 
 def test_the_first_line_comes_before_anything_heavy_is_imported() -> None:

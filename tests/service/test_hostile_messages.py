@@ -402,7 +402,9 @@ def judge(name: str, kind: Foreign, seed: int) -> None:
         assert window.verdict is None or not window.verdict.changed
 
 
-@pytest.mark.parametrize("kind", FOREIGN)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.long if kind == "two sines" else ()) for kind in FOREIGN]
+)
 def test_no_parameter_is_blamed_for_what_is_no_rotor(kind: Foreign) -> None:
     judge("lab", kind, SEED)
 
