@@ -159,13 +159,12 @@ def test_readings_are_without_bias_and_their_errors_honest(name: str, layout: La
 @pytest.mark.slow
 def test_a_wrong_gain_and_an_added_mass_are_outside_the_model() -> None:
     machine = load_machine("lab")
-    for number in range(2):
-        gain = Draw(machine, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
-        diagnosis = LikelihoodFit(machine).diagnose(simulate_window(gain, number))
-        assert (diagnosis.misfit_z or 0) > 5
-        assert diagnosis.suspect.startswith("gain of ")
-        mass = Draw(machine, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
-        assert (LikelihoodFit(machine).diagnose(simulate_window(mass, number)).misfit_z or 0) > 3
+    gain = Draw(machine, SEED, Purpose.EVALUATION, 3, anomaly=Anomaly.GAIN_DRIFT)
+    diagnosis = LikelihoodFit(machine).diagnose(simulate_window(gain, 0))
+    assert (diagnosis.misfit_z or 0) > 5
+    assert diagnosis.suspect.startswith("gain of ")
+    mass = Draw(machine, SEED, Purpose.EVALUATION, 4, anomaly=Anomaly.ADDED_MASS)
+    assert (LikelihoodFit(machine).diagnose(simulate_window(mass, 0)).misfit_z or 0) > 3
 
 
 def test_a_warm_start_ends_where_a_cold_one_does() -> None:

@@ -166,7 +166,7 @@ def test_an_offset_from_the_start_needs_the_reference_and_a_moved_shaft_is_none(
     assert found_in(samples, reference_of("lab")) == ()
 
 
-@pytest.mark.parametrize(("state", "gain"), [("y1", 0.9), ("z2", 1.2), ("y2_dot", 0.8), ("z1_dot", 0.9)])
+@pytest.mark.parametrize(("state", "gain"), [("y1", 0.9), ("z2", 1.2), ("y2_dot", 0.8)])
 def test_a_wrong_gain_is_measured_and_the_pair_named(state: str, gain: float) -> None:
     samples = recorded("lab", 1).copy()
     samples[:, column(state)] *= gain
@@ -208,7 +208,7 @@ def test_a_delayed_sensor_is_named_with_its_delay(state: str, late: int) -> None
     assert finding.value == pytest.approx(late / 2000.0, abs=3e-5)
 
 
-@pytest.mark.parametrize(("one", "other"), [("y1", "z1"), ("y1", "y2"), ("y2_dot", "z2_dot")])
+@pytest.mark.parametrize(("one", "other"), [("y1", "y2"), ("y2_dot", "z2_dot")])
 def test_swapped_channels_are_found_and_the_reference_tells_which(one: str, other: str) -> None:
     samples = recorded("lab", 1).copy()
     samples[:, [column(one), column(other)]] = samples[:, [column(other), column(one)]]

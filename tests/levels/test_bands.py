@@ -83,8 +83,8 @@ def test_lines_that_move_with_the_speed_have_not_grown() -> None:
 
 
 def test_healthy_windows_raise_nothing() -> None:
-    """400 windows of 110 bands; at six standard errors chance raises none."""
-    raised = sum(grown(noise(1000 + n) + line(48.7, 1.0) + line(97.4, 0.3), HEALTHY)[0] != "normal" for n in range(400))
+    """200 windows of 110 bands; at six standard errors chance raises none."""
+    raised = sum(grown(noise(1000 + n) + line(48.7, 1.0) + line(97.4, 0.3), HEALTHY)[0] != "normal" for n in range(200))
     assert raised == 0
 
 

@@ -159,7 +159,7 @@ def test_calibration_finds_the_true_size_of_the_errors() -> None:
     shipped = load_bundle("lab", LAB).amortised
     assert shipped is not None
     draws = (Draw(LAB, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
-    held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(5)] for draw in draws]
+    held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(6)] for draw in draws]
     calibrated = calibrate_networks(LAB, replace(shipped, calibration={}), held_out)
     assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
     assert all(0.1 < scale < 8 for one in calibrated.calibration.values() for scale in one.z_scale)
