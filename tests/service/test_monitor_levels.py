@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -140,30 +139,20 @@ def test_an_alarm_stays_in_the_deadband_and_clears_below_it() -> None:
         assert book.present("level:DE-H") == raised, level
 
 
-@cache
-def grown() -> tuple[SampleBlock, ...]:
-    return tuple(blocks(5, 100, growth=(85.0, 3.0)))
-
-
-@cache
-def straight() -> tuple[list[str], list[tuple[EventKind, str, float]]]:
-    return run(MachineMonitor(install(FAN, None)), iter(grown()))
-
-
-@pytest.mark.parametrize("whole", [True, False])
-def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit(whole: bool) -> None:
-    stream = grown()
+def test_a_monitor_that_is_restarted_goes_on_to_the_last_bit() -> None:
+    stream = list(blocks(5, 100, growth=(85.0, 3.0)))
+    expected = run(MachineMonitor(install(FAN, None)), iter(stream))
     first = MachineMonitor(install(FAN, None))
     before = run(first, iter(stream[:90]))
-    state = first.state(whole=whole)
-    second = MachineMonitor(install(FAN, None))
-    second.restore(state.state, tuple(data for _, data in state.new_parts))
-    second.restore_alarms(state.alarms)
-    if not whole:
-        for number, block in enumerate(stream[:90]):
+    for whole in (True, False):
+        state = first.state(whole=whole)
+        second = MachineMonitor(install(FAN, None))
+        second.restore(state.state, tuple(data for _, data in state.new_parts))
+        second.restore_alarms(state.alarms)
+        for number, block in enumerate(() if whole else stream[:90]):
             second._window.recall(block.samples, block.start_ns, newest=number == 89)
-    after = run(second, iter(stream[90:]))
-    assert (before[0] + after[0], before[1] + after[1]) == straight()
+        after = run(second, iter(stream[90:]))
+        assert (before[0] + after[0], before[1] + after[1]) == expected, whole
 
 
 def test_commissioned_levels_are_the_reference_and_say_what_is_unchanged(tmp_path: Path) -> None:
