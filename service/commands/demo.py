@@ -24,7 +24,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import cycle, islice
 from pathlib import Path
@@ -247,7 +247,14 @@ class _Show:
                 simulator.must_run()
                 monitor.must_run()
                 continue
-            if self._tell(message) and (reason := self._end_of_round()) is not None:
+            try:
+                ended = self._tell(message)
+            except httpx.TransportError as error:  # it may have died since it sent this
+                with suppress(subprocess.TimeoutExpired):
+                    monitor.process.wait(_STOP_S)
+                monitor.must_run()
+                raise DemoError(f"the monitor does not answer at {self._base}: {error}") from error
+            if ended and (reason := self._end_of_round()) is not None:
                 return not reason
         self._console.print(f"{_ROUNDS} faults were shown: stopping")
         return True
