@@ -286,7 +286,7 @@ def main() -> int:
     with monitor(folder, 1024, settings, *publish) as one:
         watch, sender = Watch(one, outcome), Sender(one.endpoint)
         grammar = Grammar(options.seed, load_machine("lab"), *map(load_machine, others))
-        count = 1500 if options.small else options.messages
+        count = 3000 if options.small else options.messages
         messages(outcome, grammar, options.first, count, sender, watch, folder)
         sender.close()
         outcome.faults += watch.finish()

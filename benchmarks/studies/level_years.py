@@ -20,7 +20,16 @@ from benchmarks.studies.results import Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from models.levels.bands import band_edges
 from models.levels.judgement import LevelJudge
-from models.levels.measures import ORDERS, HopLevels, LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
+from models.levels.measures import (
+    NYQUIST_PART,
+    ORDERS,
+    HopLevels,
+    LevelPlan,
+    WindowLevels,
+    hop_levels,
+    level_plan,
+    window_levels,
+)
 from models.levels.reference import learn_levels
 from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
@@ -29,8 +38,6 @@ from rotorwatch.records.levels import ChannelLevels
 _LENGTH_S, _HOP_S = 60.0, 5.0
 """A machine file's own, if it says nothing."""
 _HOPS = round(_LENGTH_S / _HOP_S)
-_USED = 0.8
-"""Part of the spectrum that has bands, as `models.levels.measures` has it."""
 _DAY_S = 86400.0
 _KIND = replace(KINDS[VARYING], rate_hz=1280.0)
 _COMPARED = ("overall", "x1", "x2", "bands")
@@ -72,7 +79,9 @@ class Drawing:
         n, to_si = round(_HOP_S * rate_hz), np.array([one.to_si for one in sensors])
         taper = np.hanning(n + 1)[:-1]
         scale = 2 / (n * float(taper @ taper))
-        edges = np.append(band_edges(n, _USED), int(_USED * (n // 2)) + 1)  # and what is left of the band of velocities
+        edges = np.append(
+            band_edges(n, NYQUIST_PART), int(NYQUIST_PART * (n // 2)) + 1
+        )  # and what is left of the band of velocities
         bins = np.arange(edges[-1])
         poles, rms = scene.poles, scene.noise * to_si
 

@@ -48,7 +48,7 @@ COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
 _HIGH_HZ = 1000.0
-_NYQUIST_PART = 0.8
+NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
 _MANY_REVOLUTIONS = 8.0
 _HANN_BINS = 1.5
@@ -88,7 +88,7 @@ class LevelPlan:
     @property
     def high_hz(self) -> tuple[float, float] | None:
         """The high-frequency band of accelerometers; None where the sampling rate allows none."""
-        end_hz = _NYQUIST_PART * self.rate_hz / 2
+        end_hz = NYQUIST_PART * self.rate_hz / 2
         return (_HIGH_HZ, end_hz) if end_hz >= 2 * _HIGH_HZ else None
 
     def columns(self, *quantities: Quantity) -> npt.NDArray[np.intp]:
@@ -121,7 +121,7 @@ def level_plan(
     return LevelPlan(
         rate_hz,
         tuple(one.quantity for one in channels),
-        (low, min(high, _NYQUIST_PART * rate_hz / 2)),
+        (low, min(high, NYQUIST_PART * rate_hz / 2)),
         tuple(pairs),
         tuple(_skew(channels[first], channels[second]) for first, second in pairs),
         runout if runout is not None and np.any(runout) else None,
@@ -220,7 +220,7 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     if casing.size:
         accelerations = (plan.columns(Quantity.ACCELERATION)[:, None] == casing).any(axis=0)
         sums[5:, casing] = _band_squares(plan, spectrum[casing], n_samples, accelerations)
-    edges = band_edges(n_samples, _NYQUIST_PART)
+    edges = band_edges(n_samples, NYQUIST_PART)
     within = spectrum[:, : edges[-1]]
     bands = scale * np.add.reduceat(within.real**2 + within.imag**2, edges[:-1], axis=1)
     radius = [
@@ -391,7 +391,7 @@ def window_levels(
     errors = {name: each.std(axis=0) / np.sqrt(max(1, count - 1)) for name, each in by_hop.items()}
     errors |= {name: shown * scatter[number] for number, name in enumerate(ORDERS) if name in COMPARED}
     in_bands = np.sqrt(np.stack([hop.bands for hop in hops]))
-    edges = band_edges(hops[0].n_samples, _NYQUIST_PART) - 0.5  # halfway between bins
+    edges = band_edges(hops[0].n_samples, NYQUIST_PART) - 0.5  # halfway between bins
     bands = BandLevels(
         np.asarray(edges * (plan.rate_hz / hops[0].n_samples), dtype=np.float64),
         np.sqrt((in_bands**2).mean(axis=0)),

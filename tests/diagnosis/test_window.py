@@ -126,7 +126,7 @@ def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[i
 
 
 @pytest.mark.slow
-def test_more_than_a_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
+def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
     """After every block of 100 000 samples the sliding estimate is the batch estimate of the same window."""
     plan = Plan(
         rate_hz=1e4,
@@ -144,7 +144,7 @@ def test_more_than_a_million_samples_with_an_offset_a_million_times_the_fluctuat
         max_span_ns=10**13,
     )
     window, tail, checked = SlidingWindow(plan), np.empty((0, 2)), 0
-    for block in range(14):
+    for block in range(40):
         samples = signal(100_000, block, offset=2e6, angle=False)
         statistics = [*[None], *[window.statistics() for _ in window.feed(samples, round(block * 1e10))]][-1]
         tail = np.concatenate([tail, samples])[-160_000:]
@@ -154,7 +154,7 @@ def test_more_than_a_million_samples_with_an_offset_a_million_times_the_fluctuat
         expected = batch_correlation(plan, tail, end)
         np.testing.assert_allclose(statistics.correlation, expected, atol=1e-9 * expected[0, 0, 0])
         checked += 1
-    assert checked >= 12
+    assert checked >= 38
 
 
 def test_synchronous_part_and_speed_are_recovered_and_removed() -> None:
@@ -308,14 +308,18 @@ def test_readings_stay_unbiased_while_the_speed_goes_through_a_flank(measured: b
     """15 % from below 0.72 to 0.83 of the first resonance, where the 1x amplitude doubles."""
     plan = plan_for(LAB, lagged=False)
     plan = plan if measured else without_angle(plan)
-    samples = run_of_lab(40, 0.15)
-    (window,) = feed(SlidingWindow(plan), samples if measured else samples[:, :-1])
-    assert window.removed_by_hop
-    assert window.speed_source == ("phase reference" if measured else "estimated")
-    assert window.speed_range[1] / window.speed_range[0] > 1.12
-    diagnosis = LikelihoodFit(LAB).diagnose(window)
-    assert all(abs(reading.z or 99.0) < 3 for reading in diagnosis.parameters[:4])
-    assert (diagnosis.misfit_z or 0.0) < 4
+    z, misfit = [], []
+    for seed in (40, 41):
+        samples = run_of_lab(seed, 0.15)
+        (window,) = feed(SlidingWindow(plan), samples if measured else samples[:, :-1])
+        assert window.removed_by_hop
+        assert window.speed_source == ("phase reference" if measured else "estimated")
+        assert window.speed_range[1] / window.speed_range[0] > 1.12
+        diagnosis = LikelihoodFit(LAB).diagnose(window)
+        z.append([reading.z for reading in diagnosis.parameters[:4]])
+        misfit.append(diagnosis.misfit_z)
+    assert np.all(np.abs(np.mean(np.array(z, dtype=float), axis=0)) < 3 / np.sqrt(2)), z
+    assert np.all(np.array(misfit, dtype=float) < 4), misfit
 
 
 @pytest.mark.slow
@@ -330,9 +334,9 @@ def test_one_set_of_coefficients_would_not_do(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "change"), [(50, 0.0), (40, 0.15)])
-def test_the_speed_is_found_without_a_phase_reference(seed: int, change: float) -> None:
-    samples, plan = run_of_lab(seed, change), plan_for(LAB, lagged=False)
+@pytest.mark.parametrize("change", [0.0, 0.1])
+def test_the_speed_is_found_without_a_phase_reference(change: float) -> None:
+    samples, plan = run_of_lab(50, change), plan_for(LAB, lagged=False)
     (known,) = feed(SlidingWindow(plan), samples)
     (found,) = feed(SlidingWindow(without_angle(plan)), samples[:, :-1])
     assert (found.speed_source, found.phase_reference, known.phase_reference) == ("estimated", False, True)

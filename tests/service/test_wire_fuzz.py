@@ -1,4 +1,4 @@
-"""Some thousand messages that no machine sends, against a monitor that is at work."""
+"""A few thousand messages that no machine sends, against a monitor that is at work."""
 
 import json
 import subprocess
@@ -22,8 +22,8 @@ def test_a_monitor_at_work_bears_whatever_is_sent(tmp_path: Path) -> None:
     )
     assert ran.returncode == 0, f"{ran.stdout}\n{ran.stderr}"
     found = json.loads(result.read_text(encoding="utf-8"))
-    assert found["messages"] == 1500
+    assert found["messages"] == 3000
     assert len(found["kinds"]) == 10
     assert found["unsendable"] == 0
-    assert found["others"]["demo/second"]["windows"] > 5
+    assert found["others"]["demo/second"]["windows"] > 10
     assert sum(found["refused"].values()) > 100
