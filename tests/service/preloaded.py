@@ -3,6 +3,7 @@
 Each is a process of its own with its own arguments, environment and output, and runs the program from its first line.
 """
 
+import gc
 import multiprocessing
 import os
 import runpy
@@ -15,7 +16,13 @@ from pathlib import Path
 _ROOT = Path(__file__).parents[2]
 
 _CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(["service.runtime", "simulator.publisher", "models.signals.recording", __name__])
+_CONTEXT.set_forkserver_preload(
+    [
+        *("service.runtime", "service.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
+        *("models.signals.recording", "service.recordings.replay.offline", "service.terminal.stopping"),
+        *("service.history.migrations", "pydantic.v1", "uvicorn.loops.asyncio", "uvicorn.lifespan.off", __name__),
+    ]
+)
 
 
 class Preloaded:
@@ -85,6 +92,7 @@ def ran(
 
 
 def _run(arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]) -> None:
+    gc.freeze()  # looking through what is shared would copy it
     for number, path in ((0, os.devnull), (1, out), (2, err)):
         opened = os.open(path, os.O_RDWR | os.O_APPEND)
         os.dup2(opened, number)
@@ -94,4 +102,5 @@ def _run(arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environmen
     os.environ.update(environment)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     module, *sys.argv[1:] = arguments
+    sys.modules.pop(module, None)
     runpy.run_module(module, run_name="__main__", alter_sys=True)

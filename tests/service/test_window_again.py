@@ -186,7 +186,7 @@ def test_killed_with_recordings_alone_the_window_is_there_and_what_nobody_has_is
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kept", [0, 12])
+@pytest.mark.parametrize("kept", [pytest.param(0, marks=pytest.mark.long), 12])
 def test_killed_where_nobody_has_the_window_it_fills_anew_and_alarms_are_held(tmp_path: Path, kept: int) -> None:
     with plant(tmp_path, recording=False, kept=kept) as here:
         with here.monitor() as first:
