@@ -183,8 +183,9 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, help="how long each attack lasts (70; small: 1.2)")
     options = parser.parse_args()
     small = options.small
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    if not small:
+        _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     names = ("HEAD", "BODY", "SEND")
     timeouts = {f"ROTORWATCH_HTTP__{name}_TIMEOUT_S": "1" for name in names} if small else {}
     seconds = options.seconds or (1.2 if small else 70.0)

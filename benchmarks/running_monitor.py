@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import resource
 import socket
 import subprocess
 import sys
@@ -76,25 +77,29 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
         "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
         **settings,
     }
-    run = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", sys.executable, "-m"]
-    send = [sys.executable, "-m", "simulator.rotorsim", "publish", "--connect", endpoint]
-    send += ["--wait-for-subscriber", "120", *publish]
+    send = ["simulator.rotorsim", "publish", "--connect", endpoint, "--wait-for-subscriber", "120", *publish]
     out, log, published = folder / "out", folder / "log", folder / "published"
-    with out.open("wb") as output, log.open("wb") as errors, published.open("wb") as sent:
-        process = subprocess.Popen(
-            [*run, "service.rotorwatch", "run"], stdout=output, stderr=errors, env=environment, stdin=subprocess.DEVNULL
+    process = started(["service.rotorwatch", "run"], out, log, environment)
+    resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (files, files))
+    publisher = started(send, published, Path(os.devnull), dict(os.environ))
+    try:
+        found = Monitor(process, publisher, _url(process, out, log), endpoint, log, published)
+        while found.blocks()[0] < 20:
+            time.sleep(0.1)
+        yield found
+    finally:
+        for one in (publisher, process):
+            one.terminate()
+        for one in (publisher, process):
+            one.wait(60)
+
+
+def started(arguments: list[str], out: Path, err: Path, environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    """``python -m ARGUMENTS``, with its output in files."""
+    with out.open("wb") as output, err.open("wb") as errors:
+        return subprocess.Popen(
+            [sys.executable, "-m", *arguments], stdout=output, stderr=errors, env=environment, stdin=subprocess.DEVNULL
         )
-        publisher = subprocess.Popen(send, stdout=sent, stderr=subprocess.DEVNULL)
-        try:
-            found = Monitor(process, publisher, _url(process, out, log), endpoint, log, published)
-            while found.blocks()[0] < 20:
-                time.sleep(0.1)
-            yield found
-        finally:
-            for one in (publisher, process):
-                one.terminate()
-            for one in (publisher, process):
-                one.wait(60)
 
 
 def _url(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:

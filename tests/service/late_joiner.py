@@ -2,48 +2,40 @@
 
 ::
 
-    python -m tests.service.late_joiner monitor LISTEN HISTORY      alarm events without end; a line on stdin ends them
-    python -m tests.service.late_joiner followers CONNECT FILE      stdin: start (fork a follower) or wait (for its end)
+    python -m tests.service.late_joiner monitor LISTEN FILE      alarm events until there is such a file
+    python -m tests.service.late_joiner follow CONNECT FILE      writes them to the file
 """
 
 import os
+import signal
 import sys
-import threading
+import time
 from pathlib import Path
 
 from models.signals.link import LinkSettings
 from rotorwatch.client.alarm_log import follow_alarms
 from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.operations import OperationKind
+from service.monitor.alarms.operation import OperatorAction
+from service.settings.service import LogSettings
 from service.stream.transport import Link
+from service.terminal.logs import configure_logging
+from tests.service.live import Feed, open_session, service, until
 
 PLACE = "demo/lab"
 ALARM = "data-gap"
 _PAUSE_S = 0.02
 
 
-def say(what: object) -> None:
+def say(what: str) -> None:
     """Tell the test."""
     sys.stdout.write(f"{what}\n")
     sys.stdout.flush()
 
 
-def followers(connect: str, path: str) -> None:
-    """Start followers on request; forked, because so many fresh interpreters would take minutes."""
-    children: list[int] = []
-    for line in sys.stdin:
-        if line.strip() == "start":
-            child = os.fork()
-            if not child:
-                follow(connect, Path(path))
-                os._exit(1)
-            children.append(child)
-            say(child)
-        else:
-            say(os.waitpid(children.pop(), 0)[1])
-
-
-def follow(connect: str, path: Path) -> None:
+def follow(connect: str, file_name: str) -> None:
     """Append every event to a file; go on after the last complete line of it."""
+    path = Path(file_name)
     kept = path.read_bytes() if path.exists() else b""
     whole = kept[: kept.rfind(b"\n") + 1]
     lines = whole.splitlines()
@@ -62,25 +54,10 @@ def follow(connect: str, path: Path) -> None:
     follow_alarms(Link(LinkSettings(connect=(connect,))).session, [PLACE], {PLACE: last}, keep, ask_every_s=0.5)
 
 
-def monitor(listen: str, history: str) -> None:
+def monitor(listen: str, enough: str) -> None:
     """Run the service; its alarm is taken out of service and put back again and again."""
-    from rotorwatch.records.operations import OperationKind  # noqa: PLC0415  # followers need none of this
-    from service.monitor.alarms.operation import OperatorAction  # noqa: PLC0415  # followers need none of this
-    from service.runtime import running  # noqa: PLC0415
-    from service.settings.service import HistorySettings, HttpSettings, LogSettings, MachineEntry, ServiceSettings  # noqa: PLC0415
-    from service.terminal.logs import configure_logging  # noqa: PLC0415
-    from tests.service.live import OPEN, Feed, open_session, until  # noqa: PLC0415
-
-    settings = ServiceSettings(
-        link=LinkSettings(listen=(listen,)),
-        http=HttpSettings(port=0),
-        history=HistorySettings(url=f"sqlite:///{history}"),
-        access=OPEN,
-        machines=(MachineEntry(file="lab"),),
-    )
     configure_logging(LogSettings(level="error"))
-    with running(settings) as runtime:
-        worker = runtime.machines()[0]
+    with service(listen) as (_, worker):
 
         def state() -> str:
             return next((a.state for a in worker.alarms(include_normal=True).alarms if a.name == ALARM), "")
@@ -95,19 +72,13 @@ def monitor(listen: str, history: str) -> None:
                     feed.put_good()
                 until(lambda: bool(state()), "an alarm")
         say("busy")
-        enough = threading.Event()
-
-        def wait_for_line() -> None:
-            sys.stdin.readline()
-            enough.set()
-
-        threading.Thread(target=wait_for_line, daemon=True).start()
-        while not enough.wait(_PAUSE_S):
+        while not Path(enough).exists():
+            time.sleep(_PAUSE_S)
             kind: OperationKind = "return-to-service" if state() == "out-of-service" else "remove-from-service"
             worker.operate(OperatorAction(kind, ALARM, "test", "as often as it goes"))
-        say(f"idle after {worker.alarms().sequence}")
-        sys.stdin.readline()
+        say(f"idle after {worker.alarms().sequence}.")
+        signal.pause()
 
 
 if __name__ == "__main__":
-    {"monitor": monitor, "followers": followers}[sys.argv[1]](*sys.argv[2:])
+    {"monitor": monitor, "follow": follow}[sys.argv[1]](*sys.argv[2:])
