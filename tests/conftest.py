@@ -69,6 +69,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ranks = {name: rank for rank, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: (ranks.get(item.path.stem, len(ranks)), -tests[item.path]))
     gc.freeze()  # what is imported by now stays to the end: nobody need look through it again and again
+    gc.set_threshold(10_000, 20, 20)  # nor through what comes later all the time, 5 % of the computing
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -23,7 +23,7 @@ from sqlalchemy.pool import StaticPool
 
 from service.history.file import HistoryFile, is_damage
 from service.history.records import DamagedError, StoreError
-from service.history.tables import REVISION
+from service.history.tables import REVISION, create
 
 if TYPE_CHECKING:
     from sqlalchemy.dialects import postgresql, sqlite
@@ -328,8 +328,12 @@ class Database:
         return engine
 
     def _bring_up_to_date(self, connection: Connection) -> None:
-        there = inspect(connection).has_table("alembic_version")
-        if not there or connection.scalars(text("SELECT version_num FROM alembic_version")).all() != [REVISION]:
+        there = inspect(connection).get_table_names()
+        if not there and self.is_sqlite:
+            create(connection)
+        elif "alembic_version" not in there or connection.scalars(
+            text("SELECT version_num FROM alembic_version")
+        ).all() != [REVISION]:
             from service.history.migrations import migrate  # noqa: PLC0415  # Alembic takes long to import
 
             try:

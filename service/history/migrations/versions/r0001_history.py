@@ -3,10 +3,10 @@
 import sqlalchemy as sa
 from alembic import op
 
+from service.history.tables import KEPT, SQLITE_TRIGGERS
+
 revision = "0001"
 down_revision: str | None = None
-
-_KEPT = ("alarm_events", "audit_log")
 
 
 def upgrade() -> None:
@@ -16,7 +16,8 @@ def upgrade() -> None:
     _checkpoints()
     _access()
     if op.get_bind().dialect.name == "sqlite":
-        _triggers_of_sqlite()
+        for trigger in SQLITE_TRIGGERS:
+            op.execute(trigger)
     else:
         _triggers_of_postgresql()
 
@@ -193,31 +194,12 @@ def _access() -> None:
     )
 
 
-def _triggers_of_sqlite() -> None:
-    for table in _KEPT:
-        for change in ("UPDATE", "DELETE"):
-            op.execute(
-                f"CREATE TRIGGER {table}_no_{change.lower()} BEFORE {change} ON {table} "
-                f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
-            )
-    # INSERT OR REPLACE removes the former row without a trigger of its own.
-    op.execute(
-        "CREATE TRIGGER alarm_events_no_replace BEFORE INSERT ON alarm_events WHEN EXISTS (SELECT 1 FROM alarm_events "
-        "WHERE machine_id = NEW.machine_id AND (sequence = NEW.sequence OR id = NEW.id)) "
-        "BEGIN SELECT RAISE(ABORT, 'alarm_events is append-only'); END"
-    )
-    op.execute(
-        "CREATE TRIGGER audit_log_no_replace BEFORE INSERT ON audit_log WHEN EXISTS (SELECT 1 FROM audit_log "
-        "WHERE number = NEW.number) BEGIN SELECT RAISE(ABORT, 'audit_log is append-only'); END"
-    )
-
-
 def _triggers_of_postgresql() -> None:
     op.execute(
         "CREATE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS "
         "$$ BEGIN RAISE EXCEPTION '% is append-only', TG_TABLE_NAME; END $$"
     )
-    for table in _KEPT:
+    for table in KEPT:
         op.execute(
             f"CREATE TRIGGER {table}_no_change BEFORE UPDATE OR DELETE ON {table} "
             "FOR EACH ROW EXECUTE FUNCTION refuse_change()"
