@@ -61,12 +61,12 @@ def identify(
         If masses or shaft are missing.
     """
     whole = _first_guess(machine, windows)
+    diagnoses = [diagnosis for _, diagnosis in _read(whole, windows)]
     for number in range(_ROUNDS):
-        diagnoses = _read(whole, windows)
         together = added([stretch_of(each, w.start_ns, w.end_ns) for each, w in zip(diagnoses, windows, strict=True)])
         values, covariance = together.estimate()
         moves = dict(zip(together.names, values.tolist(), strict=True))
-        whole = _moved(whole, moves, windows)
+        whole, diagnoses = _moved(whole, moves, windows)
         progress(number + 1, _ROUNDS)
         if max(abs(value) for value in moves.values()) < _SETTLED:
             break
@@ -78,43 +78,44 @@ def identify(
         )
     total = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     total[np.ix_(together.known, together.known)] = covariance
-    return Identified(whole, together.names, total, tuple(_read(whole, windows)))
+    return Identified(whole, together.names, total, tuple(diagnoses))
 
 
-def _read(machine: Machine, windows: Sequence[WindowStatistics]) -> list[Diagnosis]:
+def _read(machine: Machine, windows: Sequence[WindowStatistics]) -> list[tuple[LikelihoodFit, Diagnosis]]:
     found = []
     for window in windows:
+        fit = LikelihoodFit(machine)  # each from a cold start: healthy windows may be of different conditions
         try:
-            # Each from a cold start: healthy windows may be of different conditions.
-            found.append(LikelihoodFit(machine).diagnose(window))
+            found.append((fit, fit.diagnose(window)))
         except np.linalg.LinAlgError as error:
             raise EstimationError(f"{machine.name}: {error} in a healthy window") from error
     return found
 
 
-def _moved(machine: Machine, moves: dict[str, float], windows: Sequence[WindowStatistics]) -> Machine:
-    """The machine with its parameters where they were read; moves are in the scale of the errors."""
+def _moved(
+    machine: Machine, moves: dict[str, float], windows: Sequence[WindowStatistics]
+) -> tuple[Machine, list[Diagnosis]]:
+    """The machine with its parameters where they were read, and what is read relative to it.
+
+    Moves are in the scale of the errors; the unbalance is moved to the vectors that are read in the windows.
+    """
     steps = {name: math.expm1(min(1.5, max(-1.5, value))) for name, value in moves.items() if name != "e"}
-    rotor = changed(machine.rotor, steps)
-    moved = machine.model_copy(update={"rotor": rotor})
-    return _with_unbalance(moved, windows) if "e" in moves else moved
-
-
-def _with_unbalance(machine: Machine, windows: Sequence[WindowStatistics]) -> Machine:
-    """Size and phase of the unbalance, from the vectors that are read in the windows."""
-    vectors = [diagnosis.unbalance for diagnosis in _read(machine, windows) if diagnosis.unbalance is not None]
-    if not vectors:
-        return machine
+    moved = machine.model_copy(update={"rotor": changed(machine.rotor, steps)})
+    read = _read(moved, windows)
+    vectors = [diagnosis.unbalance for _, diagnosis in read if diagnosis.unbalance is not None]
+    if "e" not in moves or not vectors:
+        return moved, [diagnosis for _, diagnosis in read]
     weights = np.array([1 / (one.variance_real + one.variance_imaginary) for one in vectors])
     parts = weights @ np.array([(one.real, one.imaginary) for one in vectors]) / weights.sum()
     size, turned = math.hypot(*parts), math.atan2(parts[1], parts[0])
-    phase = math.remainder(machine.operation.unbalance_phase_rad + turned, 2 * math.pi)
-    return machine.model_copy(
+    phase = math.remainder(moved.operation.unbalance_phase_rad + turned, 2 * math.pi)
+    balanced = moved.model_copy(
         update={
-            "rotor": machine.rotor.model_copy(update={"e_m": machine.rotor.e_m * size}),
-            "operation": machine.operation.model_copy(update={"unbalance_phase_rad": phase}),
+            "rotor": moved.rotor.model_copy(update={"e_m": moved.rotor.e_m * size}),
+            "operation": moved.operation.model_copy(update={"unbalance_phase_rad": phase}),
         }
     )
+    return balanced, [fit.balanced(balanced, diagnosis) for fit, diagnosis in read]
 
 
 def _first_guess(machine: MachineFile, windows: Sequence[WindowStatistics]) -> Machine:

@@ -71,6 +71,7 @@ class LikelihoodFit:
         self._line: Linearised | None = None
         self._line_segments = self._followed = 0
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
+        self._latest: tuple[WindowStatistics, SpectralModel, ModelPoint, FloatArray, float] | None = None
         self._groups: dict[bytes, BinGroups] = {}
         self._workspace = Workspace()
 
@@ -186,10 +187,22 @@ class LikelihoodFit:
         n = len(STRUCTURAL)
         # A search that has not converged adds the step it would still take to the uncertainty.
         structural = covariance[:n, :n] + np.diag(found.remaining**2)
-        read = self._read(window, model, found.whitened.point, structural, speed)
+        self._latest = window, model, found.whitened.point, structural, speed
+        read = self._read(*self._latest)
         return replace(
             read, misfit_z=goodness.misfit_z, suspect=goodness.suspect, unexplained=unexplained, steps=found.steps
         )
+
+    def balanced(self, machine: Machine, diagnosis: Diagnosis) -> Diagnosis:
+        """Read the window that was diagnosed last relative to a machine that differs in its unbalance alone.
+
+        What is random does not depend on the unbalance: nothing is searched again.
+        """
+        if self._latest is None:
+            raise EstimationError(f"{machine.name}: no window has been diagnosed")
+        self._machine = machine
+        read = self._read(*self._latest)
+        return replace(diagnosis, parameters=read.parameters, covariance=read.covariance, unbalance=read.unbalance)
 
     def glance(self, stretch: WindowStatistics) -> Diagnosis | None:
         """Read a short stretch of the latest window by one step from the window's maximum.
