@@ -222,8 +222,8 @@ def test_shapes_without_power_are_no_commissioning(count: int, varies: float, ve
 @pytest.mark.slow
 def test_a_machine_that_is_no_such_rotor_is_told_the_cure() -> None:
     assert PARTIAL.rotor is not None
-    masses = {"m1_kg": 2.5 * LAB.rotor.m1_kg, "m2_kg": 0.5 * LAB.rotor.m2_kg}
+    masses = {"m1_kg": 1.5 * LAB.rotor.m1_kg, "m2_kg": 0.7 * LAB.rotor.m2_kg}
     wrong = PARTIAL.model_copy(update={"rotor": PARTIAL.rotor.model_copy(update=masses)})
-    made = commissioned(wrong, healthy(wrong, 70.0, 41))
+    made = commissioned(wrong, healthy(wrong, 45.0, 41))
     assert refused(made)
     assert "leave [rotor] out of the machine file" in verdict_of(made, "agrees with the identified rotor")[2]

@@ -28,6 +28,8 @@ SEED = 7_700_003
 LAB = load_machine("lab")
 SHORT = LAB.model_copy(update={"window": LAB.window.model_copy(update={"length_s": 20.0})})
 """Most of the time of a training goes into simulating its windows."""
+COARSE = LAB.model_copy(update={"window": SHORT.window.model_copy(update={"segment_s": 2.5})})
+"""And much of the rest into the principal directions of its spectra."""
 DRAWS = 240
 """Of which a training makes eight batches."""
 
@@ -43,6 +45,7 @@ def briefly() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
         patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 96)
+        patch.setattr("simulator.training.command._CALIBRATION_SHARE", 1)
         yield
 
 
@@ -53,8 +56,8 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
 
     folder: Path = tmp_path_factory.mktemp("trained") / "bundle"
     with briefly():
-        train_for(SHORT, folder, 2, DRAWS, SEED, 1)
-    return load_bundle(folder, SHORT)
+        train_for(COARSE, folder, 2, DRAWS, SEED, 1)
+    return load_bundle(folder, COARSE)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +65,7 @@ def recipe(bundle: Bundle) -> FeatureDraws:
     """As the training made it."""
     assert bundle.amortised is not None
     basis = bundle.amortised.basis
-    return FeatureDraws(SHORT, SEED, DRAWS // 8, basis.mean, basis.directions)
+    return FeatureDraws(COARSE, SEED, DRAWS // 8, basis.mean, basis.directions)
 
 
 def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_trained(bundle: Bundle) -> None:
@@ -77,9 +80,9 @@ def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_tol
     from models.diagnosis.networks.training import train_network  # noqa: PLC0415
 
     equation, told = EQUATIONS[1], list[float]()
-    material = windows(SHORT, Purpose.TRAINING, 1, 2, equation.kept_nominal)
+    material = windows(COARSE, Purpose.TRAINING, 1, 2, equation.kept_nominal)
     with briefly():
-        again = train_network(equation, material, SHORT, SEED, told.append)
+        again = train_network(equation, material, COARSE, SEED, told.append)
     first = next(one for one in bundle.networks if one.equation.number == equation.number)
     np.testing.assert_array_equal(first.network.W1, again.network.W1)
     assert told[-1] == 1.0
@@ -91,8 +94,8 @@ def test_amortised_networks_learn_and_are_trained_again_to_the_last_bit(bundle: 
 
     draws = recipe
     again = train_networks(
-        SHORT,
-        ForceFeatures(SHORT).states,
+        COARSE,
+        ForceFeatures(COARSE).states,
         (draws.mean, draws.directions),
         draws.n_common,
         batches(draws, 8, processes=1),
@@ -128,8 +131,8 @@ def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
     draws = recipe
     with pytest.raises(EstimationError, match="lab: 0 windows are too few to train on"):
         train_networks(
-            SHORT,
-            ForceFeatures(SHORT).states,
+            COARSE,
+            ForceFeatures(COARSE).states,
             (draws.mean, draws.directions),
             draws.n_common,
             [],
@@ -139,9 +142,10 @@ def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
         )
 
 
-def test_a_small_training_finds_and_sizes_a_fault_on_new_windows() -> None:
+def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     from models.diagnosis.networks.training import calibrate, train_network  # noqa: PLC0415
 
+    monkeypatch.setattr("models.diagnosis.networks.training._ROUNDS", 16)
     equation = EQUATIONS[0]
     network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 12, equation.kept_nominal), SHORT, SEED)
     trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 6, equation.kept_nominal), SHORT)
@@ -158,9 +162,9 @@ def test_calibration_finds_the_true_size_of_the_errors() -> None:
 
     shipped = load_bundle("lab", LAB).amortised
     assert shipped is not None
-    draws = (Draw(LAB, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
+    draws = (Draw(SHORT, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
     held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(6)] for draw in draws]
-    calibrated = calibrate_networks(LAB, replace(shipped, calibration={}), held_out)
+    calibrated = calibrate_networks(SHORT, replace(shipped, calibration={}), held_out)
     assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
     assert all(0.1 < scale < 8 for one in calibrated.calibration.values() for scale in one.z_scale)
     doubled = Calibration(0.0, (-5.0, -3.0), (2.0, 4.0))
