@@ -16,7 +16,6 @@ from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import ndtr
 
 from models.diagnosis.readings import Diagnosis, possible_reading
@@ -88,18 +87,17 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
     probability = np.zeros(len(PARAMETERS))
     if not known:
         return Isolation((), 1.0, tuple(probability.tolist()), (), outside, confidence)
-    sets = _sets(len(known))
+    sets, members = _sets(len(known)), _members(len(known))
     J = stretch.information[np.ix_(known, known)]
     b = stretch.vector[list(known)]
-    explained = _explained(J, b, sets)
-    price = np.array([0.0 if not A else thresholds.first**2 + (len(A) - 1) * thresholds.further**2 for A in sets])
+    explained = _explained(J, b, members)
+    price = thresholds.first**2 + (members.sum(axis=1) - 1) * thresholds.further**2
+    price[0] = 0.0  # of the empty set
     gain = (explained - price) / 2
     weight = np.exp(gain - gain.max())
     weight /= weight.sum()
     best = int(np.argmax(gain))
-    for A, share in zip(sets, weight, strict=True):
-        for i in A:
-            probability[known[i]] += share
+    probability[list(known)] = weight @ members
     changed = tuple(PARAMETERS[known[i]] for i in sets[best])
     return Isolation(
         changed=changed,
@@ -118,24 +116,18 @@ def _sets(n: int) -> tuple[tuple[int, ...], ...]:
 
 
 @lru_cache
-def _of_size(sets: tuple[tuple[int, ...], ...], size: int) -> npt.NDArray[np.intp]:
-    """Sets of one size, shape (n_sets, size)."""
-    return np.array([A for A in sets if len(A) == size])
+def _members(n: int) -> FloatArray:
+    """One for each parameter that a set holds, shape (n_sets, n)."""
+    return np.array([[float(i in A) for i in range(n)] for A in _sets(n)])
 
 
-def _explained(J: FloatArray, b: FloatArray, sets: tuple[tuple[int, ...], ...]) -> FloatArray:
-    """What each set explains, b_A' J_AA⁻¹ b_A; sets of one size are solved in one go."""
-    explained = np.zeros(len(sets))
+def _explained(J: FloatArray, b: FloatArray, members: FloatArray) -> FloatArray:
+    """What each set explains, b_A' J_AA⁻¹ b_A, all in one go: what is not in a set stands alone there."""
     scale = 1 / np.sqrt(np.diag(J))
-    J, b = J * np.outer(scale, scale), b * scale
-    at = 1
-    for size in range(1, J.shape[0] + 1):
-        index = _of_size(sets, size)
-        own = b[index]
-        solved = np.linalg.solve(J[index[:, :, None], index[:, None, :]], own[:, :, None])[:, :, 0]
-        explained[at : at + len(index)] = np.sum(own * solved, axis=1)
-        at += len(index)
-    return explained
+    alone = J * np.outer(scale, scale) * members[:, :, None] * members[:, None, :]
+    alone[:, range(b.size), range(b.size)] = 1.0
+    own = b * scale * members
+    return np.asarray(np.sum(own * np.linalg.solve(alone, own[:, :, None])[:, :, 0], axis=1), dtype=np.float64)
 
 
 def restricted(stretch: Stretch, names: tuple[str, ...], by: str) -> tuple[Parameter, ...]:
