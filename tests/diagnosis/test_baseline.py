@@ -49,10 +49,10 @@ def test_a_healthy_machine_reads_healthy_under_another_excitation() -> None:
 @pytest.mark.parametrize(
     ("name", "rotor", "low", "high"),
     [
-        ("k_by", with_bearing(ROTOR, k_y=-0.1), -0.12, -0.06),
+        pytest.param("k_by", with_bearing(ROTOR, k_y=-0.1), -0.12, -0.06, marks=pytest.mark.long),
         pytest.param("c_by", with_bearing(ROTOR, c_y=-0.3), -0.40, -0.20, marks=pytest.mark.long),
         pytest.param("k_bz", with_bearing(ROTOR, k_z=-0.1), -0.12, -0.06, marks=pytest.mark.long),
-        ("c_bz", with_bearing(ROTOR, c_z=-0.3), -0.40, -0.20),
+        pytest.param("c_bz", with_bearing(ROTOR, c_z=-0.3), -0.40, -0.20, marks=pytest.mark.long),
         ("e", replace(ROTOR, unbalance_kg_m=1.5 * ROTOR.unbalance_kg_m), 0.2, 0.9),
     ],
 )

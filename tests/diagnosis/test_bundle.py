@@ -224,7 +224,7 @@ def test_forces_of_the_nominal_machine_are_those_of_its_sources() -> None:
 def test_the_shipped_networks_find_and_size_faults_on_new_windows(parameter: str) -> None:
     reader = NetworkDiagnostician(LAB, shipped())
     read, z_others = [], []
-    for number in range(4):
+    for number in range(3):
         diagnosis = reader.diagnose(window(parameter, number))
         by_name = {reading.name: reading for reading in diagnosis.parameters}
         assert tuple(by_name) == ("k_by", "c_by", "e", "EI", "k_bz", "c_bz")

@@ -103,7 +103,7 @@ def in_band(part: float) -> float:
     return float(part * np.sqrt((high - low) / (machine_of("lab").rate_hz / 2)) / np.hypot(1, part))
 
 
-@pytest.mark.parametrize("name", ["lab", "heavy"])
+@pytest.mark.parametrize("name", ["lab", pytest.param("heavy", marks=pytest.mark.long)])
 @pytest.mark.parametrize("displacements", [False, True])
 def test_healthy_sensors_are_quiet_under_another_excitation(name: str, displacements: bool) -> None:
     reference = reference_of(name, displacements=displacements)
@@ -163,10 +163,10 @@ def test_a_little_more_noise_is_not_worth_a_finding() -> None:
     assert found_in(with_noise(recorded("lab", 920), "y1", 0.04)) == ()
 
 
-CHANGES = {"k_by": -0.25, "c_by": -0.5, "e": 1.0}
+CHANGES = {"k_by": -0.25, "e": 1.0}
 
 
-@pytest.mark.parametrize(("parameter", "at_s"), [("k_by", 31.0), ("c_by", 31.0), ("e", 31.0), ("e", 0.0)])
+@pytest.mark.parametrize(("parameter", "at_s"), [("k_by", 31.0), ("e", 31.0), ("e", 0.0)])
 def test_a_fault_of_the_machine_is_none_of_its_sensors(parameter: str, at_s: float) -> None:
     event = Event(at_s=at_s, parameter=parameter, relative_change=CHANGES[parameter])
     samples = recorded("lab", 925, events=(event,))

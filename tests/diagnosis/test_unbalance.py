@@ -68,7 +68,7 @@ def test_a_turned_heavy_spot_is_read_as_a_vector_and_never_below_nothing(e: floa
 def test_a_rotor_that_was_balanced_has_lost_its_unbalance_and_no_more() -> None:
     """The difference of two windows' vectors is their noise alone: which side of nothing it is on is chance."""
     draw = Draw(MACHINE, SEED, Purpose.EVALUATION, 0, layout=Layout.INDEPENDENT, fixed_condition=True)
-    drawings = [simulate_window(draw, number) for number in range(5)]
+    drawings = [simulate_window(draw, number) for number in range(3)]
     last = drawings.pop()
     for window in drawings:
         assert window.synchronous is not None
@@ -140,7 +140,7 @@ def test_a_healthy_machine_reads_healthy(ramp: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "change"), [("e", 0.2), ("c_by", -0.2)])
+@pytest.mark.parametrize(("name", "change"), [("e", 0.2), pytest.param("c_by", -0.2, marks=pytest.mark.long)])
 def test_a_change_is_named_alone(name: str, change: float) -> None:
     diagnosis = read(SEED_OF_VARYING_SPEED + 1, 0.1, Event(at_s=0.0, parameter=name, relative_change=change))
     assert isolate_window(diagnosis, 0.001).changed == (name,)

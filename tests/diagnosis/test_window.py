@@ -126,7 +126,7 @@ def test_any_splitting_gives_identical_statistics_after_every_block(cuts: list[i
 
 
 @pytest.mark.slow
-def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
+def test_a_million_samples_with_an_offset_a_million_times_the_fluctuation() -> None:
     """After every block of 100 000 samples the sliding estimate is the batch estimate of the same window."""
     plan = Plan(
         rate_hz=1e4,
@@ -144,7 +144,7 @@ def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -
         max_span_ns=10**13,
     )
     window, tail, checked = SlidingWindow(plan), np.empty((0, 2)), 0
-    for block in range(40):
+    for block in range(12):
         samples = signal(100_000, block, offset=2e6, angle=False)
         statistics = [*[None], *[window.statistics() for _ in window.feed(samples, round(block * 1e10))]][-1]
         tail = np.concatenate([tail, samples])[-160_000:]
@@ -154,7 +154,7 @@ def test_four_million_samples_with_an_offset_a_million_times_the_fluctuation() -
         expected = batch_correlation(plan, tail, end)
         np.testing.assert_allclose(statistics.correlation, expected, atol=1e-9 * expected[0, 0, 0])
         checked += 1
-    assert checked >= 38
+    assert checked >= 10
 
 
 def test_synchronous_part_and_speed_are_recovered_and_removed() -> None:

@@ -30,7 +30,7 @@ def kit(*, mounted: bool, full: bool) -> tuple[Commissioning, HealthyRecording, 
     machine: MachineFile = _mounted() if mounted else LAB
     scenario, _ = load_scenario("healthy")
     sensors = scenario.sensors.model_copy(update={"noise_relative": 1e-6})
-    scenario = scenario.model_copy(update={"duration_s": 190.0, "seed": 77_205, "sensors": sensors})
+    scenario = scenario.model_copy(update={"duration_s": 100.0, "seed": 77_205, "sensors": sensors})
     assert isinstance(machine, Machine)
     stream = [(block, "") for block, _ in blocks(scenario, machine, 1.0)]
     if not full:
