@@ -1,7 +1,6 @@
 """`rotorwatch plot`: pictures as files, the same bytes for the same input, and errors that say what was looked for."""
 
 import struct
-import subprocess
 import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
@@ -14,7 +13,8 @@ from models.signals.recording import RecordedMessage, read_recording
 from service.rotorwatch import app
 from simulator.recorder import record
 from simulator.scenario import Event, parse_fault
-from tests.service.live import LAB, ROOT, START_NS, scenario_blocks
+from tests.service.live import LAB, START_NS, scenario_blocks
+from tests.service.preloaded import ran
 from tests.service.replaying import recording, write
 
 
@@ -58,7 +58,7 @@ def pixels(path: Path) -> tuple[int, int]:
     return width, height
 
 
-@pytest.mark.parametrize("kind", ["trend", "correlation", "orbit", "spectrum", "polar"])
+@pytest.mark.parametrize("kind", ["trend", "correlation", "spectrum"])
 def test_a_steady_machine(faulty: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "picture.svg"
     code, said = run(kind, faulty, "--out", out, "--size", "8x6")
@@ -71,8 +71,7 @@ def test_a_steady_machine(faulty: Path, tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "options"),
     [
-        ("bode", ("--channel", "y2", "--revolutions", "8")),
-        ("bode", ("--order", "2", "--slow-roll", "1000")),
+        ("bode", ("--channel", "y2", "--revolutions", "8", "--order", "2", "--slow-roll", "1000")),
         ("polar", ("--channel", "y1", "--channel", "z1")),
         ("centreline", ("--place", "disc", "--clearance", "200", "--window", "0.5")),
         ("full-spectrum", ("--axis", "orders", "--window", "5", "--scale", "log", "--to-hz", "100")),
@@ -93,14 +92,10 @@ def test_the_same_input_gives_the_same_bytes(faulty: Path, tmp_path: Path) -> No
     for out in ours:
         assert run(*arguments, out)[0] == 0
     (tmp_path / "matplotlibrc").write_text("axes.facecolor: yellow\nfont.size: 20\n", encoding="utf-8")
-    environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7"}
+    environment = {"PATH": "/usr/bin:/bin", "MATPLOTLIBRC": str(tmp_path), "TZ": "Asia/Tokyo"}
     environment["MPLCONFIGDIR"] = get_cachedir()  # where the list of fonts is, which takes seconds to make
-    code = f"""from service.rotorwatch import app
-for out in {theirs}:
-    app(["plot", *{arguments}, out], standalone_mode=False)
-"""
-    command = [sys.executable, "-c", code]
-    subprocess.run(command, check=True, cwd=ROOT, env=environment, timeout=300, capture_output=True)
+    for out in theirs:
+        assert ran("service.rotorwatch", "plot", *arguments, out, environment=environment).returncode == 0
     for out, other in zip(ours, theirs, strict=True):
         assert Path(out).read_bytes() == Path(other).read_bytes()
 
@@ -158,7 +153,7 @@ def test_names_of_pictures(faulty: Path, tmp_path: Path) -> None:
     code, said = run("orbit", faulty, "--out", out)
     assert (code, "exists already; --overwrite replaces it" in said) == (2, True)
     assert out.read_bytes() == b"another picture"
-    assert run("orbit", faulty, "--out", out, "--overwrite")[0] == 0
+    assert run("orbit", faulty, "--out", out, "--overwrite", "--size", "4x3")[0] == 0
     assert pixels(out)[0] > 0
     code, said = run("orbit", faulty, "--out", tmp_path / "nowhere" / "orbit.png")
     assert (code, "cannot be written" in said) == (1, True)
@@ -177,7 +172,9 @@ def test_without_a_keyphasor_there_are_spectra_but_no_orbits(without_angle: Path
     code, said = run("full-spectrum", without_angle, "--window", "2", "--axis", "orders", "--out", tmp_path / "f.png")
     assert (code, "--axis orders needs the shaft angle" in said) == (2, True)
     for kind, *options in (("spectrum",), ("waterfall", "--cascade"), ("full-spectrum",)):
-        code, said = run(kind, without_angle, "--window", "2", *options, "--out", tmp_path / f"{kind}.png")
+        code, said = run(
+            kind, without_angle, "--window", "2", *options, "--size", "4x3", "--out", tmp_path / f"{kind}.png"
+        )
         assert code == 0, said
 
 
