@@ -121,7 +121,7 @@ def test_two_publishers_on_one_key_are_named() -> None:
     assert monitor.health().quality.accepted_blocks == len(ours)  # the first goes on undisturbed
 
 
-@pytest.mark.parametrize("ahead", [0, 1, 5])
+@pytest.mark.parametrize("ahead", [0, pytest.param(1, marks=pytest.mark.long), 5])
 def test_a_forged_block_replaces_no_true_one(ahead: int) -> None:
     monitor = MachineMonitor(install(LAB, None))
     ours = scenario_blocks(70.0)
@@ -154,7 +154,7 @@ def misshapen(good: SampleBlock, rng: np.random.Generator) -> SampleBlock:
     return replace(good, **(place | wrong[rng.integers(5)]))  # type: ignore[arg-type]  # fields of any kind
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in range(1, 4))])
 def test_what_can_be_no_block_costs_none(seed: int) -> None:
     monitor, rng = MachineMonitor(install(LAB, None)), np.random.default_rng(seed)
     ours = scenario_blocks(30.0)

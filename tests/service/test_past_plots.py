@@ -94,7 +94,7 @@ def run(*arguments: str | Path) -> tuple[int, str]:
 @pytest.mark.parametrize("kind", ["trend", "polar", "centreline"])
 def test_pictures_of_the_history(settings: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "picture.png"
-    code, said = run(kind, "--history", settings, "--out", out)
+    code, said = run(kind, "--history", settings, "--out", out, "--size", "6x4", "--dpi", "60")
     assert (code, said.strip()) == (0, str(out)), said
     assert out.stat().st_size > 5000
 
