@@ -41,7 +41,7 @@ class PostgresServer:
 
     def new_database(self, name: str, template: str = "template1") -> str:
         """Make a database, empty or a copy of another one, and return its address."""
-        self.run("createdb", "-h", str(self.folder), "-U", USER, "-T", template, name)
+        self.run("createdb", "-S", "file_copy", "-h", str(self.folder), "-U", USER, "-T", template, name)
         return self.url(name)
 
     def start(self) -> None:

@@ -52,7 +52,9 @@ def test_the_healthy_machine_stays_healthy() -> None:
     assert [reading.name for reading in rows["28 + 29"].parameters] == ["k_by", "c_by"]
 
 
-@pytest.mark.parametrize(("name", "change"), [("k_by", -0.2), ("c_bz", -0.4), ("e", 0.5)])
+@pytest.mark.parametrize(
+    ("name", "change"), [pytest.param("k_by", -0.2, marks=pytest.mark.long), ("c_bz", -0.4), ("e", 0.5)]
+)
 def test_a_change_is_named_alone(name: str, change: float) -> None:
     blocks = stream(65.0, SEED + 2, Event(at_s=0.0, parameter=name, relative_change=change))
     windows, events = feed(MachineMonitor(installed()), blocks)
