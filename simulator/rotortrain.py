@@ -60,9 +60,12 @@ def train(
     Example: rotortrain train --machine lab --out lab-bundle
     """
     with _running():
-        from simulator.training.command import train_bundle  # noqa: PLC0415  # start-up stays free of numpy and torch
+        from models.machine import load_machine  # noqa: PLC0415  # start-up stays free of numpy and torch
 
-        train_bundle(machine, out, windows, draws, seed, processes)
+        known = load_machine(machine)  # or say so before torch, which takes seconds
+        from simulator.training.command import train_for  # noqa: PLC0415
+
+        train_for(known, out, windows, draws, seed, processes)
 
 
 @app.command()

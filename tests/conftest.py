@@ -17,6 +17,7 @@ import httpx
 import hypothesis
 import pytest
 import structlog
+import typer.testing
 
 ROOT = Path(__file__).parents[1]
 if str(ROOT) not in sys.path:
@@ -39,6 +40,8 @@ structlog.configure(
 )
 # A client reads all the certificates this computer trusts, 20 ms of computing, before it knows that it asks over HTTP.
 httpx._transports.default.create_ssl_context = cache(httpx.create_ssl_context)  # type: ignore[attr-defined]
+# A program's commands are put together once, as in a process of its own, and not for every command line.
+typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[attr-defined]
 
 _LONGEST = (
     "test_window_again",

@@ -19,7 +19,7 @@ from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import EquationNetwork
 from models.diagnosis.networks.training import calibrate, calibrate_networks, train_network, train_networks
 from models.diagnosis.window import WindowStatistics
-from models.machine import Machine, load_machine
+from models.machine import Machine
 from models.physics.rotor import PARAMETERS
 from rotorwatch import __version__
 from simulator.commands import bars
@@ -30,17 +30,6 @@ _CONDITIONS_PER_BATCH = 480
 # Windows of either layout that calibrate the amortised networks, per training window of a relation network.
 _CALIBRATION_SHARE = 3
 _CALIBRATION_STREAM = 20
-
-
-def train_bundle(name: str, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
-    """Train the networks of a machine file or a shipped machine, see `train_for`.
-
-    Raises
-    ------
-    RotorwatchError
-        If the machine file or the bundle directory is not usable.
-    """
-    train_for(load_machine(name), out, n_windows, n_draws, seed, processes)
 
 
 def train_for(machine: Machine, out: Path, n_windows: int, n_draws: int, seed: int, processes: int) -> None:
