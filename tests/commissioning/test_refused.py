@@ -107,7 +107,7 @@ def test_vibration_that_grows() -> None:
 
 @pytest.mark.slow
 def test_a_machine_that_changed_meanwhile() -> None:
-    made = made_of(stream(140.0, 55, Event(at_s=70.0, parameter="k_by", relative_change=-0.3)))
+    made = made_of(stream(90.0, 55, Event(at_s=45.0, parameter="k_by", relative_change=-0.3)))
     assert refused(made)
     _, text, _ = verdict_of(made, "halves agree")
     assert text.startswith("bearing stiffness, horizontal differs between the halves")

@@ -59,7 +59,7 @@ def test_a_machine_without_parameters_is_commissioned_and_again_only_with_a_reas
     assert load_commissioned(folder / "kit", machine) == first
 
     monkeypatch.setattr("simulator.commission.page.pictures_of", lambda *_: ())  # they were drawn above
-    again = run(folder, *arguments, "--why", "bearing exchanged")
+    again = run(folder, *(one for one in arguments if one != "friday.mcap"), "--why", "bearing exchanged")
     assert again.exit_code == 0, again.stderr
     second = load_commissioned(folder / "kit", machine)
     assert (second.version, second.replaces, second.why) == (2, first.identity, "bearing exchanged")
