@@ -32,9 +32,9 @@ from tests.service.replaying import S, machine_blocks, recorded, recording, writ
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Healthy for 75 s, then half of the vertical bearing damping more."""
+    """Healthy for 62 s, then half of the vertical bearing damping more."""
     return recording(
-        tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(120.0, parse_fault("c_bz=0.5@75"))
+        tmp_path_factory.mktemp("plots") / "faulty.mcap", scenario_blocks(102.0, parse_fault("c_bz=0.5@62"))
     )
 
 

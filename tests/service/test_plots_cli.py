@@ -58,7 +58,7 @@ def pixels(path: Path) -> tuple[int, int]:
     return width, height
 
 
-@pytest.mark.parametrize("kind", ["trend", "correlation", "spectrum"])
+@pytest.mark.parametrize("kind", [pytest.param("trend", marks=pytest.mark.long), "correlation", "spectrum"])
 def test_a_steady_machine(faulty: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "picture.svg"
     code, said = run(kind, faulty, "--out", out, "--size", "8x6")

@@ -35,14 +35,6 @@ from tests.service.replaying import hurried, recording
 M = TypeVar("M", bound=BaseModel)
 ID = "demo/lab/20260101T000000Z.mcap"
 RECORDINGS, REPLAYS = "/api/v1/recordings", "/api/v1/replays"
-GET_MODELS: dict[str, type[BaseModel]] = {
-    RECORDINGS: RecordingList,
-    f"{RECORDINGS}/{{site}}/{{machine}}/{{name}}": RecordingDetail,
-    REPLAYS: ReplayList,
-    f"{REPLAYS}/{{replay_id}}": ReplayJob,
-    f"{REPLAYS}/{{replay_id}}/reports": ReplayReportList,
-    f"{REPLAYS}/{{replay_id}}/alarms": ReplayAlarmList,
-}
 QUICK = "demo/lab/20270101T000000Z.mcap"
 DAY_NS = 86_400 * 10**9
 ENDED = ("finished", "stopped", "failed")
@@ -306,15 +298,6 @@ def test_unknown_replays(client: httpx.Client) -> None:
     for path in ("", "/reports", "/alarms", "/events"):
         problem(client.get(f"{REPLAYS}/nothing{path}"), 404)
     problem(client.delete(f"{REPLAYS}/nothing"), 404)
-
-
-def test_openapi_tells_of_every_route(client: httpx.Client) -> None:
-    paths = client.get("/openapi.json").json()["paths"]
-    for path, model in GET_MODELS.items():
-        responses = paths[path]["get"]["responses"]
-        model.model_validate(responses["200"]["content"]["application/json"]["example"])
-        assert "500" in responses
-    ReplayJob.model_validate(paths[REPLAYS]["post"]["responses"]["201"]["content"]["application/json"]["example"])
 
 
 def test_without_a_directory_the_answer_names_the_setting() -> None:

@@ -132,12 +132,12 @@ def test_short_segments_weaken_no_correlation() -> None:
 
 
 def test_standard_errors_from_spectra_are_those_of_many_windows() -> None:
-    """Coloured noise in 40 windows: the scatter of the estimates against the error stated for each."""
+    """Coloured noise in 25 windows: the scatter of the estimates against the error stated for each."""
     shorter = LAB.window.model_copy(update={"length_s": 30.0})
     machine = LAB.model_copy(update={"sensors": LAB.sensors[:2], "window": shorter})
     rng = np.random.default_rng(3)
     values, errors = [], []
-    for _ in range(40):
+    for _ in range(25):
         white = rng.standard_normal((round(33 * LAB.rate_hz), 2))
         smooth = oaconvolve(white, np.hanning(40)[:, None], "same", axes=0)
         blocks_ = synthetic({"y1": smooth[:, 0], "z1": smooth[:, 0] + smooth[:, 1]})
