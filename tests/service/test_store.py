@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ from tests.service.postgres import KINDS, database_url
 
 NS = 1_000_000_000
 T0 = 1_767_225_600 * NS
+NUMBERS = count()
 
 
 @pytest.fixture(params=KINDS)
@@ -46,9 +48,18 @@ def store(url: str) -> Iterator[Store]:
     made.close()
 
 
+@pytest.fixture(scope="module", params=KINDS)
+def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    made = Store(database_url(request.param, tmp_path_factory.mktemp("shared")), Retention())
+    made.open()
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def lab(store: Store) -> MachineStore:
-    return store.machine("demo", "lab")
+def lab(shared: Store) -> MachineStore:
+    """A machine of one's own, beside those of other tests."""
+    return shared.machine("demo", f"lab-{next(NUMBERS)}")
 
 
 def alarm_event(sequence: int, **changes: object) -> StoredEvent:
@@ -223,7 +234,7 @@ def test_events_that_contradict_the_log_are_refused_with_their_step(lab: Machine
     for events, message in (
         ((alarm_event(1, id="other"),), "alarm event 1 has the id other, but the history has it with the id event-1"),
         ((alarm_event(2, id="event-0"),), "alarm event 2 has the id event-0, which alarm event 0 has already"),
-        ((alarm_event(3),), "demo/lab: alarm event 3 comes after 1, expected 2"),
+        ((alarm_event(3),), ": alarm event 3 comes after 1, expected 2"),
         ((alarm_event(2), alarm_event(3, id="event-2")), "two alarm events of one step have the same id"),
     ):
         with pytest.raises(StoreError, match=message):
@@ -248,7 +259,7 @@ def test_events_that_contradict_the_log_are_refused_with_their_step(lab: Machine
     ],
 )
 def test_what_no_database_takes_is_refused_by_name(lab: MachineStore, step: Step, message: str) -> None:
-    with pytest.raises(StoreError, match=f"demo/lab: .*{message}"):
+    with pytest.raises(StoreError, match=f"demo/lab-.*: .*{message}"):
         lab.commit(step)
     assert lab.waiting == 0
     assert lab.commit(hop_step(1, events=(alarm_event(0),)))
@@ -281,7 +292,8 @@ def test_steps_that_wait_together_are_committed_together(store: Store, monkeypat
     assert 10 <= len(commits) < 120 // 2  # 120 steps
 
 
-def test_who_reads_does_not_hold_up_who_writes(store: Store, lab: MachineStore) -> None:
+def test_who_reads_does_not_hold_up_who_writes(store: Store) -> None:
+    lab = store.machine("demo", "lab")
     with store._database.reading() as connection:
         assert connection.scalar(text("SELECT count(*) FROM alarm_events")) == 0
         for number in range(3):
