@@ -307,7 +307,8 @@ class SlidingWindow:
             self._pending = self._pending[-1:]
             self._leave(self._row)
         while self._pending_samples >= self.plan.need:
-            buffer, first_ns = np.concatenate(self._pending), self._pending_start_ns
+            first_ns = self._pending_start_ns
+            buffer = self._pending[0] if len(self._pending) == 1 else np.concatenate(self._pending)
             block_ns, row = self._blocks[0][0], self._row
             self._pending, self._row = [buffer], self._row + self.plan.stride
             self._leave(self.plan.stride)

@@ -14,7 +14,7 @@ from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording,
 
 SLOW = LAB.operation.speed_rpm
 FAST = 1.15 * SLOW
-LENGTH_S = 45.0
+LENGTH_S = 40.0
 
 
 @cache
