@@ -25,7 +25,7 @@ from models.physics.rotor import FAULT_FIELDS, PARAMETERS
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, PARTIAL, commissioned, healthy, recording, stream
 
-HEALTHY_S = 130.0
+HEALTHY_S = 90.0
 MACHINES = {"full": LAB, "partial": PARTIAL, "none": NOTHING}
 
 
@@ -130,7 +130,7 @@ def test_outside_the_commissioned_conditions_is_said_so() -> None:
 
 @pytest.mark.slow
 def test_a_longer_recording_is_asked_for_where_the_commissioning_dominates() -> None:
-    little = commissioned(NOTHING, healthy(NOTHING, 66.0, 46))
+    little = commissioned(NOTHING, healthy(NOTHING, 46.0, 46))
     much = made_at("none")
     for one, other in zip(little.report.parameters[:4], much.report.parameters[:4], strict=True):
         assert one.commissioning_error is not None
