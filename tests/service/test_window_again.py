@@ -37,14 +37,14 @@ from tests.service.live import (
 )
 
 BLOCK_S = 0.5
-FIRST, ALL = 91, 140
+FIRST, ALL = 78, 124
 """Blocks until the monitor ends, in the middle of a hop, and in all: one alarm comes before, another one after."""
 
 
 @cache
 def stream() -> tuple[SampleBlock, ...]:
     scenario, machine = load_scenario("healthy")
-    faults = (parse_fault("c_bz=0.5@0"), parse_fault("k_by=-0.33@40"))
+    faults = (parse_fault("c_bz=0.5@0"), parse_fault("k_by=-0.33@30"))
     story = scenario.overridden(duration_s=ALL * BLOCK_S, seed=7_700_031, faults=faults)
     return tuple(block for block, _ in blocks(story, machine, BLOCK_S, START_NS))
 
@@ -129,7 +129,7 @@ def put_first(here: Plant, first: Program) -> None:
 
 
 def until_evaluated(at: Program) -> None:
-    last_ns = START_NS + 67_500_000_000  # of the last hop, or a little later where hops began anew
+    last_ns = START_NS + 57_500_000_000  # of the last hop, or a little later where hops began anew
 
     def evaluated() -> bool:
         report = at.health().report
@@ -161,7 +161,7 @@ def test_killed_where_the_window_can_be_had_again_all_goes_on_as_if_nothing_had_
             first.kill()
         with here.monitor() as second:
             until(lambda: second.health().filled == 1.0, "full window")
-            assert second.health().restart == "went on where it stood at 2026-01-01T00:00:42.500000Z"
+            assert second.health().restart == "went on where it stood at 2026-01-01T00:00:37.500000Z"
             here.put(stream()[FIRST:])
             until_evaluated(second)
             assert second.health().quality.gaps == 0
@@ -217,7 +217,7 @@ def test_stopped_in_order_the_window_is_kept(tmp_path: Path) -> None:
             assert first.stop() == 0
         with here.monitor() as second:
             health = second.health()
-            assert (health.filled, health.restart) == (1.0, "went on where it stood at 2026-01-01T00:00:45.500000Z")
+            assert (health.filled, health.restart) == (1.0, "went on where it stood at 2026-01-01T00:00:39.000000Z")
             here.put(stream()[FIRST:])
             until_evaluated(second)
             assert second.stop() == 0
