@@ -129,9 +129,9 @@ def test_of_two_runs_the_later_one_is_shown(twice: Path) -> None:
 )
 def test_pictures_do_not_depend_on_how_fast_the_data_came(slow: Path, quick: Path, tmp_path: Path, kind: str) -> None:
     where = ("--at", "31") if kind != "waterfall" else ("--from", "8", "--to", "31")
-    seconds = () if kind == "orbit" else ("--window", "4")
+    options = ("--size", "4x3") if kind == "orbit" else ("--window", "4")
     for path, out in ((slow, tmp_path / "slow.svg"), (quick, tmp_path / "quick.svg")):
-        found = CliRunner().invoke(app, ["plot", kind, str(path), "--out", str(out), *where, *seconds])
+        found = CliRunner().invoke(app, ["plot", kind, str(path), "--out", str(out), *where, *options])
         assert found.exit_code == 0, found.output
     assert (tmp_path / "slow.svg").read_bytes() == (tmp_path / "quick.svg").read_bytes()
 

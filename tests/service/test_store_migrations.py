@@ -206,6 +206,7 @@ def test_readings_and_buckets_of_rows_are_those_that_were_there(
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("url", [pytest.param("sqlite", marks=pytest.mark.long), "postgresql"], indirect=True)
 def test_a_large_history_says_how_far_it_is_brought_up_to_date(url: str) -> None:
     numbers = "WITH RECURSIVE n (k) AS (SELECT 1 UNION ALL SELECT k + 1 FROM n WHERE k < 20003) "
     engine = engine_for(url)
