@@ -13,23 +13,15 @@ import httpx
 import pytest
 from pydantic import BaseModel
 
-from models.signals.link import LinkSettings
-from rotorwatch.records.monitor import Problem
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
 from service.api.routes.replays import ReplayDesk
 from service.runtime import Runtime, running
-from service.settings.service import (
-    HistorySettings,
-    HttpSettings,
-    MachineEntry,
-    RecordingSettings,
-    ReplaySettings,
-    ServiceSettings,
-)
+from service.settings.service import HttpSettings, RecordingSettings, ReplaySettings, ServiceSettings
 from simulator.scenario import parse_fault
-from tests.service.live import START_NS, endpoint, scenario_blocks, until
-from tests.service.monitored import OPEN
+from tests.service import monitored
+from tests.service.live import START_NS, endpoint, scenario_blocks, settings, until
+from tests.service.monitored import problem
 from tests.service.replaying import hurried, recording
 
 M = TypeVar("M", bound=BaseModel)
@@ -41,16 +33,10 @@ ENDED = ("finished", "stopped", "failed")
 
 
 def plan(directory: Path | None, **replay: object) -> ServiceSettings:
-    return ServiceSettings(
-        link=LinkSettings(listen=(endpoint(),)),
-        http=HttpSettings(port=0),
-        history=HistorySettings(url="sqlite:///:memory:"),
-        access=OPEN,
-        machines=(MachineEntry(file="lab", bundle="lab"),),
-        # The service records there too; recordings of January stay.
-        recording=RecordingSettings(directory=None if directory is None else str(directory), keep_days=36_500.0),
-        replay=ReplaySettings.model_validate(replay),
-    )
+    # The service records there too; recordings of January stay.
+    recording = RecordingSettings(directory=None if directory is None else str(directory), keep_days=36_500.0)
+    more = {"recording": recording, "replay": ReplaySettings.model_validate(replay)}
+    return settings(endpoint(), bundle="lab").model_copy(update=more)
 
 
 @pytest.fixture(scope="module")
@@ -74,18 +60,12 @@ def runtime(directory: Path) -> Iterator[Runtime]:
 
 @pytest.fixture
 def client(runtime: Runtime) -> Iterator[httpx.Client]:
-    with httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as opened:
+    with monitored.client(runtime) as opened:
         yield opened
 
 
 def get(client: httpx.Client, path: str, model: type[M], **arguments: Any) -> M:
     return model.model_validate_json(client.get(path, params=arguments).raise_for_status().content)
-
-
-def problem(answer: httpx.Response, status: int) -> Problem:
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    return Problem.model_validate_json(answer.content)
 
 
 def start(client: httpx.Client, headers: dict[str, str] | None = None, **request: Any) -> ReplayJob:
@@ -301,21 +281,14 @@ def test_unknown_replays(client: httpx.Client) -> None:
 
 
 def test_without_a_directory_the_answer_names_the_setting() -> None:
-    with (
-        running(plan(None)) as runtime,
-        httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as client,
-    ):
+    with running(plan(None)) as runtime, monitored.client(runtime) as client:
         assert "[recording] directory" in problem(client.get(RECORDINGS), 404).detail
         assert "[recording] directory" in problem(client.post(REPLAYS, json={"recordings": [ID]}), 404).detail
         assert get(client, REPLAYS, ReplayList).replays == ()
 
 
 def test_switched_off_nothing_can_be_started(directory: Path) -> None:
-    settings = plan(directory, enabled=False)
-    with (
-        running(settings) as runtime,
-        httpx.Client(base_url=runtime.http_url, trust_env=False, timeout=180.0) as client,
-    ):
+    with running(plan(directory, enabled=False)) as runtime, monitored.client(runtime) as client:
         found = problem(client.post(REPLAYS, json={"recordings": [ID]}), 403)
         assert "[replay] enabled" in found.detail
         assert len(get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS).recordings) == 3
@@ -335,15 +308,13 @@ def test_switched_off_nothing_can_be_started(directory: Path) -> None:
     ],
 )
 def test_started_by_default_only_on_loopback(host: str, enabled: bool | None, expected: bool) -> None:
-    settings = plan(None, enabled=enabled).model_copy(update={"http": HttpSettings(host=host)})
-    assert ReplayDesk(settings, None).enabled is expected
+    asked = plan(None, enabled=enabled).model_copy(update={"http": HttpSettings(host=host)})
+    assert ReplayDesk(asked, None).enabled is expected
 
 
 def test_the_service_ends_its_replays_and_old_results_make_room(directory: Path) -> None:
     folder = directory / ".replays"
-    with running(plan(directory, kept=1)) as runtime, httpx.Client(
-        base_url=runtime.http_url, trust_env=False, timeout=180.0
-    ) as client:  # fmt: skip
+    with running(plan(directory, kept=1)) as runtime, monitored.client(runtime) as client:
         first = ended(client, start(client, to_ns=START_NS + 10**9))
         assert (folder / first.id).is_dir()
         second = start(client, mode="paced", pace=0.1)
