@@ -99,10 +99,20 @@ def database_url(kind: str, folder: Path, *, empty: bool = False) -> str:
     return server.new_database(name) if empty else server.new_database(name, _postgres_template())
 
 
-def _filled(url: str) -> None:
+@contextmanager
+def opened(url: str) -> Iterator[Store]:
+    """A history with the usual retention."""
     store = Store(url, Retention())
     store.open()
-    store.close()
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def _filled(url: str) -> None:
+    with opened(url):
+        pass
 
 
 @functools.cache

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from service.history.records import Retention
-from service.history.store import Store
 from tests.service.live import Program, endpoint, program, until
+from tests.service.postgres import opened
 
 KILLS = int(os.environ.get("ROTORWATCH_KILLS", "8"))
 MONITOR_KILLS = 1
@@ -56,12 +55,8 @@ def test_follower_killed_again_and_again_has_the_exact_log(tmp_path: Path) -> No
         started("follow", file)
         until(lambda: f'"sequence":{latest},'.encode() in file.read_bytes().splitlines()[-1], "the end of the log")
     sys.stdout.write(f"{latest + 1} events; {grown} of {KILLS} kills while events came in, {torn} within a line\n")
-    store = Store(history, Retention())
-    store.open()
-    try:
+    with opened(history) as store:
         log = store.machine("demo", "lab").events(limit=latest + 10)
-    finally:
-        store.close()
     assert [event.sequence for event in log] == list(range(latest + 1))
     assert file.read_text(encoding="utf-8").splitlines() == [event.text for event in log]
     # Otherwise the test has shown nothing: the kills must have hit followers at work.

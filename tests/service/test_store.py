@@ -28,7 +28,7 @@ from service.history.records import (
     TokenRecord,
 )
 from service.history.store import Store
-from tests.service.postgres import KINDS, database_url
+from tests.service.postgres import KINDS, database_url, opened
 
 NS = 1_000_000_000
 T0 = 1_767_225_600 * NS
@@ -42,18 +42,14 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture
 def store(url: str) -> Iterator[Store]:
-    made = Store(url, Retention())
-    made.open()
-    yield made
-    made.close()
+    with opened(url) as made:
+        yield made
 
 
 @pytest.fixture(scope="module", params=KINDS)
 def shared(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
-    made = Store(database_url(request.param, tmp_path_factory.mktemp("shared")), Retention())
-    made.open()
-    yield made
-    made.close()
+    with opened(database_url(request.param, tmp_path_factory.mktemp("shared"))) as made:
+        yield made
 
 
 @pytest.fixture
@@ -138,9 +134,7 @@ def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
         assert lab.commit(step) is True
     store.close()
 
-    again = Store(url, Retention())
-    again.open()
-    try:
+    with opened(url) as again:
         lab = again.machine("demo", "lab")
         assert lab.last_sequence() == 5
         assert lab.events() == tuple(step.events[0] for step in steps)
@@ -151,8 +145,6 @@ def test_everything_comes_back_as_it_went_in(store: Store, url: str) -> None:
             assert found == [(one.end_ns, one.value, one.standard_error) for one in kept]
         newest = [(f"part {number:06}", b"part %d" % number) for number in (3, 4, 5)]
         assert lab.restore() == Checkpoint(head(T0 + 25 * NS), tuple(newest))
-    finally:
-        again.close()
 
 
 def test_machines_do_not_see_each_other(store: Store) -> None:
@@ -323,16 +315,12 @@ def test_one_monitor_writes_a_machine(store: Store, url: str) -> None:
     store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
     with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
         store.machine("demo", "lab")
-    other = Store(url, Retention())
-    other.open()
-    try:
+    with opened(url) as other:
         with pytest.raises(StoreError, match="another monitor writes the history of demo/lab"):
             other.machine("demo", "lab")
         other.machine("demo", "pump").commit(Step(events=(alarm_event(0),)))
         store.close()
         assert other.machine("demo", "lab").last_sequence() == 0
-    finally:
-        other.close()
 
 
 def test_a_monitor_that_was_replaced_writes_nothing_more(store: Store, url: str) -> None:
@@ -419,9 +407,7 @@ def test_a_closed_history_says_so(url: str) -> None:
 
 
 def test_history_in_memory_serves_readers_and_writers_at_once() -> None:
-    store = Store("sqlite:///:memory:", Retention())
-    store.open()
-    try:
+    with opened("sqlite:///:memory:") as store:
         machines = [store.machine("demo", f"m{number}") for number in range(4)]
 
         def feed(machine: MachineStore) -> None:
@@ -433,8 +419,6 @@ def test_history_in_memory_serves_readers_and_writers_at_once() -> None:
         with ThreadPoolExecutor(len(machines)) as pool:
             list(pool.map(feed, machines))
         assert len(store.audit.entries(limit=1000)) == 120
-    finally:
-        store.close()
 
 
 @pytest.mark.parametrize(
@@ -476,16 +460,12 @@ def test_a_file_that_is_no_database_is_named(tmp_path: Path) -> None:
 
 def test_sqlite_is_set_up_to_survive_a_power_failure(tmp_path: Path) -> None:
     file = tmp_path / "deep" / "history.sqlite"
-    store = Store(f"sqlite:///{file}", Retention())
-    store.open()
-    try:
+    with opened(f"sqlite:///{file}") as store:
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
         names = ("journal_mode", "synchronous", "foreign_keys", "busy_timeout", "page_size", "wal_autocheckpoint")
         with store._database.reading() as reader:
             found = [reader.scalar(text(f"PRAGMA {name}")) for name in names]
         assert found == ["wal", 2, 1, 5000, 512, 32000]
-    finally:
-        store.close()
     with sqlite3.connect(file) as connection:
         assert connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
     connection.close()

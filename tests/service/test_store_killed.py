@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.history.records import Retention
-from service.history.store import Store
 from tests.service.live import program
-from tests.service.postgres import KINDS, database_url
+from tests.service.postgres import KINDS, database_url, opened
 
 ROUNDS = 4
 
@@ -28,9 +26,7 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
             time.sleep(rng.uniform(0.0, 0.05))  # at any moment of a transaction
             writer.kill()
             safe = int(writer.output().rsplit("\n", 2)[-2])
-        store = Store(url, Retention())
-        store.open()  # the dead process has let go of the machine
-        try:
+        with opened(url) as store:
             lab = store.machine("demo", "lab")
             last = lab.last_sequence()
             steps = (last + 1) // 2
@@ -44,5 +40,3 @@ def test_a_killed_writer_leaves_whole_steps(url: str, tmp_path: Path) -> None:
             assert restored is not None
             assert [part for _, part in restored.parts] == [b"part %d" % n for n in range(steps - 3, steps)]
             safe = steps - 1
-        finally:
-            store.close()

@@ -3,9 +3,7 @@
 import hashlib
 import subprocess
 import sys
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -19,10 +17,9 @@ from structlog.testing import capture_logs
 from service.history import claim
 from service.history.claim import unpack
 from service.history.migrations import migrate
-from service.history.records import Checkpoint, CheckpointHead, Retention, Step, StoredReading, StoreError
-from service.history.store import Store
+from service.history.records import Checkpoint, CheckpointHead, Step, StoredReading, StoreError
 from service.history.tables import REVISION, metadata
-from tests.service.postgres import KINDS, database_url
+from tests.service.postgres import KINDS, database_url, opened
 
 
 @pytest.fixture(params=KINDS)
@@ -33,16 +30,6 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 def engine_for(url: str) -> Engine:
     made = make_url(url)
     return create_engine(made.set(drivername={"sqlite": "sqlite", "postgresql": "postgresql+psycopg"}[made.drivername]))
-
-
-@contextmanager
-def opened(url: str) -> Iterator[Store]:
-    store = Store(url, Retention())
-    store.open()
-    try:
-        yield store
-    finally:
-        store.close()
 
 
 def opened_and_closed(url: str) -> None:

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rotorwatch.records.history import Reading
-from service.history.records import Retention, Step, StoredEvent, StoredReading, StoredReport
+from service.history.records import Step, StoredEvent, StoredReading, StoredReport
 from service.history.store import Store
-from tests.service.postgres import KINDS, database_url
+from tests.service.postgres import KINDS, database_url, opened
 from tests.service.test_store import alarm_event
 
 _T = TypeVar("_T")
@@ -26,10 +26,8 @@ LIMIT = st.integers(1, 7)
 @pytest.fixture(scope="module", params=KINDS)
 def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     folder: Path = tmp_path_factory.mktemp("store")
-    made = Store(database_url(request.param, folder), Retention())
-    made.open()
-    yield made
-    made.close()
+    with opened(database_url(request.param, folder)) as made:
+        yield made
 
 
 def pages(fetch: Callable[[int | None], Sequence[_T]], number: Callable[[_T], int], limit: int) -> list[_T]:

@@ -15,7 +15,7 @@ from service.history.records import Retention, Step, StoredReading
 from service.history.store import Store
 from service.history.tables import buckets, machines
 from service.history.windows import READING, add_up, packed, singles, unpacked
-from tests.service.postgres import KINDS, database_url
+from tests.service.postgres import KINDS, database_url, opened
 from tests.service.test_store import T0, executed
 
 NS = 1_000_000_000
@@ -33,10 +33,8 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
 
 @pytest.fixture
 def store(url: str) -> Iterator[Store]:
-    made = Store(url, Retention())
-    made.open()
-    yield made
-    made.close()
+    with opened(url) as made:
+        yield made
 
 
 def commit(lab: MachineStore, *times_s: float, value: float = 1.0) -> None:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,8 +17,6 @@ from models.machine import Machine, load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
-from service.history.records import Retention
-from service.history.store import Store
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
 from service.stream.checkpoints import stored_event, stored_report
@@ -35,6 +33,7 @@ from tests.service.live import (
     until,
     until_subscribed,
 )
+from tests.service.postgres import opened
 
 BLOCK_S = 0.5
 FIRST, ALL = 78, 124
@@ -87,9 +86,7 @@ class Plant:
 
     def said(self) -> tuple[list[str], list[str]]:
         """Alarm events and reports of the history, to the byte."""
-        store = Store(self.url, Retention())
-        store.open()
-        with closing(store):
+        with opened(self.url) as store:
             lab = store.machine("demo", "lab")
             return [one.text for one in lab.events(limit=1000)], [one.text for _, one in lab.reports(limit=1000)][::-1]
 
