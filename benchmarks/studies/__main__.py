@@ -11,6 +11,7 @@ from benchmarks.studies.delay import delay
 from benchmarks.studies.evaluate import evaluate
 from benchmarks.studies.level_years import level_years
 from benchmarks.studies.levels import levels
+from benchmarks.studies.other_faults import other_faults
 from benchmarks.studies.pages import write_page
 from benchmarks.studies.peers import peers
 from benchmarks.studies.reproduction import reproduction
@@ -28,6 +29,7 @@ STUDIES = {
     "delay": delay,
     "levels": levels,
     "level_years": level_years,
+    "other_faults": other_faults,
     "reproduction": reproduction,
 }
 

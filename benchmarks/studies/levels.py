@@ -4,7 +4,7 @@ Streams are fed to the monitor itself, block by block, and what it raises is cou
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,15 +15,13 @@ from benchmarks.studies import results as r
 from benchmarks.studies.level_streams import KINDS, WINDOW, At, Defect, Gains, drawn, generator
 from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
+from benchmarks.studies.watched import Raised, commissioned, raised
 from models.alarm_names import LEVEL
-from models.commissioning.commission import commission
-from models.commissioning.commissioned import Installed, RecordingEntry
-from models.commissioning.healthy import healthy_from_blocks
+from models.commissioning.commissioned import Installed
 from models.diagnosis.verdict.calibration import MONTH_S
 from models.machine import Machine, MachineFile, load_machine
 from models.signals.block import FloatArray, SampleBlock
 from models.signals.channels import Quantity
-from rotorwatch.records.alarms import EventKind
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event
 from simulator.stream import blocks
@@ -44,43 +42,12 @@ _KIT_BLOCK_S = 0.5
 ComplexArray = npt.NDArray[np.complex128]
 
 
-@dataclass(frozen=True, slots=True)
-class _Raised:
-    name: str
-    at_s: float
-
-
-def _raised(monitor: MachineMonitor, stream: Iterable[SampleBlock]) -> Iterator[_Raised]:
-    """Alarms as they are raised, with times from the first sample."""
-    first_ns: int | None = None
-    for block in stream:
-        first_ns = block.start_ns if first_ns is None else first_ns
-        report = monitor.step(block)
-        if not report.verdict.accepted or report.fault is not None:
-            raise report.fault or ValueError(report.verdict.text)
-        for event in report.events:
-            if event.kind is EventKind.RAISED:
-                yield _Raised(event.alarm.name, (event.time_ns - first_ns) / 1e9)
-
-
-def _commissioned(file: MachineFile, stream: Iterable[SampleBlock]) -> Installed | str:
-    """The machine, commissioned on a healthy stream; or why it was refused."""
-    healthy = list(stream)
-    recording = healthy_from_blocks("healthy", file, [(block, "") for block in healthy])
-    entry = RecordingEntry(
-        name="healthy", sha256="0" * 64, start_ns=healthy[0].start_ns, end_ns=healthy[-1].end_ns,
-        used_s=recording.duration_s, gaps=0,
-    )  # fmt: skip
-    made = commission(file, [recording], [entry])
-    return made.report.summary if made.commissioned is None else Installed(file, None, made.commissioned)
-
-
 # Doublings
 
 
-def _outcome(doubled: str, step_s: float, raised: Iterable[_Raised], channel: str = "") -> dict[str, Value]:
+def _outcome(doubled: str, step_s: float, of: Iterable[Raised], channel: str = "") -> dict[str, Value]:
     """What was raised within two windows of a doubling, and whether anything was before."""
-    found = list(raised)
+    found = list(of)
     after = [one for one in found if step_s < one.at_s <= step_s + 2 * _LENGTH_S]
     of_level = [one for one in after if one.name.startswith(LEVEL + channel)]
     return {
@@ -103,7 +70,7 @@ def _doublings(options: Options, case: int, machine: str, number: int) -> Iterat
         course = partial(_stepped, doubled, step_s, channel)
         monitor = MachineMonitor(Installed(scene.machine))
         stream = scene.blocks(rng, step_s + 2 * _LENGTH_S + 1, course)
-        yield _outcome(doubled, step_s, _raised(monitor, stream), scene.machine.sensors[channel].name)
+        yield _outcome(doubled, step_s, raised(monitor, stream), scene.machine.sensors[channel].name)
 
 
 def _stepped(doubled: str, step_s: float, channel: int, t: FloatArray) -> Gains:
@@ -170,7 +137,7 @@ def _kit_doublings(options: Options, case: int, machine: str, number: int) -> It
     twice = _second_order(kit, speed_rad_s, healthy, ratio)
     if file is kit:  # the theory of a linear rotor has no 2x, and is mostly refused where there is one
         twice = np.zeros_like(twice)
-    installed = _commissioned(file, _with_2x(kit, healthy, twice, np.inf))
+    installed = commissioned(file, _with_2x(kit, healthy, twice, np.inf))
     for at, doubled in enumerate(_DOUBLED[:2] if file is kit else _DOUBLED):
         if isinstance(installed, str):
             yield {"doubled": doubled, "refused": installed}
@@ -181,7 +148,7 @@ def _kit_doublings(options: Options, case: int, machine: str, number: int) -> It
         faults += [Event(at_s=step_s, excitation_level=2.0)] if doubled == "overall" else []
         stream = simulated(own, step_s + 2 * _LENGTH_S + 1, faults)
         changed = _with_2x(kit, stream, twice, np.inf if doubled == "1x" else step_s)
-        yield _outcome(doubled, step_s, _raised(MachineMonitor(installed), changed))
+        yield _outcome(doubled, step_s, raised(MachineMonitor(installed), changed))
 
 
 # Excitation that varies
@@ -209,11 +176,11 @@ def _varying(options: Options, case: int, reference: str, varied: str, number: i
         seconds += windows * _LENGTH_S
     else:
         healthy = scene.blocks(learned, windows * _LENGTH_S + 5.0, partial(_levelled, seen))
-        installed = _commissioned(scene.machine, healthy)
+        installed = commissioned(scene.machine, healthy)
     if isinstance(installed, str):
         yield {"refused": installed}
         return
-    found = list(_raised(MachineMonitor(installed), scene.blocks(watched, seconds, partial(_levelled, levels))))
+    found = list(raised(MachineMonitor(installed), scene.blocks(watched, seconds, partial(_levelled, levels))))
     yield {
         "hours": (seconds - (windows * _LENGTH_S if first else 0.0)) / 3600,
         "alarms": sum(one.name.startswith(LEVEL) for one in found),
@@ -247,14 +214,14 @@ def _bearing(options: Options, case: int, machine: str, number: int) -> Iterator
     )
     own = generator(options.seed, case, number, At.EVALUATION)
     stream = replace(scene, defect=defect).blocks(own, defect.begins_s + defect.growth_s + slower * _LENGTH_S, _steady)
-    raised = next(_raised(MachineMonitor(Installed(scene.machine)), stream), None)
-    early = raised is not None and raised.at_s <= defect.begins_s
-    ratio = None if raised is None or early else defect.overall(raised.at_s)
+    first = next(raised(MachineMonitor(Installed(scene.machine)), stream), None)
+    early = first is not None and first.at_s <= defect.begins_s
+    ratio = None if first is None or early else defect.overall(first.at_s)
     yield {
         "early": early,
         "ratio": ratio,
         "found": ratio is not None and ratio < 2,
-        "first": "" if raised is None else raised.name,
+        "first": "" if first is None else first.name,
     }
 
 

@@ -38,6 +38,7 @@ import scipy  # its sub-packages are loaded when they are first used
 
 from models.checkpoint import checked
 from models.levels.bands import BandLevels, band_edges
+from models.levels.kurtosis import random_kurtosis
 from models.signals.block import FloatArray
 from models.signals.channels import LEAST_APART_DEG, Channel, Quantity, apart_deg
 
@@ -312,6 +313,8 @@ class WindowLevels:
     speed_rad_s : float or None
         Mean speed; None where it is not known.
     bands : BandLevels or None
+    random_kurtosis : ndarray, shape (n_hops, n), or None
+        See `models.levels.kurtosis`.
     """
 
     values: Mapping[str, FloatArray]
@@ -320,6 +323,7 @@ class WindowLevels:
     speed_rad_s: float | None = None
     hops: int = 1
     bands: BandLevels | None = None
+    random_kurtosis: FloatArray | None = None
 
 
 def window_levels(
@@ -351,7 +355,8 @@ def window_levels(
     for number, (y, _) in enumerate(plan.pairs):
         s_max[:, y] = [hop.radius[number] for hop in hops]
     turning = np.abs(np.nan_to_num(speeds_rad_s)) > _STANDS
-    orders = np.stack([hop.orders for hop in hops])[turning]
+    every_order = np.stack([hop.orders for hop in hops])
+    orders = every_order[turning]
     amplitudes, scatter, vectors = _amplitudes(orders, phase_reference=phase_reference)
     measured_1x = amplitudes[1]
     speed_rad_s = float(speeds_rad_s[turning].mean()) if turning.any() else None
@@ -398,7 +403,8 @@ def window_levels(
         in_bands.std(axis=0) / np.sqrt(max(1, count - 1)),
         2 * count * np.maximum(1.0, np.diff(edges) / _HANN_BINS),
     )
-    return WindowLevels(values, errors, vectors, speed_rad_s, count, bands)
+    kurtosis = random_kurtosis(sums[:, 1], sums[:, 4], every_order[:, 1:])
+    return WindowLevels(values, errors, vectors, speed_rad_s, count, bands, kurtosis)
 
 
 def _amplitudes(orders: _ComplexArray, *, phase_reference: bool) -> tuple[FloatArray, FloatArray, _ComplexArray | None]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Self
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from models.checkpoint import checked, texts
 from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
+from models.levels.kurtosis import KurtosisReference, learn_kurtosis
 from models.levels.measures import COMPARED, WindowLevels
 
 _STORED = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -55,7 +57,7 @@ class OperatingState(BaseModel):
         By channel and measure.
     hops : float
         Mean number of hops in a window.
-    bands : dict
+    bands, kurtosis : dict
         By channel.
     """
 
@@ -66,6 +68,7 @@ class OperatingState(BaseModel):
     levels: dict[str, dict[str, ReferenceLevel]]
     hops: float = Field(ge=1)
     bands: dict[str, BandReference] = {}
+    kurtosis: dict[str, KurtosisReference] = Field(default={}, exclude_if=lambda found: not found)
 
 
 class LevelReference(BaseModel):
@@ -131,6 +134,7 @@ def _speed(levels: WindowLevels) -> float:
 def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingState:
     speeds = [one.speed_rad_s for one in group if one.speed_rad_s is not None]
     bands = [one.bands for one in group if one.bands is not None]
+    kurtosis = [one.random_kurtosis for one in group if one.random_kurtosis is not None]
     return OperatingState(
         windows=len(group),
         speed_rad_s=(min(speeds), max(speeds)) if speeds else None,
@@ -141,6 +145,11 @@ def _state(channels: Sequence[str], group: Sequence[WindowLevels]) -> OperatingS
         hops=float(np.mean([one.hops for one in group])),
         bands={
             channel: learn_bands(bands, column) for column, channel in enumerate(channels) if len(bands) == len(group)
+        },
+        kurtosis={
+            channel: learned
+            for column, channel in enumerate(channels)
+            if len(kurtosis) == len(group) and (learned := learn_kurtosis([one[:, column] for one in kurtosis]))
         },
     )
 
@@ -192,7 +201,8 @@ class FirstWindows:
         if self.reference is not None or start_ns < self._end_ns:
             return
         self._end_ns = end_ns
-        self._seen.append(levels)
+        # Only diagnosis needs a healthy kurtosis, and a machine that is diagnosed is commissioned.
+        self._seen.append(replace(levels, random_kurtosis=None))
         if len(self._seen) == self._count:
             self.reference = learn_levels("the first windows", self._channels, self._seen)
             self._seen = []

@@ -95,11 +95,18 @@ class Evaluation:
         """Why no parameter could be read, every reason once."""
         return "; ".join(dict.fromkeys(one.reason for one in self.deciding.parameters if one.reason))
 
-    def named(self, channels: Sequence[Channel]) -> "Evaluation":
-        """The same with sentences in the names of a machine's channels."""
+    def named(self, channels: Sequence[Channel], foreign: str) -> "Evaluation":
+        """The same with sentences in the names of a machine's channels.
+
+        Parameters
+        ----------
+        foreign : str
+            What was seen that no change of a parameter makes: the first suspect. Empty if nothing.
+        """
+        suspect = foreign or with_channel_names(self.deciding.suspect, channels)
         return replace(
             self,
-            deciding=replace(self.deciding, suspect=with_channel_names(self.deciding.suspect, channels)),
+            deciding=replace(self.deciding, suspect=suspect),
             shapes=tuple(
                 one.model_copy(update={"text": with_channel_names(one.text, channels)}) for one in self.shapes
             ),

@@ -7,6 +7,7 @@ from models.commissioning.commissioned import Installed
 from models.diagnosis.moments import Plan
 from models.diagnosis.window import SlidingWindow
 from models.levels.judgement import LevelJudge, channel_state
+from models.levels.kurtosis import departure
 from models.levels.measures import WindowLevels
 from models.levels.reference import FirstWindows, LevelReference
 from models.machine import MachineFile
@@ -45,6 +46,8 @@ class LevelWatch:
         self._commissioned = None if installed.commissioned is None else installed.commissioned.levels
         self.first = FirstWindows([channel.name for channel in channels], machine.levels.reference_windows)
         self.latest: tuple[ChannelLevels, ...] = ()
+        self._found: WindowLevels | None = None
+        self._channels = channels
         self._states = [state_name(channel) for channel in channels]
         self._hop_ns = round(machine.window.hop_s * 1e9)
 
@@ -63,8 +66,43 @@ class LevelWatch:
         if found is None:
             return
         self.latest = self.judged(found)
+        self._found = found
         if self._takes_first and window.filled == 1:
             self.first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
+
+    def foreign(self, *, named: bool) -> str:
+        """What the latest levels show that no change of a parameter makes; empty if nothing.
+
+        A 2x that has grown, or a random part that is not Gaussian as it was on the healthy machine.
+
+        Parameters
+        ----------
+        named : bool
+            Whether a parameter has been found to have changed, which this would cast doubt on.
+        """
+        levels = self._found
+        if levels is None:
+            return ""
+        grown = [limits.text for one in self.latest for limits in one.limits if limits.measure == "x2" and limits.text]
+        if grown:
+            return grown[0]
+        state, seen = (None, False) if self.reference is None else self.reference.at(levels.speed_rad_s)
+        if state is None or not seen or levels.random_kurtosis is None:
+            return ""
+        found = [
+            (departure(levels.random_kurtosis[:, column], state.kurtosis[channel.name], doubt=named), channel)
+            for column, channel in enumerate(self._channels)
+            if channel.name in state.kurtosis
+        ]
+        most, channel = max(found, key=lambda one: abs(one[0]), default=(0.0, None))
+        if channel is None or not most:
+            return ""
+        healthy = state.kurtosis[channel.name].mean
+        how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub or a loose part"
+        return (
+            f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
+            f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
+        )
 
     def tell(self, alarms: AlarmBook, end_ns: int, *, faulty: Collection[str] = (), explained: bool = False) -> None:
         """Let operators hear of what is beyond its limits at the end of a hop.

@@ -436,12 +436,12 @@ class MachineMonitor:
             self._levels.tell(self._alarms, end_ns, faulty=faulty)
             state = self._state(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE)
             return Report(**self._window_now(statistics.start_ns, end_ns, state), sensors=findings, reason=str(error))
-        evaluation = evaluation.named(self.machine.sensors)
+        foreign = self._levels.foreign(named=bool(self._test.state.findings))
+        evaluation = evaluation.named(self.machine.sensors, foreign)
         looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
         whole = self._test.settings.window_hops
         looks[whole] = stretch_of(evaluation.deciding, statistics.start_ns, end_ns)
-        verdict = self._test.update(looks)
-        changed = [shape.text for shape in evaluation.shapes if shape.verdict == "changed"]
+        verdict = self._test.update(looks, foreign=foreign != "")
         self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
         self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=bool(verdict.changed))
         unexplained = evaluation.deciding.unexplained
@@ -450,10 +450,10 @@ class MachineMonitor:
         if not unexplained and not evaluation.deciding.evaluable:
             reason = evaluation.why_nothing
         if evaluation.shapes:
+            changed = "; ".join(shape.text for shape in evaluation.shapes if shape.verdict == "changed")
             evidence = Evidence(start_ns=statistics.start_ns, end_ns=end_ns)
-            self._alarms.update_state(SHAPE, bool(changed), end_ns, "; ".join(changed), evidence=evidence)
-        outside = verdict.outside_model
-        calm = evaluation.calm(outside=outside)
+            self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
+        calm = evaluation.calm(outside=verdict.outside_model)
         if not self._plan.states and self._levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
         state = self._state(calm)
@@ -464,7 +464,7 @@ class MachineMonitor:
             equations=evaluation.equations,
             opinions=evaluation.opinions,
             misfit_z=evaluation.deciding.misfit_z,
-            suspect=evaluation.deciding.suspect if outside and not unexplained else "",
+            suspect=evaluation.deciding.suspect if verdict.outside_model and not unexplained else "",
             verdict=verdict,
             sensors=findings,
             detectable=()

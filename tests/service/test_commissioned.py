@@ -8,13 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from models.alarm_names import LEVEL
+from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
 from models.machine import AlarmSettings
+from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
-from simulator.scenario import Event
+from simulator.scenario import Event, Rub, load_scenario
+from simulator.stream import blocks
 from tests.commissioning.rotor_kit import LAB, NOTHING, commissioned, recording, samples_of, stream, with_samples
 from tests.service.test_monitor import feed
 
@@ -75,6 +77,18 @@ def test_another_speed_is_not_evaluable_here_and_raises_nothing_but_levels() -> 
     assert all("not evaluable here: speed is 1518 rpm" in window.reason for window in full(windows))
     # Louder than it was at the commissioned speed is said, and what that is worth.
     assert all("commissioned at another speed" in event.alarm.note for event in events)
+
+
+def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve() -> None:
+    scenario, machine = load_scenario("healthy")
+    rubbing = scenario.model_copy(
+        update={"rub": Rub(clearance_m=4e-5), "events": (Event(at_s=0.0, anomaly="rub", size=2.0),)}
+    ).overridden(duration_s=75.0, seed=SEED + 7)
+    windows, events = feed(MachineMonitor(installed()), [block for block, _ in blocks(rubbing, machine)])
+    assert "clipped, as by a rub" in full(windows)[-1].suspect
+    raised = {event.alarm.name: event.alarm for event in events}
+    assert "clipped, as by a rub" in raised[MODEL].note
+    assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
 
 
 def _faulty(kind: str) -> list[SampleBlock]:

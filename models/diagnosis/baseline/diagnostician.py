@@ -1,7 +1,8 @@
 """The diagnosis of a window against a baseline, and where a bearing's change is a sensor's gain.
 
 In a row that balances the bearing's forces against the disc's inertia, a gain error at the bearing or at the disc
-scales every one of the row's own parameters alike. Where a place has one sensor only, nothing else would show it.
+scales every one of the row's own parameters alike. One sensor of several at a place gives itself away; of a single one,
+or of all that share a transducer, nothing else would show it.
 """
 
 import itertools
@@ -39,7 +40,7 @@ _MOST_LOSS = -0.95
 class GainSuspicion:
     """A common factor that explains the row's own parameters as well as separate changes do."""
 
-    sentence: str  # ``gain of y1 or y2``
+    sentence: str  # ``gain of y1 or of y2``
     factor: float  # relative change of all of the row's own parameters
     # The factor in standard errors, as a one-sided normal variable that knows of how many rows it is the largest.
     z: float
@@ -48,7 +49,7 @@ class GainSuspicion:
 def gain_suspicion(
     diagnosis: Diagnosis, rows: Sequence[Row], relations: Sequence[Relation | None]
 ) -> GainSuspicion | None:
-    """Find the row whose changes look most like a gain error of a place with a single sensor.
+    """Find the row whose changes look most like a gain error of all sensors of a place.
 
     Returns
     -------
@@ -56,25 +57,15 @@ def gain_suspicion(
         None where single parameters explain the window, or a common factor does not.
     """
     tested = [
-        (row, single)
+        (row, relation)
         for row, relation in zip(rows, relations, strict=True)
-        if relation is not None and len(row.own) > 1 and (single := _single_sensors(row, relation))
+        if relation is not None and len(row.own) > 1
     ]
-    found = [_row_suspicion(diagnosis, row, single, len(tested)) for row, single in tested]
+    found = [_row_suspicion(diagnosis, row, relation, len(tested)) for row, relation in tested]
     return max((one for one in found if one is not None), key=lambda one: one.z, default=None)
 
 
-def _single_sensors(row: Row, relation: Relation) -> tuple[str, ...]:
-    """States of the row's coordinates that are measured in one way only."""
-    single = []
-    for coordinate in dict.fromkeys(motion.coordinate for motion in row.motions):
-        states = [name for name in relation.states if name == coordinate or name.startswith(f"{coordinate}_")]
-        if len(states) == 1:
-            single += states
-    return tuple(single)
-
-
-def _row_suspicion(diagnosis: Diagnosis, row: Row, single: tuple[str, ...], tested: int) -> GainSuspicion | None:
+def _row_suspicion(diagnosis: Diagnosis, row: Row, relation: Relation, tested: int) -> GainSuspicion | None:
     readings = diagnosis.evaluable
     names = [reading.name for reading in readings]
     if any(own.parameter not in names for own in row.own):
@@ -93,7 +84,11 @@ def _row_suspicion(diagnosis: Diagnosis, row: Row, single: tuple[str, ...], test
         return None
     tail = 2 * tested * float(ndtr(-abs(factor) * math.sqrt(weight)))
     z = -float(ndtri(min(0.5, max(tail, 1e-300))))
-    return GainSuspicion(f"gain of {' or '.join(single)}", math.expm1(factor), z)
+    places = [
+        " and ".join(name for name in relation.states if name == coordinate or name.startswith(f"{coordinate}_"))
+        for coordinate in dict.fromkeys(motion.coordinate for motion in row.motions)
+    ]
+    return GainSuspicion(f"gain of {' or of '.join(filter(None, places))}", math.expm1(factor), z)
 
 
 _WORST_ERROR = 0.2

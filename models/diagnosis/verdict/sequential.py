@@ -240,7 +240,7 @@ class SequentialTest:
                 return (max((hops for hops in short if hops <= next_hops), default=short[0]),)
         return short
 
-    def update(self, looks: Mapping[int, Stretch]) -> Verdict:
+    def update(self, looks: Mapping[int, Stretch], *, foreign: bool = False) -> Verdict:
         """Judge one hop.
 
         Parameters
@@ -248,6 +248,8 @@ class SequentialTest:
         looks : mapping of int to Stretch
             Stretches that end with this hop, by their hops: the full window, and those of the short ones that are
             there. `wanted` says which suffice.
+        foreign : bool
+            Whether something was seen that no change of a parameter makes.
 
         Raises
         ------
@@ -277,7 +279,8 @@ class SequentialTest:
         else:
             self._note(isolation.changed, every, clean, verdicts)
         current = self._current(clean[deciding[-1]], isolation.changed) if deciding and not unexplained else ()
-        isolation = replace(isolation, outside=bool(unexplained) or outside, outside_confidence=confidence)
+        outside = bool(unexplained) or outside or foreign
+        isolation = replace(isolation, outside=outside, outside_confidence=confidence)
         self.unexplained = unexplained
         findings = () if unexplained else self.state.findings
         detected = bool(verdicts) and not unexplained

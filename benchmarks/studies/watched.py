@@ -1,0 +1,52 @@
+"""A machine commissioned on a healthy stream and watched by the monitor itself, and what it raises."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from models.commissioning.commission import commission
+from models.commissioning.commissioned import Installed, RecordingEntry
+from models.commissioning.healthy import healthy_from_blocks
+from models.machine import MachineFile
+from models.signals.block import SampleBlock
+from rotorwatch.records.alarms import EventKind
+from service.monitor.monitor import MachineMonitor
+
+
+@dataclass(frozen=True, slots=True)
+class Raised:
+    """An alarm that was raised; time from the first sample."""
+
+    name: str
+    at_s: float
+    low_confidence: bool
+    note: str
+
+
+def raised(monitor: MachineMonitor, stream: Iterable[SampleBlock]) -> Iterator[Raised]:
+    """Alarms as they are raised."""
+    first_ns: int | None = None
+    for block in stream:
+        first_ns = block.start_ns if first_ns is None else first_ns
+        report = monitor.step(block)
+        if not report.verdict.accepted or report.fault is not None:
+            raise report.fault or ValueError(report.verdict.text)
+        for event in report.events:
+            if event.kind is EventKind.RAISED:
+                alarm = event.alarm
+                yield Raised(alarm.name, (event.time_ns - first_ns) / 1e9, alarm.low_confidence, alarm.note)
+
+
+def commissioned(file: MachineFile, *streams: Iterable[SampleBlock]) -> Installed | str:
+    """The machine, commissioned on healthy streams of one condition each; or why it was refused."""
+    recordings, entries = [], []
+    for number, stream in enumerate(streams, start=1):
+        healthy, name = list(stream), f"healthy {number}"
+        recordings.append(healthy_from_blocks(name, file, [(block, "") for block in healthy]))
+        entries.append(
+            RecordingEntry(
+                name=name, sha256=f"{number:064d}", start_ns=healthy[0].start_ns, end_ns=healthy[-1].end_ns,
+                used_s=recordings[-1].duration_s, gaps=0,
+            )
+        )  # fmt: skip
+    made = commission(file, recordings, entries)
+    return made.report.summary if made.commissioned is None else Installed(file, None, made.commissioned)

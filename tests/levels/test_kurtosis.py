@@ -1,0 +1,88 @@
+"""The kurtosis of a random part against closed forms, and what departs from a healthy machine's."""
+
+import numpy as np
+import pytest
+
+from models.levels.kurtosis import KurtosisReference, departure, learn_kurtosis
+from models.levels.measures import LevelPlan, WindowLevels, hop_levels, level_plan, window_levels
+from models.signals.block import FloatArray
+from models.signals.channels import Channel
+
+RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
+Y = Channel.model_validate(
+    {"name": "y2", "quantity": "displacement", "location": "disc", "direction": "y", "unit": "um"}
+)
+PLAN: LevelPlan = level_plan([Y], RATE_HZ, (10.0, 400.0))
+T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
+THETA = 2 * np.pi * 23.0 * T
+
+
+def noise(seed: int) -> FloatArray:
+    return np.random.default_rng([20261123, seed]).standard_normal(T.size)
+
+
+def window(samples: FloatArray, *, turning: bool = True) -> WindowLevels:
+    angles = np.split(THETA, HOPS) if turning else [None] * HOPS
+    hops = [
+        hop_levels(PLAN, 1e-6 * part[:, None], angle)
+        for part, angle in zip(np.split(samples, HOPS), angles, strict=True)
+    ]
+    speed = 2 * np.pi * 23.0 if turning else np.nan
+    return window_levels(PLAN, hops, np.full(HOPS, speed), phase_reference=turning)
+
+
+def kurtosis(samples: FloatArray, *, turning: bool = True) -> FloatArray:
+    found = window(samples, turning=turning).random_kurtosis
+    assert found is not None
+    return found[:, 0]
+
+
+@pytest.mark.parametrize("lines", [(0.0, 0.0), (2.0, 0.0), (3.0, 1.0)])
+def test_gaussian_vibration_has_three_whatever_its_lines(lines: tuple[float, float]) -> None:
+    first, second = lines
+    samples = noise(1) + first * np.cos(THETA + 0.4) + second * np.cos(2 * THETA)
+    # 5000 samples a hop: their kurtosis scatters by √(24 / 60 000) over twelve of them
+    assert kurtosis(samples).mean() == pytest.approx(3, abs=5 * np.sqrt(24 / T.size))
+
+
+def test_what_clips_is_below_and_what_knocks_above() -> None:
+    # A normal variable clipped at 1.5 of its deviations, from its moments: 1.2357 / 0.7785².
+    assert kurtosis(np.clip(noise(2), -1.5, 1.5)).mean() == pytest.approx(2.039, abs=0.03)
+    knocks = np.zeros(T.size)
+    knocks[:: round(RATE_HZ / 10)] = 5.0
+    assert kurtosis(noise(3) + knocks).mean() > 6
+
+
+def test_without_a_known_rotation_nothing_is_said() -> None:
+    found = kurtosis(noise(4), turning=False)
+    assert np.all(np.isnan(found))
+    assert learn_kurtosis([found]) is None
+
+
+def reference() -> KurtosisReference:
+    learned = learn_kurtosis([kurtosis(noise(10 + n) + 2 * np.cos(THETA)) for n in range(5)])
+    assert learned is not None
+    return learned
+
+
+def test_healthy_windows_stay_within_the_limit_and_another_excitation_too() -> None:
+    healthy = reference()
+    assert healthy.hops == 60
+    for n in range(40):
+        gain = np.repeat(np.random.default_rng([7, n]).uniform(0.5, 2.0, HOPS), T.size // HOPS)
+        samples = gain * noise(100 + n) + (1 + n % 3) * np.cos(THETA)
+        assert departure(kurtosis(samples), healthy) == 0.0
+
+
+def test_a_departure_is_seen_in_the_newest_half_before_the_window_is_full_of_it() -> None:
+    healthy, samples = reference(), noise(200) + 2 * np.cos(THETA)
+    at = T.size // 2
+    samples[at:] = np.clip(samples[at:], -2.5, 2.5)
+    assert departure(kurtosis(samples), healthy) < 0
+
+
+def test_less_will_do_to_doubt_what_else_was_found() -> None:
+    healthy = KurtosisReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
+    by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
+    assert departure(by_five_errors, healthy) == 0.0
+    assert departure(by_five_errors, healthy, doubt=True) == pytest.approx(-0.144, abs=1e-3)
