@@ -446,7 +446,8 @@ def _in_words(findings: Sequence[Finding], isolation: Isolation, *, detected: bo
         )
         # Never more sure than can be.
         sure = "above 99.9 %" if isolation.confidence > 0.9995 else f"{100 * isolation.confidence:.1f} %"
-        text = f"changed: {found}; confidence {sure}"
+        within = " among changes of parameters" if isolation.outside else ""
+        text = f"changed: {found}; confidence {sure}{within}"
     elif detected:
         text = "something has changed; too little data yet to say what"
     else:
