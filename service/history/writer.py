@@ -22,6 +22,7 @@ from service.history.tables import machines
 
 _LOCK = 0x726F746F  # first number of PostgreSQL's advisory locks; the second is the machine's
 _LOOK_S = 2.0  # between looks whether the database is still where it should be
+_LETS_GO_S = 2.0  # PostgreSQL notices within it that a monitor that was killed has gone
 _PATIENCE = 4.0  # times the database's timeout: others may be before this step
 _log = structlog.get_logger("rotorwatch", part="history")
 
@@ -236,8 +237,12 @@ class Writer:
                     if descriptor is None:
                         raise _taken(claim)
                     undo.callback(os.close, descriptor)
-                elif not self._database.is_sqlite and not _lock_row(connection, found):
-                    raise _taken(claim)
+                elif not self._database.is_sqlite:
+                    patience = time.monotonic() + _LETS_GO_S
+                    while not _lock_row(connection, found):
+                        if time.monotonic() > patience:
+                            raise _taken(claim)
+                        time.sleep(0.05)
                 chosen = machines.c.machine_id == found
                 connection.execute(update(machines).where(chosen).values(owner=owner))
                 steps = connection.execute(select(machines.c.steps).where(chosen)).scalar_one()

@@ -323,6 +323,16 @@ def test_one_monitor_writes_a_machine(store: Store, url: str) -> None:
         assert other.machine("demo", "lab").last_sequence() == 0
 
 
+@pytest.mark.parametrize("url", ["postgresql"], indirect=True)
+def test_a_server_may_take_its_time_to_notice_that_a_monitor_was_killed(store: Store, url: str) -> None:
+    store.machine("demo", "lab").commit(Step(events=(alarm_event(0),)))
+    with opened(url) as other:
+        ending = threading.Timer(0.3, store.close)
+        ending.start()
+        assert other.machine("demo", "lab").last_sequence() == 0
+        ending.join()
+
+
 def test_a_monitor_that_was_replaced_writes_nothing_more(store: Store, url: str) -> None:
     lab = store.machine("demo", "lab")
     assert lab.commit(hop_step(0))
