@@ -233,7 +233,7 @@ def _watched(subject: _Subject, monitor: MachineMonitor, fault: str) -> dict[str
         "named at first without reserve": any(not one.low_confidence for one in named),
         "without reserve": any(not one.low_confidence for one in standing),
         "blamed": ", ".join(dict.fromkeys(one.name for one in named)),
-        "level": any(one.name.startswith(LEVEL) for one in after),
+        "levels": any(one.name.startswith(LEVEL) for one in after),
         "model": any(one.name in {MODEL, SHAPE} for one in after),
         "changed": any(one.name == CHANGED for one in after),
         "data": any(one.name.startswith(DATA) for one in after),
@@ -253,10 +253,11 @@ def _heard(rows: Sequence[Record]) -> list[Record]:
 _COLUMNS = {
     "streams": len,
     "heard": r.share("heard"),
-    "by levels": r.share("level"),
+    "by levels": r.share("levels"),
     "outside the model": r.share("model"),
     "sensor or data": r.share("data"),
     "k, c or e named": r.share("named"),
+    "at first without reserve": r.share("named at first without reserve"),
     "left without reserve": r.share("without reserve"),
     "delay, median s": r.middle("delay_s"),
 }
