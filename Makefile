@@ -14,8 +14,8 @@ RUN := $(VENV)/.run
 READY := $(VENV)/.ready
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable
 MODELS_AND_MONITOR := tests/test_doctests.py tests/physics tests/signals tests/diagnosis tests/commissioning $(wildcard tests/service/test_monitor*.py)
-# Twice the cores of a small computer: many tests wait more than they compute.
-WORKERS ?= 4
+# Three times the cores of a small computer: many tests wait more than they compute.
+WORKERS ?= 6
 FAULT ?= k_by
 SEED ?= 1
 PACE ?= 10

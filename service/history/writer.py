@@ -238,7 +238,7 @@ class Writer:
                         raise _taken(claim)
                     undo.callback(os.close, descriptor)
                 elif not self._database.is_sqlite:
-                    patience = time.monotonic() + _LETS_GO_S
+                    patience = time.monotonic() + min(_LETS_GO_S, self._database.timeout_s)
                     while not _lock_row(connection, found):
                         if time.monotonic() > patience:
                             raise _taken(claim)
