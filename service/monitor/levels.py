@@ -83,12 +83,13 @@ class LevelWatch:
         levels = self._found
         if levels is None:
             return ""
-        grown = [limits.text for one in self.latest for limits in one.limits if limits.measure == "x2" and limits.text]
-        if grown:
-            return grown[0]
         state, seen = (None, False) if self.reference is None else self.reference.at(levels.speed_rad_s)
-        if state is None or not seen or levels.random_kurtosis is None:
+        if state is None or not seen:  # at another speed much is otherwise
             return ""
+        twice = [one.limit("x2") for one in self.latest]
+        grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
+        if grown or levels.random_kurtosis is None:
+            return next(iter(grown), "")
         found = [
             (departure(levels.random_kurtosis[:, column], state.kurtosis[channel.name], doubt=named), channel)
             for column, channel in enumerate(self._channels)

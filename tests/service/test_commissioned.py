@@ -10,6 +10,7 @@ import pytest
 
 from models.alarm_names import LEVEL, MODEL
 from models.commissioning.commissioned import Installed
+from models.levels.settings import LevelSettings
 from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
@@ -89,6 +90,15 @@ def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve() -> None:
     raised = {event.alarm.name: event.alarm for event in events}
     assert "clipped, as by a rub" in raised[MODEL].note
     assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
+
+
+def test_a_2x_beyond_a_limit_of_ones_own_has_not_grown_and_doubts_nothing() -> None:
+    own = LevelSettings.model_validate({"limits": [{"channel": "y1", "measure": "x2", "alert": 1e-3, "danger": 1e3}]})
+    machine = MACHINE.model_copy(update={"levels": own})
+    monitor = MachineMonitor(Installed(machine, None, installed().commissioned))
+    windows, events = feed(monitor, stream(85.0, SEED + 1)[:650])
+    assert {event.alarm.name for event in events} == {f"{LEVEL}y1"}
+    assert not any(window.suspect for window in windows)
 
 
 def _faulty(kind: str) -> list[SampleBlock]:
