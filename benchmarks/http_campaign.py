@@ -138,7 +138,7 @@ def campaign(one: Monitor, attack: Attack, count: int, duration_s: float, limit:
             trickled_s = now_s
         asked.append(one.asked())
         most = max(most, one.files())
-        time.sleep(0.05)
+        time.sleep(0.02)
     end_s = time.monotonic()
     opened = callers.opened
     if attack.name == "event streams":  # who is answered may stay, so these have to leave

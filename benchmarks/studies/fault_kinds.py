@@ -8,14 +8,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
+from benchmarks.finite_elements.assembly import ComplexArray
 from models.signals.block import FloatArray
 
 MOTIONS = (("bearing", "y"), ("disc", "y"), ("bearing", "z"), ("disc", "z"))
 _BEARING_Y, _DISC_Y, _BEARING_Z, _DISC_Z = range(4)
-
-ComplexArray = npt.NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,15 +24,14 @@ class Rotor:
     ----------
     response : callable
         Of displacements to unit forces at `MOTIONS` at frequencies, Hz: shape (n, 4, 4), m/N.
-    bearing : Bearing
-        Of the probed one.
+    bearing : (float, float)
+        Stiffness, N/m, and damping, Ns/m, of the probed one, mean of both planes.
     """
 
     speed_hz: float
     rate_hz: float
     response: Callable[[FloatArray], ComplexArray]
     bearing: tuple[float, float]
-    """Stiffness, N/m, and damping, Ns/m, of the probed bearing, mean of both planes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,13 +10,13 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.finite_elements.assembly import assemble, probed
+from benchmarks.finite_elements.assembly import ComplexArray, Equations, assemble, probed
 from benchmarks.finite_elements.machines import rotor_named
 from benchmarks.finite_elements.observed import RATE_HZ, RunCondition, WindowSizes, machine_of, sampled
 from benchmarks.finite_elements.rotor import BeamRotor
 from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
 from benchmarks.studies import results as r
-from benchmarks.studies.fault_kinds import CRACK, FAULTS, HEALTHY, MOTIONS, RUBS, ComplexArray, Rotor, Seen
+from benchmarks.studies.fault_kinds import CRACK, FAULTS, HEALTHY, MOTIONS, RUBS, Rotor, Seen
 from benchmarks.studies.results import Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
 from benchmarks.studies.subjects import SHIPPED, SUBJECTS
@@ -46,12 +46,10 @@ _ALIKE = (1.35, 1.65)
 # Machines
 
 
-def _response(M: FloatArray, C: FloatArray, K: FloatArray, kept: Sequence[int], f: FloatArray) -> ComplexArray:
-    """Displacements at some coordinates under unit forces there, from a few modes of the state matrix."""
-    n = len(M)
-    A = np.vstack([np.hstack([np.zeros((n, n)), np.eye(n)]), -np.linalg.solve(M, np.hstack([K, C]))])
-    roots, shapes = np.linalg.eig(A)
-    inputs = np.vstack([np.zeros((n, len(kept))), np.linalg.inv(M)[:, kept]])
+def _response(equations: Equations, kept: Sequence[int], f: FloatArray) -> ComplexArray:
+    """Displacements at some coordinates under unit forces there, from the modes of the state matrix."""
+    roots, shapes = np.linalg.eig(equations.A)
+    inputs = np.vstack([np.zeros((len(equations.M), len(kept))), np.linalg.inv(equations.M)[:, kept]])
     drive = np.linalg.solve(shapes, inputs.astype(np.complex128))
     factors = 1 / (2j * np.pi * f[:, None] - roots)
     pairs = (shapes[kept][:, None, :] * drive.T[None, :, :]).reshape(len(kept) ** 2, -1)
@@ -66,9 +64,6 @@ class _Subject:
     level: KnowledgeLevel
     seed: int
     number: int
-
-    def rng(self, *purpose: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, SUBJECTS.index(self.name), self.number, *purpose])
 
     @property
     def file(self) -> MachineFile:
@@ -131,7 +126,7 @@ class _Subject:
 def _of_beam(beam: BeamRotor, ran: RunCondition, seconds: float, seed: list[int]) -> tuple[Rotor, Seen]:
     found = sampled(beam, ran, seconds, seed)
     equations, bearing = assemble(beam, ran.speed_rad_s), beam.bearings[0]
-    response = partial(_response, equations.M, equations.C, equations.K, list(probed(beam)))
+    response = partial(_response, equations, list(probed(beam)))
     both = (bearing.k_y + bearing.k_z) / 2, (bearing.c_y + bearing.c_z) / 2
     speed_hz = ran.speed_rad_s / (2 * np.pi)
     return Rotor(speed_hz, RATE_HZ, response, both), Seen(found[:, :4], found[:, 4:8], found[:, 8])
@@ -147,7 +142,8 @@ def _of_shipped(machine: Machine, scenarios: Iterator[Scenario]) -> tuple[Rotor,
     angle = si[:, columns[Quantity.SHAFT_ANGLE, "shaft", "rotation"]]
     rotor, speed_rad_s = machine.rotor, _speed_rad_s(scenario)
     kept = [STATE_INDEX[name] for name in ("y1", "y2", "z1", "z2")]
-    response = partial(_response, M_matrix(rotor), P_matrix(rotor, speed_rad_s), Q_matrix(rotor), kept)
+    equations = Equations(M_matrix(rotor), P_matrix(rotor, speed_rad_s), Q_matrix(rotor))
+    response = partial(_response, equations, kept)
     both = (rotor.k_by_N_per_m + rotor.k_bz_N_per_m) / 2, (rotor.c_by_N_s_per_m + rotor.c_bz_N_s_per_m) / 2
     return Rotor(speed_rad_s / (2 * np.pi), machine.rate_hz, response, both), Seen(motion, rate, angle)
 

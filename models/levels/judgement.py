@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.levels.bands import Growth, growth
+from models.levels.kurtosis import departure
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
 from models.levels.settings import LevelSettings
@@ -21,6 +22,8 @@ from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth
 
 _BEYOND_RANGE = 1.25
 _ERRORS = 6.0
+_ERRORS_OF_DOUBT = 4.0
+"""Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED = 0.6
 _DEADBAND = 0.9
 _PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
@@ -60,6 +63,43 @@ class LevelJudge:
     def judge(self, levels: WindowLevels, reference: LevelReference | None) -> tuple[ChannelLevels, ...]:
         """Levels of one window, channel by channel."""
         return tuple(self._channel(column, levels, reference) for column in range(len(self._channels)))
+
+    def foreign(
+        self, levels: WindowLevels, judged: Sequence[ChannelLevels], reference: LevelReference | None, *, named: bool
+    ) -> str:
+        """What the levels of a window show that no change of a parameter makes; empty if nothing.
+
+        A 2x that has grown, or a random part that is not Gaussian as it was on the healthy machine.
+
+        Parameters
+        ----------
+        judged : sequence of ChannelLevels
+            What `judge` says of them.
+        named : bool
+            Whether a parameter has been found to have changed, which this would cast doubt on.
+        """
+        state, seen = (None, False) if reference is None else reference.at(levels.speed_rad_s)
+        if state is None or not seen:  # at another speed much is otherwise
+            return ""
+        twice = [one.limit("x2") for one in judged]
+        grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
+        if grown or levels.random_kurtosis is None:
+            return next(iter(grown), "")
+        n_errors = _ERRORS_OF_DOUBT if named else _ERRORS
+        found = [
+            (departure(levels.random_kurtosis[:, column], state.kurtosis[one.name], _BEYOND_RANGE, n_errors), one)
+            for column, one in enumerate(self._channels)
+            if one.name in state.kurtosis
+        ]
+        most, channel = max(found, key=lambda one: abs(one[0]), default=(0.0, None))
+        if channel is None or not most:
+            return ""
+        healthy = state.kurtosis[channel.name].mean
+        how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub or a loose part"
+        return (
+            f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
+            f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
+        )
 
     def _channel(self, column: int, levels: WindowLevels, reference: LevelReference | None) -> ChannelLevels:
         channel, speed_rad_s = self._channels[column], levels.speed_rad_s

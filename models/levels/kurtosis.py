@@ -13,9 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from models.signals.block import FloatArray
 
-_ERRORS, _ERRORS_OF_DOUBT = 6.0, 4.0
-_BEYOND_RANGE = 1.25
-
 
 def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[np.complex128]) -> FloatArray:
     """Kurtosis of each hop without what its lines take from it, shape (n_hops, n); nan where these are not known.
@@ -68,21 +65,19 @@ def learn_kurtosis(windows: Sequence[FloatArray]) -> KurtosisReference | None:
     )
 
 
-def departure(hops: FloatArray, reference: KurtosisReference, *, doubt: bool = False) -> float:
+def departure(hops: FloatArray, reference: KurtosisReference, beyond_range: float, n_errors: float) -> float:
     """Difference from the healthy mean, of the newest half of a window or of all of it; 0 within its limit.
-
-    The limit is six standard errors, and a quarter beyond the healthy range.
 
     Parameters
     ----------
-    doubt : bool
-        Four standard errors will do: it decides whether to believe something else that has been found, not whether
-        anything has happened.
+    beyond_range : float
+        No limit is nearer than that, times the healthy range.
+    n_errors : float
+        Nor nearer than so many standard errors.
     """
-    errors = _ERRORS_OF_DOUBT if doubt else _ERRORS
     for count in (max(1, len(hops) // 2), len(hops)):
         difference = float(hops[-count:].mean()) - reference.mean
-        by_chance = errors * reference.scatter * np.sqrt(1 / count + 1 / reference.hops)
-        if abs(difference) > max(by_chance, _BEYOND_RANGE * reference.range * np.sqrt(len(hops) / count)):
+        by_chance = n_errors * reference.scatter * np.sqrt(1 / count + 1 / reference.hops)
+        if abs(difference) > max(by_chance, beyond_range * reference.range * np.sqrt(len(hops) / count)):
             return difference
     return 0.0

@@ -7,7 +7,6 @@ from models.commissioning.commissioned import Installed
 from models.diagnosis.moments import Plan
 from models.diagnosis.window import SlidingWindow
 from models.levels.judgement import LevelJudge, channel_state
-from models.levels.kurtosis import departure
 from models.levels.measures import WindowLevels
 from models.levels.reference import FirstWindows, LevelReference
 from models.machine import MachineFile
@@ -47,7 +46,6 @@ class LevelWatch:
         self.first = FirstWindows([channel.name for channel in channels], machine.levels.reference_windows)
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
-        self._channels = channels
         self._states = [state_name(channel) for channel in channels]
         self._hop_ns = round(machine.window.hop_s * 1e9)
 
@@ -71,39 +69,10 @@ class LevelWatch:
             self.first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
 
     def foreign(self, *, named: bool) -> str:
-        """What the latest levels show that no change of a parameter makes; empty if nothing.
-
-        A 2x that has grown, or a random part that is not Gaussian as it was on the healthy machine.
-
-        Parameters
-        ----------
-        named : bool
-            Whether a parameter has been found to have changed, which this would cast doubt on.
-        """
-        levels = self._found
-        if levels is None:
+        """What the latest levels show that no change of a parameter makes, see `LevelJudge.foreign`."""
+        if self._found is None:
             return ""
-        state, seen = (None, False) if self.reference is None else self.reference.at(levels.speed_rad_s)
-        if state is None or not seen:  # at another speed much is otherwise
-            return ""
-        twice = [one.limit("x2") for one in self.latest]
-        grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]
-        if grown or levels.random_kurtosis is None:
-            return next(iter(grown), "")
-        found = [
-            (departure(levels.random_kurtosis[:, column], state.kurtosis[channel.name], doubt=named), channel)
-            for column, channel in enumerate(self._channels)
-            if channel.name in state.kurtosis
-        ]
-        most, channel = max(found, key=lambda one: abs(one[0]), default=(0.0, None))
-        if channel is None or not most:
-            return ""
-        healthy = state.kurtosis[channel.name].mean
-        how = "clipped, as by a rub" if most < 0 else "with impacts, as of a rub or a loose part"
-        return (
-            f"a vibration at {channel.name} ({channel.location} {channel.direction}) that is {how}: kurtosis of its "
-            f"random part {healthy + most:.2f}, {healthy:.2f} on the healthy machine"
-        )
+        return self._judge.foreign(self._found, self.latest, self.reference, named=named)
 
     def tell(self, alarms: AlarmBook, end_ns: int, *, faulty: Collection[str] = (), explained: bool = False) -> None:
         """Let operators hear of what is beyond its limits at the end of a hop.

@@ -71,18 +71,18 @@ def test_healthy_windows_stay_within_the_limit_and_another_excitation_too() -> N
     for n in range(40):
         gain = np.repeat(np.random.default_rng([7, n]).uniform(0.5, 2.0, HOPS), T.size // HOPS)
         samples = gain * noise(100 + n) + (1 + n % 3) * np.cos(THETA)
-        assert departure(kurtosis(samples), healthy) == 0.0
+        assert departure(kurtosis(samples), healthy, 1.25, 6.0) == 0.0
 
 
 def test_a_departure_is_seen_in_the_newest_half_before_the_window_is_full_of_it() -> None:
     healthy, samples = reference(), noise(200) + 2 * np.cos(THETA)
     at = T.size // 2
     samples[at:] = np.clip(samples[at:], -2.5, 2.5)
-    assert departure(kurtosis(samples), healthy) < 0
+    assert departure(kurtosis(samples), healthy, 1.25, 6.0) < 0
 
 
 def test_less_will_do_to_doubt_what_else_was_found() -> None:
     healthy = KurtosisReference(mean=3.0, scatter=0.1, hops=1000, range=0.0)
     by_five_errors = np.full(HOPS, 3.0 - 5 * 0.1 / np.sqrt(HOPS))
-    assert departure(by_five_errors, healthy) == 0.0
-    assert departure(by_five_errors, healthy, doubt=True) == pytest.approx(-0.144, abs=1e-3)
+    assert departure(by_five_errors, healthy, 1.25, 6.0) == 0.0
+    assert departure(by_five_errors, healthy, 1.25, 4.0) == pytest.approx(-0.144, abs=1e-3)
