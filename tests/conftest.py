@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import execnet.gateway_io
 import httpx
 import hypothesis
 import pytest
@@ -63,6 +64,13 @@ _LONGEST = (
     "test_replay_identity",
 )
 """Modules that take long for the number of their tests, longest first."""
+
+
+def pytest_xdist_setupnodes() -> None:
+    """Have workers forked, which makes them start at once."""
+    from tests.forked_workers import ForkedIO  # noqa: PLC0415  # nobody else needs it
+
+    execnet.gateway_io.Popen2IOMaster = ForkedIO  # type: ignore[assignment, misc]
 
 
 @pytest.hookimpl(trylast=True)

@@ -15,14 +15,14 @@ from pathlib import Path
 
 _ROOT = Path(__file__).parents[2]
 
-_CONTEXT = multiprocessing.get_context("forkserver")
-_CONTEXT.set_forkserver_preload(
-    [
-        *("service.runtime", "service.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
-        *("models.signals.recording", "service.recordings.replay.offline", "service.terminal.stopping"),
-        *("service.history.migrations", "pydantic.v1", "uvicorn.loops.asyncio", "uvicorn.lifespan.off", __name__),
-    ]
-)
+PROGRAMS = [
+    *("service.runtime", "service.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
+    *("models.signals.recording", "service.recordings.replay.offline", "service.terminal.stopping"),
+    *("service.history.migrations", "pydantic.v1", "uvicorn.loops.asyncio", "uvicorn.lifespan.off", __name__),
+]
+"""What they import."""
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(PROGRAMS)
 
 
 class Preloaded:
@@ -32,7 +32,7 @@ class Preloaded:
         self, arguments: tuple[str, ...], cwd: Path, out: Path, err: Path, environment: dict[str, str]
     ) -> None:
         self.args = arguments
-        self._process = _CONTEXT.Process(target=_run, args=(arguments, cwd, out, err, environment))
+        self._process = CONTEXT.Process(target=_run, args=(arguments, cwd, out, err, environment))
         self._process.start()
 
     @property

@@ -1,0 +1,63 @@
+"""Test workers forked off a process that has imported what they, and the programs they start, import.
+
+That takes five seconds of computing, otherwise spent by every worker, and again by whatever starts programs for it.
+"""
+
+import atexit
+import gc
+import os
+import sys
+from multiprocessing import forkserver
+from multiprocessing.connection import Connection
+from types import ModuleType
+
+from execnet.gateway_base import ExecModel, Popen2IO
+
+from tests.service.preloaded import CONTEXT, PROGRAMS
+
+CONTEXT.set_forkserver_preload(
+    [
+        *(*PROGRAMS, "tests.service.live", "tests.interchange.material", "tests.faults.measure"),
+        *("models.commissioning.commission", "service.analysis.figures.spectrum", "simulator.commission.page"),
+        *("service.interchange.importing", "scipy.io", "scipy.optimize", "scipy.stats", "pyarrow.parquet"),
+        *("h5py", "nptdms", "playwright.sync_api", "psycopg", "pytest", "pyuff", "trustme", "yaml"),
+        *("hypothesis.extra.numpy", "schemathesis.specs.openapi.checks"),
+    ]
+)
+
+
+class ForkedIO(Popen2IO):
+    """A worker and the pipes to it, instead of a new Python."""
+
+    def __init__(self, _: list[str], execmodel: ExecModel) -> None:
+        requests, to_worker = CONTEXT.Pipe(duplex=False)
+        from_worker, answers = CONTEXT.Pipe(duplex=False)
+        self.popen = CONTEXT.Process(target=_work, args=(requests, answers))
+        self.popen.start()
+        super().__init__(
+            os.fdopen(os.dup(to_worker.fileno()), "wb"), os.fdopen(os.dup(from_worker.fileno()), "rb"), execmodel
+        )
+        for end in (requests, to_worker, from_worker, answers):
+            end.close()
+
+    def wait(self) -> int | None:
+        """Wait for the end."""
+        self.popen.join()
+        return self.popen.exitcode
+
+    def kill(self) -> None:
+        """End it at once."""
+        self.popen.kill()
+
+
+def _work(requests: Connection, answers: Connection) -> None:
+    gc.freeze()  # looking through what is shared would copy it
+    for number, end in enumerate((requests, answers)):
+        os.dup2(end.fileno(), number)
+        end.close()
+    # The programs a worker starts come from the same process, and import nothing of the worker.
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]
+    sys.modules["__main__"] = ModuleType("__main__")
+    with open(0, encoding="utf-8", closefd=False) as stdin:
+        exec(eval(stdin.readline()), {})  # noqa: S102, S307  # what execnet has a new Python do
+    atexit._run_exitfuncs()
