@@ -19,6 +19,7 @@ from simulator.timeline import SWAPPED_WITH, SensorFaults
 
 _TURN = 2 * np.pi
 _NO_FAULT: SensorFaults = {}
+_AHEAD = 8192
 
 
 class Sensor:
@@ -51,12 +52,19 @@ class Sensor:
         corner_hz = settings.noise_corner_hz
         self._memory = 0.0 if corner_hz is None else float(np.exp(-2 * np.pi * corner_hz / rate_hz))
         self._noise: float | None = None
+        self._ahead: FloatArray = np.empty(0)
         self._held: float | None = None
         self._rate_hz, self._reach = rate_hz, round(longest_delay_s * rate_hz)
         self._past: FloatArray | None = None
 
     def noise(self, n_samples: int) -> FloatArray:
-        """Draw the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
+        """Take the next samples of unit-variance noise, first-order noise sampled exactly; shape (n_samples,)."""
+        if self._ahead.size < n_samples:  # a filter takes as long to be set up as for thousands of samples
+            self._ahead = np.concatenate([self._ahead, self._drawn(max(n_samples - self._ahead.size, _AHEAD))])
+        taken, self._ahead = self._ahead[:n_samples], self._ahead[n_samples:]
+        return taken
+
+    def _drawn(self, n_samples: int) -> FloatArray:
         white = self._rng.standard_normal(n_samples)
         if self._memory == 0:
             return white
@@ -165,6 +173,8 @@ class SensorBank:
     def _stretches(self, name: str, first: int, n_samples: int) -> list[tuple[int, int, SensorFaults]]:
         """Rows during which one channel's faults stay the same."""
         states = self._faults.get(name, ())
+        if not states:
+            return [(0, n_samples, _NO_FAULT)]
         begin, end = (bisect_right(states, sample, key=itemgetter(0)) for sample in (first, first + n_samples - 1))
         cuts = [0, *(sample - first for sample, _ in states[begin:end]), n_samples]
         return [(begin, end, _in_force(states, first + begin)) for begin, end in pairwise(cuts)]

@@ -1,6 +1,7 @@
 """A valid JSON object of a record, for documents and tests."""
 
 import json
+from functools import cache
 from typing import get_args, get_origin
 
 from pydantic import BaseModel
@@ -10,12 +11,18 @@ __all__ = ["example"]
 
 def example(model: type[BaseModel]) -> dict[str, object]:
     """Build one valid JSON object of a model out of the examples of its fields."""
-    return {name: _field_example(field.examples, field.annotation) for name, field in model.model_fields.items()}
+    found: dict[str, object] = json.loads(_example_json(model))
+    return found
+
+
+@cache
+def _example_json(model: type[BaseModel]) -> str:
+    return json.dumps({name: _field_example(one.examples, one.annotation) for name, one in model.model_fields.items()})
 
 
 def _field_example(examples: list[object] | None, annotation: object) -> object:
     if examples:
-        return json.loads(json.dumps(examples[0]))
+        return examples[0]
     item = next((part for part in get_args(annotation) if part is not Ellipsis), annotation)
     if not (isinstance(item, type) and issubclass(item, BaseModel)):
         raise TypeError(f"no example for {annotation}")

@@ -6,7 +6,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Body, Depends, FastAPI, HTTPException, Query
+from fastapi import Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
@@ -32,6 +32,7 @@ from service.recordings.replay.machine import is_shipped_bundle, is_shipped_mach
 from service.settings.service import MachineEntry, ServiceSettings
 
 _PLACE = "/api/v1/replays"
+_JOB = f"{_PLACE}/{{replay_id}}"
 _LOOK_S = 0.25
 _QUIET_S = 15.0
 _UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # what to connect to, nothing listens there
@@ -155,10 +156,8 @@ class ReplayDesk:
 
 def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     """Add the routes."""
-    router = APIRouter(prefix=_PLACE, tags=["replays"])
-    _add_reading_routes(router, desk, guard)
-    _add_changing_routes(router, desk, guard)
-    app.include_router(router)
+    _add_reading_routes(app, desk, guard)
+    _add_changing_routes(app, desk, guard)
 
 
 _NoOrder = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
@@ -166,32 +165,35 @@ _Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldes
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
-def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
-    @router.get("", dependencies=[guard.read], responses=responses(ReplayList))
+def _add_reading_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
+    common: dict[str, Any] = {"tags": ["replays"], "dependencies": [guard.read]}
+
+    @app.get(_PLACE, responses=responses(ReplayList), **common)
     def replays() -> ReplayList:
         """Replays since the service started, the latest first."""
         return ReplayList(replays=() if desk.jobs is None else desk.jobs.jobs())
 
-    @router.get("/{replay_id}", dependencies=[guard.read], responses=responses(ReplayJob, 404, 422))
+    @app.get(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def replay(replay_id: str) -> ReplayJob:
         """How far a replay is, and in the end what it found."""
         return _job(desk, replay_id)
 
-    @router.get("/{replay_id}/reports", dependencies=[guard.read], responses=responses(ReplayReportList, 404, 422))
+    @app.get(f"{_JOB}/reports", responses=responses(ReplayReportList, 404, 422), **common)
     def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayReportList:
         """Window reports of an offline replay; the history of the live machine has none of them."""
         found, following = _results(desk, replay_id, "/report", offset, limit)
         return ReplayReportList(reports=tuple(Report.model_validate_json(one) for one in found), next_offset=following)
 
-    @router.get("/{replay_id}/alarms", dependencies=[guard.read], responses=responses(ReplayAlarmList, 404, 422))
+    @app.get(f"{_JOB}/alarms", responses=responses(ReplayAlarmList, 404, 422), **common)
     def replay_alarms(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayAlarmList:
         """Alarm events of an offline replay; nobody else hears of them."""
         found, following = _results(desk, replay_id, "/alarm/event", offset, limit)
         events = tuple(AlarmCloudEvent.model_validate_json(one) for one in found)
         return ReplayAlarmList(events=events, next_offset=following)
 
-    @router.get(
-        "/{replay_id}/events",
+    @app.get(
+        f"{_JOB}/events",
+        tags=["replays"],
         dependencies=[guard.stream],
         response_class=StreamingResponse,
         responses={200: {"content": {"text/event-stream": {}}}, **problem_responses(404, 422)},
@@ -206,38 +208,36 @@ def _add_reading_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> No
         )
 
 
-def _add_changing_routes(router: APIRouter, desk: ReplayDesk, guard: Guard) -> None:
-    guarded = [guard.operate, Depends(_switch(desk))]
+def _add_changing_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
+    common: dict[str, Any] = {"tags": ["replays"], "dependencies": [guard.operate, Depends(_switch(desk))]}
     problems = (400, 404, 413, 415, 422)
 
-    @router.post(
-        "", status_code=201, dependencies=guarded, responses=responses(ReplayJob, *problems, 409, status_code=201)
-    )
+    @app.post(_PLACE, status_code=201, responses=responses(ReplayJob, *problems, 409, status_code=201), **common)
     def start_replay(
         request: Annotated[ReplayRequest, Body(openapi_examples=_shown("an hour of yesterday", ReplayRequest))],
     ) -> ReplayJob:
         """Start a replay, in a process of its own."""
         return desk.start(request)
 
-    @router.delete("/{replay_id}", dependencies=guarded, responses=responses(ReplayJob, 404, 422))
+    @app.delete(_JOB, responses=responses(ReplayJob, 404, 422), **common)
     def stop_replay(replay_id: str) -> ReplayJob:
         """Stop a replay; what it found so far stays."""
         _job(desk, replay_id)
         return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
 
-    @router.post("/{replay_id}/pause", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
+    @app.post(f"{_JOB}/pause", responses=responses(ReplayJob, *problems, 409), **common)
     def pause_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
         """Pause a paced replay."""
         _ = order
         return _order(desk, replay_id, "pause")
 
-    @router.post("/{replay_id}/resume", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
+    @app.post(f"{_JOB}/resume", responses=responses(ReplayJob, *problems, 409), **common)
     def resume_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
         """Let a paused replay go on."""
         _ = order
         return _order(desk, replay_id, "resume")
 
-    @router.post("/{replay_id}/seek", dependencies=guarded, responses=responses(ReplayJob, *problems, 409))
+    @app.post(f"{_JOB}/seek", responses=responses(ReplayJob, *problems, 409), **common)
     def seek_in_replay(
         replay_id: str, place: Annotated[ReplaySeek, Body(openapi_examples=_shown("to a time", ReplaySeek))]
     ) -> ReplayJob:
