@@ -28,6 +28,7 @@ from models.diagnosis.sensors.reference import learn_sensor_reference
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import from_scale, slope, to_scale
 from models.errors import EstimationError
+from models.levels.gains import learn_gains, place_of
 from models.levels.judgement import alerts_of
 from models.levels.reference import learn_levels
 from models.machine import Machine, MachineFile
@@ -271,7 +272,8 @@ def commission(
     windows = [piece.window for piece in pieces]
     commissioned = None
     if pieces and not refused:
-        channels = [machine.sensors[column].name for column in recordings[0].plan.columns]
+        channels = [machine.sensors[column] for column in recordings[0].plan.columns]
+        bands = [[p.levels.bands for p in pieces if p.recording == one.name and p.levels.bands] for one in recordings]
         commissioned = Commissioned(
             site=machine.site,
             machine=machine.name,
@@ -286,7 +288,12 @@ def commission(
             baselines=learned.baselines,
             shape=learned.shape,
             sensors=learn_sensor_reference(windows),
-            levels=learn_levels("commissioned", channels, [piece.levels for piece in pieces]),
+            levels=learn_levels(
+                "commissioned",
+                [channel.name for channel in channels],
+                [piece.levels for piece in pieces],
+                learn_gains([place_of(channel) for channel in channels], [each for each in bands if each]),
+            ),
         )
     return Commissioning(
         _report(machine, recordings, checks, learned, commissioned, pieces, wished), commissioned, learned.machine

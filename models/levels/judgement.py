@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from models.levels.bands import Growth, growth
+from models.levels.gains import place_of, wrong_gain
 from models.levels.kurtosis import departure
 from models.levels.measures import LevelPlan, WindowLevels
 from models.levels.reference import LevelReference, OperatingState, ReferenceLevel
@@ -69,7 +70,8 @@ class LevelJudge:
     ) -> str:
         """What the levels of a window show that no change of a parameter makes; empty if nothing.
 
-        A 2x that has grown, or a random part that is not Gaussian as it was on the healthy machine.
+        A wrong gain of all sensors of a place, a 2x that has grown, or a random part that is not Gaussian as it was on
+        the healthy machine.
 
         Parameters
         ----------
@@ -78,8 +80,15 @@ class LevelJudge:
         named : bool
             Whether a parameter has been found to have changed, which this would cast doubt on.
         """
-        state, seen = (None, False) if reference is None else reference.at(levels.speed_rad_s)
-        if state is None or not seen:  # at another speed much is otherwise
+        if reference is None:
+            return ""
+        if reference.gains is not None and levels.bands is not None:
+            wrong = wrong_gain(levels.bands, [place_of(one) for one in self._channels], reference.gains)
+            if wrong is not None:
+                own = " and ".join(one.name for one in self._channels if place_of(one) == wrong[0])
+                return f"gain of {own}: {wrong[1]:.2f} times as much at all frequencies, compared with the other places"
+        state, seen = reference.at(levels.speed_rad_s)
+        if not seen:  # at another speed much is otherwise
             return ""
         twice = [one.limit("x2") for one in judged]
         grown = [limits.text for limits in twice if limits and limits.text and not limits.absolute]

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from models.checkpoint import checked, texts
 from models.errors import CheckpointError
 from models.levels.bands import BandLevels, BandReference, learn_bands
+from models.levels.gains import GainReference
 from models.levels.kurtosis import KurtosisReference, learn_kurtosis
 from models.levels.measures import COMPARED, WindowLevels
 
@@ -78,12 +79,15 @@ class LevelReference(BaseModel):
     ----------
     source : str
         Where they are from, as operators will read it.
+    gains : GainReference or None
+        Of the places side by side.
     """
 
     model_config = _STORED
 
     source: str
     states: tuple[OperatingState, ...] = Field(min_length=1)
+    gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -108,7 +112,9 @@ class LevelReference(BaseModel):
         return nearest, distance(nearest) <= _SAME_SPEED
 
 
-def learn_levels(source: str, channels: Sequence[str], windows: Sequence[WindowLevels]) -> LevelReference:
+def learn_levels(
+    source: str, channels: Sequence[str], windows: Sequence[WindowLevels], gains: GainReference | None = None
+) -> LevelReference:
     """Learn from healthy windows that do not overlap.
 
     Parameters
@@ -124,7 +130,7 @@ def learn_levels(source: str, channels: Sequence[str], windows: Sequence[WindowL
             groups[-1].append(levels)
         else:
             groups.append([levels])
-    return LevelReference(source=source, states=tuple(_state(channels, group) for group in groups))
+    return LevelReference(source=source, states=tuple(_state(channels, group) for group in groups), gains=gains)
 
 
 def _speed(levels: WindowLevels) -> float:

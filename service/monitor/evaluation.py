@@ -91,6 +91,12 @@ class Evaluation:
         )
 
     @property
+    def unlike_healthy(self) -> str:
+        """What has been seen, where no equation can be evaluated."""
+        changed = [shape.text for shape in self.shapes if shape.verdict == "changed"]
+        return "; ".join(filter(None, (self.deciding.suspect, *changed)))
+
+    @property
     def why_nothing(self) -> str:
         """Why no parameter could be read, every reason once."""
         return "; ".join(dict.fromkeys(one.reason for one in self.deciding.parameters if one.reason))

@@ -450,7 +450,7 @@ class MachineMonitor:
         if not unexplained and not evaluation.deciding.evaluable:
             reason = evaluation.why_nothing
         if evaluation.shapes:
-            changed = "; ".join(shape.text for shape in evaluation.shapes if shape.verdict == "changed")
+            changed = evaluation.unlike_healthy
             evidence = Evidence(start_ns=statistics.start_ns, end_ns=end_ns)
             self._alarms.update_state(SHAPE, changed != "", end_ns, changed, evidence=evidence)
         calm = evaluation.calm(outside=verdict.outside_model)

@@ -92,6 +92,20 @@ def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve() -> None:
     assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
 
 
+@pytest.mark.parametrize("place", ["1", "2"])
+def test_a_wrong_gain_of_a_place_is_told_and_what_it_is_taken_for_is_named_with_reserve(place: str) -> None:
+    names = [channel.name for channel in LAB.sensors]
+    wrong = [names.index(f"y{place}"), names.index(f"y{place}_dot")]
+    healthy = stream(85.0, SEED + 8)
+    samples = samples_of(healthy)
+    samples[:, wrong] *= 0.8
+    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
+    raised = {event.alarm.name: event.alarm for event in events}
+    assert f"gain of y{place} and y{place}_dot: 0.8" in raised[MODEL].note
+    assert f"gain of y{place} and y{place}_dot: 0.8" in full(windows)[-1].suspect
+    assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
+
+
 def test_a_2x_beyond_a_limit_of_ones_own_has_not_grown_and_doubts_nothing() -> None:
     own = LevelSettings.model_validate({"limits": [{"channel": "y1", "measure": "x2", "alert": 1e-3, "danger": 1e3}]})
     machine = MACHINE.model_copy(update={"levels": own})

@@ -1,0 +1,92 @@
+"""A wrong gain of a place against what changes of a machine and of its excitation look like."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from models.levels.bands import BandLevels
+from models.levels.gains import GainReference, learn_gains, wrong_gain
+from models.levels.measures import hop_levels, level_plan, window_levels
+from models.signals.block import FloatArray
+from models.signals.channels import Channel
+
+RATE_HZ, HOP_S, HOPS = 1000.0, 5.0, 12
+PLACES = ("bearing y", "disc y", "disc z")
+RESONANCES_HZ = (40.0, 60.0, 90.0)
+CHANNELS = [
+    Channel.model_validate(
+        {"name": name, "quantity": "displacement", "location": place, "direction": way, "unit": "um"}
+    )
+    for name, place, way in (("y1", "bearing", "y"), ("y2", "disc", "y"), ("z2", "disc", "z"))
+]
+PLAN = level_plan(CHANNELS, RATE_HZ, (10.0, 400.0))
+
+
+def window(
+    seed: int,
+    resonances_hz: Sequence[float] = RESONANCES_HZ,
+    gains: Sequence[float] = (1.0, 1.0, 1.0),
+    pole: float = 0.5,
+) -> BandLevels:
+    """Noise that all places share, of a colour by its pole, and some of their own, each with a resonance."""
+    rng, n = np.random.default_rng([20261130, seed]), round(HOPS * HOP_S * RATE_HZ)
+    shared = lfilter([1 - pole], [1, -pole], rng.standard_normal(n))
+    columns = []
+    for gain, hz in zip(gains, resonances_hz, strict=True):
+        root = 0.9 * np.exp(2j * np.pi * hz / RATE_HZ)
+        force = shared + 0.1 * rng.standard_normal(n)
+        columns.append(gain * lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], force))
+    samples: FloatArray = 1e-6 * np.column_stack(columns)
+    hops = [hop_levels(PLAN, part, None) for part in np.split(samples, HOPS)]
+    found = window_levels(PLAN, hops, np.full(HOPS, np.nan), phase_reference=False).bands
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def reference() -> GainReference:
+    """Of two recordings, of excitation of two colours."""
+    learned = learn_gains(
+        PLACES, [[window(10 * n + k, pole=pole) for k in range(4)] for n, pole in ((1, 0.5), (2, 0.8))]
+    )
+    assert learned is not None
+    return learned
+
+
+@pytest.mark.parametrize("at", range(3))
+@pytest.mark.parametrize("gain", [0.75, 1.2])
+def test_a_gain_is_told_with_its_place(reference: GainReference, at: int, gain: float) -> None:
+    gains = [1.0, 1.0, 1.0]
+    gains[at] = gain
+    found = wrong_gain(window(100 + at, gains=gains, pole=0.8), PLACES, reference)
+    assert found is not None
+    assert found[0] == PLACES[at]
+    assert found[1] == pytest.approx(gain, rel=0.03)
+
+
+@pytest.mark.parametrize("resonances_hz", [(36.0, 60.0, 90.0), (40.0, 52.0, 90.0), (40.0, 60.0, 100.0)])
+def test_a_resonance_that_moves_is_no_gain(reference: GainReference, resonances_hz: tuple[float, ...]) -> None:
+    assert wrong_gain(window(200, resonances_hz), PLACES, reference) is None
+
+
+def test_neither_is_excitation_that_is_louder_or_of_another_colour(reference: GainReference) -> None:
+    for seed, gain, pole in ((300, 1.0, 0.5), (301, 2.0, 0.8), (302, 0.5, 0.2), (303, 1.0, 0.95)):
+        assert wrong_gain(window(seed, gains=(gain,) * 3, pole=pole), PLACES, reference) is None
+
+
+def test_nor_a_channel_that_is_dead_or_other_places_or_hops(reference: GainReference) -> None:
+    now = window(400)
+    dead = replace(now, rms=now.rms * [0.0, 1.0, 1.0])
+    assert wrong_gain(dead, PLACES, reference) is None
+    assert wrong_gain(now, ("bearing z", "disc y", "disc z"), reference) is None
+    assert wrong_gain(replace(now, edges_hz=1.1 * now.edges_hz), PLACES, reference) is None
+
+
+def test_what_cannot_be_compared_is_not_learned() -> None:
+    windows = [window(500), window(501)]
+    assert learn_gains(PLACES, [windows]) is not None
+    assert learn_gains(PLACES, [windows[:1], windows[1:]]) is None  # no scatter
+    assert learn_gains(("bearing y", "bearing y", "disc y"), [windows]) is None  # which of two has changed?
