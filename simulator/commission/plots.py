@@ -9,6 +9,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -73,6 +74,11 @@ def inline_svg(name: str, label: str, paint: Callable[[], Figure | None]) -> Mar
         figure = paint()
         if figure is None:
             return None
+        engine = figure.get_layout_engine()
+        if engine is not None:  # otherwise the figure would be drawn twice, first to find the layout
+            FigureCanvasSVG(figure)
+            engine.execute(figure)
+            figure.set_layout_engine(None)
         figure.savefig(written, format="svg", metadata=_NO_METADATA)
     text = written.getvalue()
     text = text[text.index("<svg") :]

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import style
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -107,6 +109,15 @@ def write_figure(figure: Figure, path: Path, dpi: float) -> None:
         If the file cannot be written.
     """
     kind = path.suffix.lower().removeprefix(".")
+    engine = figure.get_layout_engine()
+    if engine is not None:  # otherwise the figure would be drawn twice, first to find the layout
+        if kind == "svg":
+            FigureCanvasSVG(figure)
+        else:
+            FigureCanvasAgg(figure)
+            figure.set_dpi(dpi)
+        engine.execute(figure)
+        figure.set_layout_engine(None)
     try:
         if kind == "svg":
             figure.savefig(path, format="svg", metadata={"Date": None})
