@@ -123,7 +123,13 @@ class Growth:
 
 
 def growth(
-    levels: BandLevels, column: int, reference: BandReference, ratio: float, beyond_range: float, n_errors: float
+    levels: BandLevels,
+    column: int,
+    reference: BandReference,
+    ratio: float,
+    beyond_range: float,
+    n_errors: float,
+    shorter: float,
 ) -> Growth | None:
     """Compare a channel's bands with the reference; None where there is nothing to compare.
 
@@ -138,12 +144,16 @@ def growth(
         No limit is nearer than that, times the largest healthy level.
     n_errors : float
         Nor nearer than so many standard errors of a window.
+    shorter : float
+        By how much a level scatters more than in the healthy windows, while the window fills.
     """
     edges_hz, own, mean, high, error = _healthy(reference)
     if levels.edges_hz.shape != edges_hz.shape or not np.allclose(levels.edges_hz, edges_hz, rtol=1e-3):
         return None
     now, chance = levels.rms[:, column], _by_chance(levels.freedom.tobytes(), reference.freedom)
-    limit = np.max([np.maximum(ratio, chance) * mean, beyond_range * high, mean + n_errors * error], axis=0)
+    relative = n_errors * np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
+    loudest = np.maximum(beyond_range, 1 + relative * np.sqrt(shorter**2 - 1)) * high
+    limit = np.max([np.maximum(ratio, chance) * mean, loudest, (1 + relative * shorter) * mean], axis=0)
     looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2))) & (own > 0)
     if not looked_at.any():
         return None

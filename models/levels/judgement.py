@@ -2,7 +2,8 @@
 
 A limit relative to a reference is never nearer than the reference itself has been: not within a quarter of its largest
 healthy level, nor within six standard errors of one window. So excitation that varies as it did in the healthy windows
-raises nothing, and a line that was nothing but noise has to stand out of it.
+raises nothing, and a line that was nothing but noise has to stand out of it. While a window fills it scatters more,
+about the loudest and the quietest healthy level as well as about their mean.
 """
 
 import math
@@ -178,17 +179,18 @@ class LevelJudge:
         shorter = _shorter(state, levels.hops)
         for name, one in state.levels.get(channel.name, {}).items():
             spread = _ERRORS * one.error * shorter
-            alert = _alert_from(one, given, spread)
+            alert = _alert_from(one, given, shorter)
             danger = None  # what levels are at another speed says too little
             if seen:
                 danger = max(given.danger_ratio * one.mean, alert * given.danger_ratio / given.alert_ratio)
             fall = None
             if name in {"overall", "velocity"} and given.fall_ratio:
-                fall = min(given.fall_ratio * one.mean, one.low / _BEYOND_RANGE, one.mean - spread)
+                quietest = one.low * min(1 / _BEYOND_RANGE, 1 - _filling(one, shorter))
+                fall = min(given.fall_ratio * one.mean, quietest, one.mean - spread)
             shown = [None if edge is None else _shown(channel, name, edge) for edge in (alert, danger, fall)]
             yield name, _Limit(source, False, *shown)
             if seen and name == "x1" and one.vector is not None and levels.vectors is not None:
-                yield from self._turned(channel, one, complex(levels.vectors[1, column]), alert, spread)
+                yield from self._turned(channel, one, complex(levels.vectors[1, column]), alert, shorter)
 
     def _grown(self, column: int, levels: WindowLevels, reference: LevelReference) -> Growth | None:
         """The band that stands out most; nothing at a speed that was never seen, at which lines are elsewhere."""
@@ -197,15 +199,17 @@ class LevelJudge:
         if own is None or levels.bands is None or not seen:
             return None
         shorter = _shorter(state, levels.hops)
-        return growth(levels.bands, column, own, self._settings.alert_ratio, _BEYOND_RANGE, _ERRORS * shorter)
+        return growth(levels.bands, column, own, self._settings.alert_ratio, _BEYOND_RANGE, _ERRORS, shorter)
 
     def _turned(
-        self, channel: Channel, one: ReferenceLevel, now: complex, alert: float, spread: float
+        self, channel: Channel, one: ReferenceLevel, now: complex, alert: float, shorter: float
     ) -> Iterator[tuple[str, _Limit]]:
         """The acceptance region of the 1x vector (ISO 20816-1, criterion II): an alert outside it, however large."""
         assert one.vector is not None  # noqa: S101  # for the type checker
         of_amplitude = 2.0 if channel.quantity in _PEAK_TO_PEAK else math.sqrt(0.5)
-        radius = max(_TURNED * abs(complex(*one.vector)), _BEYOND_RANGE * one.turned, spread / of_amplitude)
+        farthest = max(_BEYOND_RANGE * one.turned, one.turned + _filling(one, shorter) * one.mean / of_amplitude)
+        by_chance = _ERRORS * one.error * shorter / of_amplitude
+        radius = max(_TURNED * abs(complex(*one.vector)), farthest, by_chance)
         if abs(now - complex(*one.vector)) > radius:
             yield "x1", _Limit("1x vector", False, alert=_shown(channel, "x1", min(abs(now) * of_amplitude, alert)))
 
@@ -248,8 +252,14 @@ def _shorter(state: OperatingState, hops: int) -> float:
     return math.sqrt(max(1.0, state.hops / hops))
 
 
-def _alert_from(one: ReferenceLevel, given: LevelSettings, spread: float) -> float:
-    return max(given.alert_ratio * one.mean, _BEYOND_RANGE * one.high, one.mean + spread)
+def _filling(one: ReferenceLevel, shorter: float) -> float:
+    """By how much, relative, a level may scatter about that of a full window; nothing once the window is full."""
+    return _ERRORS * one.error / one.mean * math.sqrt(shorter**2 - 1) if one.mean else 0.0
+
+
+def _alert_from(one: ReferenceLevel, given: LevelSettings, shorter: float) -> float:
+    loudest = one.high * max(_BEYOND_RANGE, 1 + _filling(one, shorter))
+    return max(given.alert_ratio * one.mean, loudest, one.mean + _ERRORS * one.error * shorter)
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,7 +292,7 @@ def alerts_of(
     for state in reference.states:
         for channel in channels:
             for name, one in state.levels.get(channel.name, {}).items():
-                alert = _alert_from(one, settings, _ERRORS * one.error * _shorter(state, hops))
+                alert = _alert_from(one, settings, _shorter(state, hops))
                 healthy, limit = (_shown(channel, name, value) for value in (one.mean, alert))
                 peak_to_peak = channel.quantity in _PEAK_TO_PEAK
                 yield AlertFrom(state, channel, name, _unit(channel.unit, name, peak_to_peak), healthy, limit)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.signal
 
 from models.levels.bands import BandReference
 from models.levels.judgement import LevelJudge
@@ -20,10 +21,10 @@ PLAN: LevelPlan = level_plan([DE], RATE_HZ, (10.0, 1000.0))
 T = np.arange(round(HOPS * HOP_S * RATE_HZ)) / RATE_HZ
 
 
-def window(samples: FloatArray) -> WindowLevels:
-    """Of a machine whose speed is not known."""
-    hops: list[HopLevels] = [hop_levels(PLAN, part[:, None], None) for part in np.split(samples, HOPS)]
-    return window_levels(PLAN, hops, np.full(HOPS, np.nan), phase_reference=False)
+def window(samples: FloatArray, count: int = HOPS) -> WindowLevels:
+    """Of a machine whose speed is not known; of its first hops."""
+    hops: list[HopLevels] = [hop_levels(PLAN, part[:, None], None) for part in np.split(samples, HOPS)[:count]]
+    return window_levels(PLAN, hops, np.full(count, np.nan), phase_reference=False)
 
 
 def noise(seed: int) -> FloatArray:
@@ -97,6 +98,22 @@ def test_what_varied_in_a_band_may_vary() -> None:
     varied = reference(*(noise(seed) + line(48.7, level) for seed, level in enumerate((0.5, 1.0, 2.0))))
     assert grown(noise(11) + line(48.7, 2.4), varied)[0] == "normal"
     assert grown(noise(11) + line(48.7, 3.0), varied)[0] == "alert"
+
+
+def test_a_resonance_that_was_loud_in_one_condition_may_be_as_loud_while_a_window_fills() -> None:
+    """A shaft mode of 500 Hz whose level has few independent averages in a hop, four times as large in one window."""
+
+    def resonance(seed: int, level: float) -> FloatArray:
+        radius, omega = 0.9997, 2 * np.pi * 500.0 / RATE_HZ
+        found = scipy.signal.lfilter([1.0], [1.0, -2 * radius * np.cos(omega), radius**2], noise(seed))
+        return np.asarray(level * found / found.std())
+
+    varied = reference(*(noise(seed) + resonance(100 + seed, level) for seed, level in enumerate((1.0, 1.0, 4.0))))
+    judge, states = LevelJudge(PLAN, [DE], LevelSettings()), []
+    for seed in range(200, 300):
+        (found,) = judge.judge(window(noise(seed) + resonance(100 + seed, 4.0), 1), varied)
+        states.append(found.limit("growth"))
+    assert sum(one is not None and one.state != "normal" for one in states) == 0
 
 
 def test_without_a_reference_nothing_has_grown() -> None:

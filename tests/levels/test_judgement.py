@@ -117,6 +117,16 @@ def test_what_varied_in_the_healthy_windows_may_vary() -> None:
     assert limits(judged(CASING, window(overall=2.6e-3), healthy))["overall"].state == "alert"
 
 
+@pytest.mark.parametrize(
+    ("overall", "hops", "state"),
+    [(2.6, 16, "alert"), (2.6, 8, "normal"), (2.8, 8, "alert"), (0.35, 16, "alert"), (0.35, 8, "normal")],
+)
+def test_a_window_that_fills_scatters_about_the_loudest_healthy_one_too(overall: float, hops: int, state: str) -> None:
+    healthy = reference(*(replace(window(error=0.058 * value, overall=value), hops=16) for value in (0.5, 1.0, 2.0)))
+    found = judged(CASING, replace(window(overall=overall), hops=hops), healthy)
+    assert limits(found)["overall"].state == state
+
+
 def test_a_line_that_was_noise_has_to_stand_out_of_it() -> None:
     healthy = reference(*(window(error=1e-5, x2=value) for value in (1e-5, 2e-5, 1.5e-5)))
     assert limits(judged(CASING, window(x2=6e-5), healthy))["x2"].state == "normal"
