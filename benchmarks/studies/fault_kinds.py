@@ -59,7 +59,7 @@ def _of_1x(seen: Seen) -> float:
     return float(np.sqrt((abs(q[_BEARING_Y]) ** 2 + abs(q[_BEARING_Z]) ** 2) / 2))
 
 
-def _line(rotor: Rotor, seen: Seen, order: float, force: ComplexArray, part: float, start_rad: float) -> Seen:
+def line(rotor: Rotor, seen: Seen, order: float, force: ComplexArray, part: float, start_rad: float) -> Seen:
     """A force at an order of the speed, so large that the bearing moves by a part of its 1x."""
     response = rotor.response(np.array([order * rotor.speed_hz]))[0] @ force
     at_bearing = np.sqrt((abs(response[_BEARING_Y]) ** 2 + abs(response[_BEARING_Z]) ** 2) / 2)
@@ -73,11 +73,11 @@ def _lines(rotor: Rotor, seen: Seen, rng: np.random.Generator, orders: Mapping[f
     for order, part in orders.items():
         force = np.zeros(4, dtype=np.complex128)
         force[[_BEARING_Y, _BEARING_Z]] = rng.standard_normal(2) + 1j * rng.standard_normal(2)
-        seen = _line(rotor, seen, order, force, size * part, float(rng.uniform(0, 2 * np.pi)))
+        seen = line(rotor, seen, order, force, size * part, float(rng.uniform(0, 2 * np.pi)))
     return seen
 
 
-def _at_order(low: float, high: float, parts: tuple[float, float]) -> "_Fault":
+def _at_order(low: float, high: float, parts: tuple[float, float]) -> "Change":
     def fault(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
         return _lines(rotor, seen, rng, {float(rng.uniform(low, high)): 1.0}, _size(rng, *parts))
 
@@ -87,7 +87,7 @@ def _at_order(low: float, high: float, parts: tuple[float, float]) -> "_Fault":
 def _whirl(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
     force = np.array([1, 0, -1j, 0], dtype=np.complex128)
     order = float(rng.uniform(0.40, 0.48))
-    return _line(rotor, seen, order, force, _size(rng, 0.5, 2.0), float(rng.uniform(0, 2 * np.pi)))
+    return line(rotor, seen, order, force, _size(rng, 0.5, 2.0), float(rng.uniform(0, 2 * np.pi)))
 
 
 def _looseness(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
@@ -177,7 +177,7 @@ def _tones(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
     return replace(seen, displacement=motion, velocity=rate)
 
 
-def _noise(slope: float) -> "_Fault":
+def _noise(slope: float) -> "Change":
     def fault(rotor: Rotor, seen: Seen, rng: np.random.Generator) -> Seen:
         """Noise of its own in every channel, of a power that falls with the frequency."""
         n = len(seen.angle_rad)
@@ -205,18 +205,20 @@ def _size(rng: np.random.Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _as_simulated(_rotor: Rotor, seen: Seen, _rng: np.random.Generator) -> Seen:
+def as_simulated(_rotor: Rotor, seen: Seen, _rng: np.random.Generator) -> Seen:
+    """Nothing: all of it has been simulated."""
     return seen
 
 
-_Fault = Callable[[Rotor, Seen, np.random.Generator], Seen]
+Change = Callable[[Rotor, Seen, np.random.Generator], Seen]
+"""What something does to the motion of a rotor."""
 
 RUBS = {"rub, light": (0.5, 2.0), "rub, intermittent": (3.0, 1.6), "rub, heavy": (2.0, 1.0)}
 """Stiffness of the contact over the shaft's, and clearance over the radial rms of the disc."""
 CRACK = "breathing crack"
 HEALTHY = "none"
-FAULTS: Mapping[str, _Fault] = {
-    **dict.fromkeys((HEALTHY, *RUBS, CRACK), _as_simulated),
+FAULTS: Mapping[str, Change] = {
+    **dict.fromkeys((HEALTHY, *RUBS, CRACK), as_simulated),
     "soft foundation": _soft_foundation,
     "2x forcing": _at_order(2, 2, (0.3, 1.0)),
     "3x forcing": _at_order(3, 3, (0.3, 1.0)),

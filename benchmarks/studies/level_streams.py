@@ -15,7 +15,6 @@ from models.signals.block import FloatArray, SampleBlock
 from simulator.stream import DEFAULT_START_NS
 
 BLOCK_S = 1.0
-WINDOW = {"length_s": 20.0, "hop_s": 5.0, "max_span_s": 30.0}
 _ORDERS = np.arange(1.0, 4.0)
 
 
@@ -45,6 +44,7 @@ class Kind:
     """How the running speed is known: ``phase reference``, ``nominal`` or not at all."""
     schedule: tuple[float, float] | None = None
     """Length of snapshots and their period, s; none where samples come all the time."""
+    window_s: float = 60.0
 
 
 KINDS = {
@@ -181,7 +181,7 @@ def _file(kind: Kind, speed_rpm: float) -> MachineFile:
         sensors.append(angle | {"unit": "rad"})
     content = {"site": "study", "name": "machine", "rate_hz": kind.rate_hz, "sensors": sensors}
     if kind.schedule is None:
-        content["window"] = WINDOW
+        content["window"] = {"length_s": kind.window_s, "max_span_s": 1.5 * kind.window_s}
     else:
         content["schedule"] = {"on_s": kind.schedule[0], "every_s": kind.schedule[1]}
     if kind.rotation == "nominal":

@@ -12,12 +12,13 @@ from functools import partial
 from typing import Self
 
 import numpy as np
+import scipy.stats
 
 from benchmarks.studies import results as r
 from benchmarks.studies.level_streams import KINDS, At, Gains, Scene, drawn, generator
-from benchmarks.studies.levels import DRAWN, REFERENCES, SPREADS, VARYING, per_month, summed
-from benchmarks.studies.results import Goal, Record, Table, Value
+from benchmarks.studies.results import Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
+from models.diagnosis.verdict.calibration import MONTH_S
 from models.levels.bands import band_edges
 from models.levels.judgement import LevelJudge
 from models.levels.measures import (
@@ -35,11 +36,13 @@ from models.levels.settings import LevelSettings
 from models.signals.block import FloatArray
 from rotorwatch.records.levels import ChannelLevels
 
+REFERENCES = ("first windows", "commissioned")
+SPREADS, DRAWN = (0.1, 0.2), ("inside the reference's range", "same distribution")
 _LENGTH_S, _HOP_S = 60.0, 5.0
 """A machine file's own, if it says nothing."""
 _HOPS = round(_LENGTH_S / _HOP_S)
 _DAY_S = 86400.0
-_KIND = replace(KINDS[VARYING], rate_hz=1280.0)
+_KIND = replace(KINDS["velocity sensors, speed in the machine file"], rate_hz=1280.0)
 _COMPARED = ("overall", "x1", "x2", "bands")
 
 
@@ -140,7 +143,7 @@ def _windows(plan: LevelPlan, hops: Sequence[HopLevels], speed_rad_s: float) -> 
 
 
 def _years(options: Options, case: int, reference: str, varied: str, number: int) -> Iterator[dict[str, Value]]:
-    """A machine's day, in windows that do not overlap; its excitation as in `benchmarks.studies.levels`."""
+    """A machine's day, in windows that do not overlap; the noise of each has a level of its own."""
     spread = next(one for one in SPREADS if varied.startswith(f"{one:g}"))
     scene = drawn(_KIND, generator(options.seed, case, number, At.CONDITION), noise_over_1x=(1.0, 3.0))
     learned, watched = (generator(options.seed, case, number, at) for at in (At.REFERENCE, At.EVALUATION))
@@ -201,6 +204,21 @@ def _level(levels: WindowLevels, name: str) -> FloatArray:
         return levels.values[name]
     assert levels.bands is not None  # noqa: S101  # for the type checker
     return levels.bands.rms
+
+
+def summed(column: str, rows: Sequence[Record]) -> float:
+    """Sum of a column."""
+    return float(r.floats(row.get(column) for row in rows).sum())
+
+
+def per_month(rows: Sequence[Record]) -> Estimate | None:
+    """Alarms per machine and month, with the exact interval of a Poisson count."""
+    count, months = round(summed("alarms", rows)), summed("hours", rows) * 3600 / MONTH_S
+    if not months:
+        return None
+    low = 0.0 if not count else float(scipy.stats.chi2.ppf(0.025, 2 * count)) / 2
+    high = float(scipy.stats.chi2.ppf(0.975, 2 * count + 2)) / 2
+    return Estimate(count / months, low / months, high / months, len(rows))
 
 
 def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:

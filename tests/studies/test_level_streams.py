@@ -58,9 +58,18 @@ def test_a_doubling_of_one_sensor_is_counted_with_its_delay() -> None:
     assert 0 < float(found[0]["delay_s"] or 0) <= 40
 
 
+@pytest.mark.long
+def test_a_2x_on_a_rotor_doubles_from_what_was_commissioned() -> None:
+    study = levels(Options(windows=1, seed=99, small=True))
+    cell = next(one for one in study.cells if one.keys["machine"] == "lab, level none")
+    found = study.measure(None, cell, 1)
+    assert [row["doubled"] for row in found] == ["overall", "1x", "2x"]
+    assert [(row["any"], row["early"]) for row in found] == [(True, False)] * 3
+
+
 def test_alarms_per_month_have_the_exact_interval_of_a_poisson_count() -> None:
-    study = levels(Options(small=True))
-    (of,) = (table.columns["per machine and month"] for table in study.tables if table.name == "levels-varying")
+    study = level_years(Options(small=True))
+    (of,) = (table.columns["per machine and month"] for table in study.tables if table.name == "level-years")
     month_h = MONTH_S / 3600
 
     def rows(alarms: int) -> list[Record]:

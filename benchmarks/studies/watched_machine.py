@@ -1,0 +1,211 @@
+"""A machine of any model class in one commissioning, as streams: healthy, and from some time on with something else."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from benchmarks.finite_elements.assembly import ComplexArray, Equations, assemble, probed
+from benchmarks.finite_elements.machines import rotor_named
+from benchmarks.finite_elements.observed import RATE_HZ, RunCondition, WindowSizes, machine_of, sampled
+from benchmarks.finite_elements.rotor import BeamRotor
+from benchmarks.finite_elements.scenes import COMMISSIONED, SourceLayout, drawn_condition
+from benchmarks.studies.fault_kinds import CRACK, MOTIONS, RUBS, Change, Rotor, Seen, as_simulated
+from benchmarks.studies.subjects import SHIPPED, SUBJECTS
+from models.commissioning.commissioned import KnowledgeLevel
+from models.errors import EstimationError
+from models.machine import ConditionRange, Machine, MachineFile, load_machine
+from models.physics.response import stochastic_covariance
+from models.physics.rotor import STATE_INDEX, M_matrix, P_matrix, Q_matrix
+from models.signals.block import FloatArray, SampleBlock
+from models.signals.channels import Channel, Quantity
+from simulator.scenario import Event, Rub, Scenario
+from simulator.stream import DEFAULT_START_NS, blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+
+CONDITIONS = 3
+_HEALTHY, AFTER = 4.1, 2.5
+"""Windows of a healthy recording, and of a stream after its fault has begun."""
+_BEFORE_S = 10.0
+"""Healthy, once the window is full."""
+_BLOCK_S = 0.5
+_ALIKE = (1.35, 1.65)
+"""Level of the excitation; as commissioned within a tenth, or levels would rightly alarm before the fault begins."""
+
+
+def _response(equations: Equations, kept: Sequence[int], f: FloatArray) -> ComplexArray:
+    """Displacements at some coordinates under unit forces there, from the modes of the state matrix."""
+    roots, shapes = np.linalg.eig(equations.A)
+    inputs = np.vstack([np.zeros((len(equations.M), len(kept))), np.linalg.inv(equations.M)[:, kept]])
+    drive = np.linalg.solve(shapes, inputs.astype(np.complex128))
+    factors = 1 / (2j * np.pi * f[:, None] - roots)
+    pairs = (shapes[kept][:, None, :] * drive.T[None, :, :]).reshape(len(kept) ** 2, -1)
+    return np.asarray((factors @ pairs.T).reshape(len(f), len(kept), len(kept)), dtype=np.complex128)
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A machine of one model class in one commissioning: file, healthy streams, later streams.
+
+    Attributes
+    ----------
+    always : callable
+        What is so from the beginning, in healthy recordings too.
+    """
+
+    name: str
+    level: KnowledgeLevel
+    seed: int
+    number: int
+    always: Change = as_simulated
+
+    @property
+    def file(self) -> MachineFile:
+        """What the monitor knows of it."""
+        if self.name not in SHIPPED:
+            return machine_of(rotor_named(self.name), WindowSizes())
+        machine = load_machine(self.name)
+        if self.level is KnowledgeLevel.FULL:
+            return machine
+        return MachineFile.model_validate(machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"}))
+
+    def healthy(self, condition: int) -> Iterator[SampleBlock]:
+        """A recording in one of the conditions."""
+        rotor, seen = self._moved(condition, 1, _HEALTHY * self._window_s, "")
+        return _blocks(self.file, self.always(rotor, seen, self._rng(2)))
+
+    def condition(self, at: int) -> int:
+        """The one that the stream of a fault is in."""
+        return (at + self.number) % CONDITIONS
+
+    def faulty(self, at: int, name: str, change: Change) -> Iterator[SampleBlock]:
+        """A stream in one of the conditions in which something begins.
+
+        Parameters
+        ----------
+        at : int
+            Number of the stream.
+        name : str
+            Of what begins; a rub or a crack is simulated.
+        change : Change
+            What it does to the motion.
+        """
+        rotor, seen = self._moved(self.condition(at), 2 + at, self.begins_s + AFTER * self._window_s, name)
+        seen = self.always(rotor, seen, self._rng(2))
+        changed = change(rotor, seen, self._rng(1, at))
+        first = round(self.begins_s * rotor.rate_hz)
+        joined = (np.concatenate([getattr(seen, name)[:first], getattr(changed, name)[first:]]) for name in _FIELDS)
+        return _blocks(self.file, Seen(*joined))
+
+    @property
+    def _window_s(self) -> float:
+        return self.file.window.length_s
+
+    @property
+    def begins_s(self) -> float:
+        """When a fault begins."""
+        return self._window_s + _BEFORE_S
+
+    def _rng(self, *purpose: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, SUBJECTS.index(self.name), self.number, *purpose])
+
+    def _moved(self, condition: int, realisation: int, seconds: float, fault: str) -> tuple[Rotor, Seen]:
+        rng = self._rng(0, condition)
+        cutoff_hz = float(np.exp(rng.uniform(np.log(40.0), np.log(160.0))))
+        if self.name in SHIPPED:
+            machine = load_machine(self.name)
+            limits = ConditionRange(
+                cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=_ALIKE, noise_relative=(0.02, 0.02)
+            )
+            operation = machine.operation.model_copy(update={"speed_tolerance": 0.01})
+            drawn = machine.model_copy(update={"condition": limits, "operation": operation})
+            draw = Draw(
+                drawn, int(rng.integers(2**62)), Purpose.EVALUATION, layout=Layout(condition % 2), fixed_condition=True
+            )
+            scenario = draw_condition(draw, realisation).overridden(duration_s=seconds)
+            return _of_shipped(machine, _with_anomaly(scenario, machine, fault, self.begins_s))
+        layout = SourceLayout.INDEPENDENT if condition % 2 else SourceLayout.ONE_SOURCE
+        scene = replace(COMMISSIONED, cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=_ALIKE)
+        beam = rotor_named(self.name)
+        ran = drawn_condition(beam, layout, scene, {}, rng)
+        return _of_beam(beam, ran, seconds, [self.seed, self.number, condition, realisation])
+
+
+def _of_beam(beam: BeamRotor, ran: RunCondition, seconds: float, seed: list[int]) -> tuple[Rotor, Seen]:
+    found = sampled(beam, ran, seconds, seed)
+    equations, bearing = assemble(beam, ran.speed_rad_s), beam.bearings[0]
+    response = partial(_response, equations, list(probed(beam)))
+    both = (bearing.k_y + bearing.k_z) / 2, (bearing.c_y + bearing.c_z) / 2
+    speed_hz = ran.speed_rad_s / (2 * np.pi)
+    return Rotor(speed_hz, RATE_HZ, response, both), Seen(found[:, :4], found[:, 4:8], found[:, 8])
+
+
+def _of_shipped(machine: Machine, scenarios: Iterator[Scenario]) -> tuple[Rotor, Seen]:
+    samples, scenario = _simulated(scenarios, machine)
+    si = samples * np.array([one.to_si for one in machine.sensors])
+    columns = {(one.quantity, one.location, one.direction): n for n, one in enumerate(machine.sensors)}
+    motion, rate = (
+        si[:, [columns[quantity, *at] for at in MOTIONS]] for quantity in (Quantity.DISPLACEMENT, Quantity.VELOCITY)
+    )
+    angle = si[:, columns[Quantity.SHAFT_ANGLE, "shaft", "rotation"]]
+    rotor, speed_rad_s = machine.rotor, _speed_rad_s(scenario)
+    kept = [STATE_INDEX[name] for name in ("y1", "y2", "z1", "z2")]
+    equations = Equations(M_matrix(rotor), P_matrix(rotor, speed_rad_s), Q_matrix(rotor))
+    response = partial(_response, equations, kept)
+    both = (rotor.k_by_N_per_m + rotor.k_bz_N_per_m) / 2, (rotor.c_by_N_s_per_m + rotor.c_bz_N_s_per_m) / 2
+    return Rotor(speed_rad_s / (2 * np.pi), machine.rate_hz, response, both), Seen(motion, rate, angle)
+
+
+def _speed_rad_s(scenario: Scenario) -> float:
+    return next(event.speed_rpm for event in scenario.events if event.speed_rpm) * np.pi / 30
+
+
+_FIELDS = ("displacement", "velocity", "angle_rad")
+
+
+def _simulated(scenarios: Iterator[Scenario], machine: Machine) -> tuple[FloatArray, Scenario]:
+    """Samples of the first scenario in which the machine is stable, and that scenario."""
+    for scenario in scenarios:
+        try:
+            found = [block.samples for block, _ in blocks(scenario, machine, _BLOCK_S)]
+        except EstimationError:
+            continue
+        return np.concatenate(found).astype(np.float64), scenario
+    raise AssertionError
+
+
+def _with_anomaly(scenario: Scenario, machine: Machine, fault: str, begins_s: float) -> Iterator[Scenario]:
+    """The scenario with a rub or a crack, halved until the machine can be run."""
+    if fault not in RUBS and fault != CRACK:
+        yield scenario
+        return
+    size, clearance = RUBS.get(fault, (0.3, None))
+    kind, rub = "crack", None
+    if clearance is not None:
+        variance = np.diag(stochastic_covariance(machine.rotor, _speed_rad_s(scenario), scenario.sources))
+        radial = float(np.sqrt(variance[STATE_INDEX["y2"]] + variance[STATE_INDEX["z2"]]))
+        kind, rub = "rub", Rub(clearance_m=clearance * radial * np.hypot(1, 1 / _ALIKE[0]))
+    while True:
+        event = Event(at_s=begins_s, anomaly=kind, size=size)
+        yield scenario.model_copy(update={"rub": rub, "events": (*scenario.events, event)})
+        size /= 2
+
+
+def _blocks(file: MachineFile, seen: Seen) -> Iterator[SampleBlock]:
+    columns = [_column(one, seen) / one.to_si for one in file.sensors]
+    samples = np.column_stack(columns).astype(np.float32)
+    for n, one in enumerate(file.sensors):
+        if one.quantity is Quantity.SHAFT_ANGLE:
+            samples[:, n] = np.where(samples[:, n] >= 2 * np.pi, 0.0, samples[:, n])
+    size = round(_BLOCK_S * file.rate_hz)
+    for number, first in enumerate(range(0, len(samples), size)):
+        start_ns = DEFAULT_START_NS + round(first * 1e9 / file.rate_hz)
+        yield SampleBlock(start_ns, number, 1, file.rate_hz, samples[first : first + size])
+
+
+def _column(channel: Channel, seen: Seen) -> FloatArray:
+    if channel.quantity is Quantity.SHAFT_ANGLE:
+        return seen.angle_rad
+    of = seen.displacement if channel.quantity is Quantity.DISPLACEMENT else seen.velocity
+    return of[:, MOTIONS.index((channel.location, channel.direction))]
