@@ -18,7 +18,7 @@ from models.commissioning.commissioned import (
     described,
     knowledge_of,
 )
-from models.commissioning.healthy import HealthyRecording
+from models.commissioning.healthy import HealthyRecording, known_lines
 from models.commissioning.levels import LEVELS, NO_SUCH_ROTOR, Learned, Piece, Progress, pieces_of
 from models.diagnosis.baseline.rows import evaluable_rows
 from models.diagnosis.networks.equations import EQUATIONS, missing
@@ -293,6 +293,7 @@ def commission(
                 [channel.name for channel in channels],
                 [piece.levels for piece in pieces],
                 learn_gains([place_of(channel) for channel in channels], [each for each in bands if each]),
+                known_lines(recordings),
             ),
         )
     return Commissioning(

@@ -81,6 +81,8 @@ class LevelReference(BaseModel):
         Where they are from, as operators will read it.
     gains : GainReference or None
         Of the places side by side.
+    lines : tuple or None
+        Frequency, Hz, and order of each line; None where they were not looked for.
     """
 
     model_config = _STORED
@@ -88,6 +90,7 @@ class LevelReference(BaseModel):
     source: str
     states: tuple[OperatingState, ...] = Field(min_length=1)
     gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
+    lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -113,7 +116,11 @@ class LevelReference(BaseModel):
 
 
 def learn_levels(
-    source: str, channels: Sequence[str], windows: Sequence[WindowLevels], gains: GainReference | None = None
+    source: str,
+    channels: Sequence[str],
+    windows: Sequence[WindowLevels],
+    gains: GainReference | None = None,
+    lines: tuple[tuple[float, float], ...] | None = None,
 ) -> LevelReference:
     """Learn from healthy windows that do not overlap.
 
@@ -130,7 +137,8 @@ def learn_levels(
             groups[-1].append(levels)
         else:
             groups.append([levels])
-    return LevelReference(source=source, states=tuple(_state(channels, group) for group in groups), gains=gains)
+    states = tuple(_state(channels, group) for group in groups)
+    return LevelReference(source=source, states=states, gains=gains, lines=lines)
 
 
 def _speed(levels: WindowLevels) -> float:

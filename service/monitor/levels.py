@@ -1,16 +1,18 @@
 """The vibration levels of one machine: taken of every window, and judged against limits and reference."""
 
+import math
 from collections.abc import Collection
 
 from models.alarm_names import LEVEL
 from models.commissioning.commissioned import Installed
+from models.diagnosis.lines import new_line, steady_lines
 from models.diagnosis.moments import Plan
-from models.diagnosis.window import SlidingWindow
+from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.levels.judgement import LevelJudge, channel_state
 from models.levels.measures import WindowLevels
 from models.levels.reference import FirstWindows, LevelReference
 from models.machine import MachineFile
-from models.signals.channels import state_name
+from models.signals.channels import state_name, with_channel_names
 from rotorwatch.records.alarms import Evidence
 from rotorwatch.records.levels import ChannelLevels
 from service.monitor.alarms.book import AlarmBook
@@ -47,6 +49,7 @@ class LevelWatch:
         self.latest: tuple[ChannelLevels, ...] = ()
         self._found: WindowLevels | None = None
         self._states = [state_name(channel) for channel in channels]
+        self._machine = machine
         self._hop_ns = round(machine.window.hop_s * 1e9)
 
     @property
@@ -68,10 +71,20 @@ class LevelWatch:
         if self._takes_first and window.filled == 1:
             self.first.take(window.hops[0].start_ns, window.hops[-1].end_ns, found)
 
-    def foreign(self, *, named: bool) -> str:
-        """What the latest levels show that no change of a parameter makes, see `LevelJudge.foreign`."""
+    def foreign(self, window: SlidingWindow, statistics: WindowStatistics, *, named: bool) -> str:
+        """What the latest window shows that no change of a parameter makes: a new line, or see `LevelJudge.foreign`."""
         if self._found is None:
             return ""
+        known, speed_rad_s = None if self.reference is None else self.reference.lines, statistics.speed_rad_s
+        if known is not None and math.isfinite(speed_rad_s) and speed_rad_s:
+            line = new_line(steady_lines(window.plan, window.hops, statistics), known, speed_rad_s)
+            if line is not None:
+                text = (
+                    f"a line at {line.frequency_hz:.4g} Hz ({line.known(speed_rad_s)[1]:.2f} times running speed, "
+                    f"{line.share:.0%} of the random vibration of {line.state}) that the healthy machine did not have: "
+                    "a neighbouring machine, whirl or looseness"
+                )
+                return with_channel_names(text, self._machine.sensors)
         return self._judge.foreign(self._found, self.latest, self.reference, named=named)
 
     def tell(self, alarms: AlarmBook, end_ns: int, *, faulty: Collection[str] = (), explained: bool = False) -> None:

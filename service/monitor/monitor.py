@@ -436,7 +436,7 @@ class MachineMonitor:
             self._levels.tell(self._alarms, end_ns, faulty=faulty)
             state = self._state(HealthState.WATCHING if self._watching else HealthState.NOT_EVALUABLE)
             return Report(**self._window_now(statistics.start_ns, end_ns, state), sensors=findings, reason=str(error))
-        foreign = self._levels.foreign(named=bool(self._test.state.findings))
+        foreign = self._levels.foreign(self._window, statistics, named=bool(self._test.state.findings))
         evaluation = evaluation.named(self.machine.sensors, foreign)
         looks = {hops: stretch_of(short, present[hops].start_ns, end_ns) for hops, short in evaluation.short.items()}
         whole = self._test.settings.window_hops

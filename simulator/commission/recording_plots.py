@@ -7,7 +7,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from models.commissioning.healthy import HealthyRecording, Line, foreign_lines
+from models.commissioning.healthy import HealthyRecording, foreign_lines
+from models.diagnosis.lines import Line
 from models.diagnosis.window import WindowStatistics, window_statistics
 from models.signals.block import FloatArray
 from simulator.commission.plots import BAND, COLOURS, GREY, INK, WIDTH_IN

@@ -14,6 +14,7 @@ from models.levels.settings import LevelSettings
 from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
+from models.signals.channels import Quantity
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
@@ -103,6 +104,22 @@ def test_a_wrong_gain_of_a_place_is_told_and_what_it_is_taken_for_is_named_with_
     raised = {event.alarm.name: event.alarm for event in events}
     assert f"gain of y{place} and y{place}_dot: 0.8" in raised[MODEL].note
     assert f"gain of y{place} and y{place}_dot: 0.8" in full(windows)[-1].suspect
+    assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
+
+
+def test_a_line_that_the_healthy_machine_did_not_have_is_told() -> None:
+    healthy = stream(85.0, SEED + 9)
+    samples = samples_of(healthy)
+    turned = 2 * np.pi * 37.0 * np.arange(len(samples)) / LAB.rate_hz
+    for column, one in enumerate(LAB.sensors):
+        if one.quantity is Quantity.DISPLACEMENT:
+            samples[:, column] += 2e-5 / one.to_si * np.sin(turned)
+        elif one.quantity is Quantity.VELOCITY:
+            samples[:, column] += 2e-5 / one.to_si * 2 * np.pi * 37.0 * np.cos(turned)
+    windows, events = feed(MachineMonitor(installed()), with_samples(healthy, samples))
+    raised = {event.alarm.name: event.alarm for event in events}
+    assert "a line at 37 Hz (1.68 times running speed" in raised[MODEL].note
+    assert all(window.suspect for window in full(windows))
     assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
 
 

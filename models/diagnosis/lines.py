@@ -1,0 +1,121 @@
+"""Lines that are not the rotation: of a neighbouring machine, a gear, whirl.
+
+A line has the same strength in every segment, noise has not: of a steady line the mean fourth power of the Fourier
+coefficient is the square of the mean second power, of noise twice that. And it turns by the same angle from each
+segment to the next, where a resonance has forgotten its phase: their coherence is 1 of a line, and of n segments of
+noise c or more with the probability (1 - c²)ⁿ⁻¹.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy  # its sub-packages are loaded when they are first used
+
+from models.diagnosis.moments import HopMoments, Plan
+from models.diagnosis.window import WindowStatistics
+from models.signals.block import FloatArray
+
+_STEADY = 1.35  # fourth power over the square of the second: 2 for noise, 1 for a line; between them with little data
+_STANDS_OUT = 8.0
+_NEIGHBOURHOOD_HZ = 4.0
+_LOBE = 2  # a Hann window spreads a line over two bins on either side
+_FEWEST_SEGMENTS = 6
+_HARMONICS = 12
+_CHANCE = 1e-9
+_LOUD, _SAME = 0.02, 0.02
+"""Part of a channel's random power from which on a new line is told, and relative distance of a line from itself."""
+
+
+KnownLine = tuple[float, float]
+"""A line of the healthy machine: its frequency, Hz, and the same over the running speed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line.
+
+    Attributes
+    ----------
+    state : str
+        Where it is strongest.
+    share : float
+        Of the power of that channel's random part.
+    certain : bool
+        Whether no noise is coherent like that.
+    """
+
+    state: str
+    frequency_hz: float
+    share: float
+    certain: bool
+
+    def known(self, speed_rad_s: float) -> KnownLine:
+        """What is kept of it."""
+        return round(self.frequency_hz, 4), round(self.frequency_hz * 2 * np.pi / abs(speed_rad_s), 4)
+
+
+def steady_lines(plan: Plan, hops: Sequence[HopMoments], window: WindowStatistics) -> tuple[Line, ...]:
+    """Lines that are neither noise nor a multiple of the speed, strongest first.
+
+    Parameters
+    ----------
+    plan : Plan
+        Of the hops.
+    hops : sequence of HopMoments
+        At least one.
+    window : WindowStatistics
+        What the hops add up to.
+    """
+    window = window.as_mounted
+    states = plan.mounted
+    segments = np.concatenate([hop.segments[:, :, : len(states)] for hop in hops])
+    if segments.shape[0] < _FEWEST_SEGMENTS:
+        return ()
+    power = segments.real**2 + segments.imag**2
+    mean = power.mean(axis=0)
+    frequencies_hz = plan.frequencies_hz
+    step_hz = float(frequencies_hz[1] - frequencies_hz[0])
+    size = max(5, 2 * round(_NEIGHBOURHOOD_HZ / step_hz / 2) + 1)
+    floor = scipy.ndimage.median_filter(mean, size=(size, 1), mode="nearest")
+    total = np.maximum(np.diag(window.correlation[0]), np.finfo(float).tiny)
+    speed_hz = window.speed_rad_s / (2 * np.pi)
+    rotation = _near_rotation(frequencies_hz, speed_hz, step_hz)
+    found: dict[int, Line] = {}
+    for at, column in np.argwhere((mean > _STANDS_OUT * floor) & ~rotation[:, None]):
+        lobe = slice(max(0, at - _LOBE), at + _LOBE + 1)
+        own = power[:, at, column]
+        unsteady = (own**2).mean() >= _STEADY * mean[at, column] ** 2
+        if unsteady or mean[at, column] < mean[lobe, column].max():
+            continue
+        share = float(2 * step_hz * mean[lobe, column].sum() / total[column])
+        if at not in found or share > found[at].share:
+            certain = _coherent(segments[:, at, column])
+            found[at] = Line(states[column], float(frequencies_hz[at]), min(1.0, share), certain)
+    return tuple(sorted(found.values(), key=lambda line: -line.share))
+
+
+def new_line(lines: Sequence[Line], known: Sequence[KnownLine], speed_rad_s: float) -> Line | None:
+    """The strongest line that the healthy machine did not have, at its frequency or order; None without one."""
+    for line in lines:
+        own = line.known(speed_rad_s)
+        seen = any(abs(now - then) <= _SAME * then for one in known for now, then in zip(own, one, strict=True))
+        if line.certain and line.share > _LOUD and not seen:
+            return line
+    return None
+
+
+def _coherent(own: npt.NDArray[np.complex128]) -> bool:
+    """Whether segments keep their phase as no noise does; those that overlap are no evidence, one of two is left."""
+    earlier, later = own[:-2], own[2:]
+    norms = np.linalg.norm(earlier) * np.linalg.norm(later)
+    coherence = min(1.0, float(abs(np.vdot(earlier, later)) / norms))
+    return bool((1 - coherence**2) ** (earlier.size / 2 - 1) < _CHANCE)
+
+
+def _near_rotation(frequencies_hz: FloatArray, speed_hz: float, step_hz: float) -> npt.NDArray[np.bool_]:
+    if not np.isfinite(speed_hz):
+        return np.zeros(frequencies_hz.size, dtype=np.bool_)
+    multiples = speed_hz * np.arange(1, _HARMONICS + 1)
+    return np.asarray(np.min(np.abs(frequencies_hz[:, None] - multiples), axis=1) <= (_LOBE + 1) * step_hz)

@@ -1,0 +1,90 @@
+"""Lines beside the rotation against noise, resonances and bursts, and which of them are new."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from models.commissioning.healthy import HealthyRecording, healthy_from_blocks, known_lines
+from models.diagnosis.lines import Line, new_line, steady_lines
+from models.diagnosis.window import window_statistics
+from models.machine import MachineFile
+from models.signals.block import FloatArray, SampleBlock
+from tests.commissioning.rotor_kit import NOTHING
+
+RATE_HZ, SPEED_HZ = NOTHING.rate_hz, 22.0
+N = round(70 * RATE_HZ)
+T = np.arange(N) / RATE_HZ
+MACHINE: MachineFile = NOTHING
+
+
+def noise(seed: int) -> FloatArray:
+    return np.random.default_rng([20261130, seed]).standard_normal(N)
+
+
+def line(hz: float, amplitude: float = 0.5) -> FloatArray:
+    return np.asarray(amplitude * np.sin(2 * np.pi * hz * T + 0.3))
+
+
+def recording(of_y1: FloatArray) -> HealthyRecording:
+    """Of noise in every channel, and more in the first; turning at 22 Hz with a strong 1x."""
+    samples = np.column_stack([noise(n) + line(SPEED_HZ, 3.0) for n in range(len(MACHINE.sensors))])
+    samples[:, 0] += of_y1
+    samples[:, -1] = np.mod(2 * np.pi * SPEED_HZ * T, 2 * np.pi)
+    size = round(RATE_HZ)
+    found = [
+        (SampleBlock(1_767_225_600_000_000_000 + n * 10**9, n, 1, RATE_HZ, part.astype(np.float32)), "")
+        for n, part in enumerate(np.split(samples, N // size))
+    ]
+    made = healthy_from_blocks("r", MACHINE, found)
+    assert not made.refused
+    return made
+
+
+def lines(of_y1: FloatArray) -> tuple[Line, ...]:
+    made = recording(of_y1)
+    return steady_lines(made.plan, made.hops, window_statistics(made.plan, made.hops, lagged=False))
+
+
+@cache
+def healthy() -> tuple[tuple[float, float], ...]:
+    """A machine that has a line at 30 Hz."""
+    known = known_lines([recording(line(30.0))])
+    assert known
+    return known
+
+
+def test_a_line_is_found_with_its_share_and_kept_by_frequency_and_order() -> None:
+    (found,) = lines(line(30.0))
+    assert (found.state, found.certain) == ("y1", True)
+    assert found.frequency_hz == pytest.approx(30.0, abs=0.2)
+    assert found.share == pytest.approx(0.125 / 1.125, rel=0.1)
+    assert found.known(2 * np.pi * SPEED_HZ) == pytest.approx((30.0, 30.0 / 22.0), abs=0.01)
+
+
+def test_neither_a_multiple_of_the_speed_nor_a_narrow_resonance_is_one() -> None:
+    assert lines(line(2 * SPEED_HZ)) == ()
+    root = np.exp(2 * np.pi * (-0.003 + 1j) * 40 / RATE_HZ)  # damped by 0.3 %
+    resonance = lfilter([1.0], [1, -2 * root.real, abs(root) ** 2], noise(20))
+    assert not any(one.certain for one in lines(resonance / resonance.std()))
+
+
+def test_a_burst_is_none() -> None:
+    assert not any(one.certain for one in lines(line(30.0, 5.0) * (T // 5 == 4)))
+
+
+@pytest.mark.parametrize(("hz", "new"), [(30.0, False), (30.4, False), (33.0, True)])
+def test_new_is_what_is_at_another_frequency(hz: float, new: bool) -> None:
+    found = new_line(lines(line(hz)), healthy(), 2 * np.pi * SPEED_HZ)
+    assert (found is not None) is new
+
+
+def test_a_line_that_turns_with_the_shaft_is_the_same_at_another_speed() -> None:
+    faster = 1.1 * SPEED_HZ
+    (found,) = lines(line(33.0))
+    assert new_line([found], healthy(), 2 * np.pi * faster) is None
+
+
+def test_one_that_is_weak_is_not_told() -> None:
+    assert new_line(lines(line(33.0, 0.1)), healthy(), 2 * np.pi * SPEED_HZ) is None
