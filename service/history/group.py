@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import zstandard
-from sqlalchemy import Connection, Table, delete, insert, or_, select, update
+from sqlalchemy import Connection, Table, bindparam, delete, insert, or_, select, update
 
 from service.history.claim import Bundle, Claim
 from service.history.database import Database
@@ -18,6 +18,24 @@ from service.history.windows import READING, fill_buckets, packed
 
 SeriesNumbers = dict[tuple[int, str, str], int]
 _Rows = defaultdict[Table, list[dict[str, Any]]]
+
+# Put together once: to do so for every step takes nearly as long as to carry them out.
+_newest = (windows.c.machine_id == machines.c.machine_id) & (windows.c.number == machines.c.windows)
+# Locked in one order, whoever writes: two on one server must not wait for each other.
+_MACHINES = (
+    select(machines, windows.c.end_ns)
+    .outerjoin(windows, _newest)
+    .with_for_update(of=machines)
+    .where(machines.c.machine_id.in_(bindparam("which", expanding=True)))
+    .order_by(machines.c.machine_id)
+)
+_COUNT = update(machines).where(machines.c.machine_id == bindparam("which"))
+_EVENTS = select(alarm_events.c.sequence, alarm_events.c.id).where(
+    alarm_events.c.machine_id == bindparam("which"),
+    or_(alarm_events.c.sequence >= bindparam("first"), alarm_events.c.id.in_(bindparam("identifiers", expanding=True))),
+)
+_CHECKPOINT = update(checkpoints).where(checkpoints.c.machine_id == bindparam("which"))
+_PARTS = select(checkpoint_parts.c.name).where(checkpoint_parts.c.machine_id == bindparam("which"))
 
 
 def write_group(
@@ -42,11 +60,8 @@ def write_group(
         The attempts that were refused, with the reason, and numbers of series that are valid once the transaction is
         committed.
     """
-    newest = (windows.c.machine_id == machines.c.machine_id) & (windows.c.number == machines.c.windows)
-    query = select(machines, windows.c.end_ns).outerjoin(windows, newest).with_for_update(of=machines)
-    query = query.where(machines.c.machine_id.in_([claim.machine_id for claim in claims]))
-    # Locked in one order, whoever writes: two on one server must not wait for each other.
-    found = {row.machine_id: row for row in connection.execute(query.order_by(machines.c.machine_id))}
+    which = [claim.machine_id for claim in claims]
+    found = {row.machine_id: row for row in connection.execute(_MACHINES, {"which": which})}
     refused: dict[Claim, StoreError] = {}
     new_series: SeriesNumbers = {}
     rows, complete = _Rows(list), list[tuple[int, int, int]]()
@@ -81,12 +96,13 @@ def write_group(
         if machine.bucketed < bucketed:
             complete.append((claim.machine_id, machine.bucketed, bucketed))
         counted = {
+            "which": claim.machine_id,
             "steps": claim.written + 1,
             "reports": machine.reports + len(bundle.reports),
             "windows": machine.windows + len(new),
             "bucketed": bucketed,
         }
-        connection.execute(update(machines).where(machines.c.machine_id == claim.machine_id).values(counted))
+        connection.execute(_COUNT, counted)
         _write_checkpoint(connection, claim.machine_id, bundle)
     for table, values in rows.items():
         if values:
@@ -100,12 +116,9 @@ def _new_events(connection: Connection, claim: Claim, events: Sequence[StoredEve
     """Events that are not in the log yet; StoreError if these contradict it."""
     if not events:
         return []
-    log = alarm_events.c
     new = {event.sequence: event for event in events}
-    query = select(log.sequence, log.id).where(
-        log.machine_id == claim.machine_id, or_(log.sequence >= min(new), log.id.in_([event.id for event in events]))
-    )
-    for sequence, identifier in connection.execute(query):
+    places = {"which": claim.machine_id, "first": min(new), "identifiers": [event.id for event in events]}
+    for sequence, identifier in connection.execute(_EVENTS, places):
         event = new.pop(sequence, None)
         if event is not None and event.id != identifier:
             raise StoreError(
@@ -159,11 +172,11 @@ def _write_checkpoint(connection: Connection, machine_id: int, bundle: Bundle) -
     if bundle.head is None:
         return
     values = asdict(bundle.head) | {"alarms": zstandard.compress(bundle.head.alarms.encode())}
-    changed = connection.execute(update(checkpoints).where(checkpoints.c.machine_id == machine_id).values(values))
+    changed = connection.execute(_CHECKPOINT, {"which": machine_id, **values})
     if changed.rowcount == 0:
         connection.execute(insert(checkpoints).values(machine_id=machine_id, **values))
     parts = checkpoint_parts.c
-    there = connection.scalars(select(parts.name).where(parts.machine_id == machine_id))
+    there = connection.scalars(_PARTS, {"which": machine_id})
     gone = [name for name in there if name not in bundle.keep or name in bundle.new_parts]
     if gone:
         connection.execute(delete(checkpoint_parts).where(parts.machine_id == machine_id, parts.name.in_(gone)))
