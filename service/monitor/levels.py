@@ -98,8 +98,9 @@ class LevelWatch:
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
             counts.
         explained : bool
-            Whether parameters have been found to have changed: their alarms say what has become louder, and why, so
-            an alert is not raised beside them. What is raised already stays, and a danger is always told.
+            Whether parameters have been found to have changed, without reserve: their alarms say what has become
+            louder, and why, so an alert is not raised beside them. What is raised already stays, and a danger is
+            always told.
         """
         evidence = Evidence(start_ns=end_ns - self._hop_ns, end_ns=end_ns)
         for state, levels in zip(self._states, self.latest, strict=False):

@@ -443,10 +443,10 @@ class MachineMonitor:
         looks[whole] = stretch_of(evaluation.deciding, statistics.start_ns, end_ns)
         verdict = self._test.update(looks, foreign=foreign != "")
         self._alarms.found(verdict, self._test.unexplained, evaluation.deciding.suspect, end_ns)
-        self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=bool(verdict.changed))
+        explained = bool(verdict.changed) and not verdict.outside_model
+        self._levels.tell(self._alarms, end_ns, faulty=faulty, explained=explained)
         unexplained = evaluation.deciding.unexplained
-        # Where the window straddles a change, what is explained is in the verdict's current readings.
-        reason = "" if verdict.current else unexplained
+        reason = "" if verdict.current else unexplained  # what a window astride a change explains is in the verdict
         if not unexplained and not evaluation.deciding.evaluable:
             reason = evaluation.why_nothing
         if evaluation.shapes:

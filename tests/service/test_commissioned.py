@@ -15,6 +15,7 @@ from models.machine import AlarmSettings
 from models.physics.rotor import PARAMETERS
 from models.signals.block import SampleBlock
 from models.signals.channels import Quantity
+from rotorwatch.records.alarms import Severity
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import Event, Rub, load_scenario
@@ -90,7 +91,28 @@ def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve() -> None:
     assert "clipped, as by a rub" in full(windows)[-1].suspect
     raised = {event.alarm.name: event.alarm for event in events}
     assert "clipped, as by a rub" in raised[MODEL].note
-    assert all(alarm.low_confidence for name, alarm in raised.items() if name in PARAMETERS)
+    named = [alarm for name, alarm in raised.items() if name in PARAMETERS]
+    assert all(alarm.low_confidence for alarm in named)
+    # Its size would be a danger, were it one of that parameter.
+    assert {alarm.severity for alarm in named} <= {Severity.ALERT}
+
+
+def test_what_grows_beside_a_name_is_heard_where_the_name_does_not_explain_it() -> None:
+    """An unbalance has been named when a 2x comes, from which on the machine is outside the model."""
+    begins = 700
+    after = stream(110.0, SEED + 2, Event(at_s=0.0, parameter="e", relative_change=0.5))
+    samples = samples_of(after)
+    names = [channel.name for channel in LAB.sensors]
+    theta, once = samples[:, names.index("theta")], len(samples) * begins // len(after)
+    for state in ("y1", "y2", "z1", "z2"):
+        line = 3.5 * np.cos(2 * theta[once:])
+        samples[once:, names.index(state)] += line
+        samples[once:, names.index(f"{state}_dot")] += 2 * LAB.operation.speed_rad_s * 1e-3 * line
+    monitor = MachineMonitor(installed())
+    _, first = feed(monitor, with_samples(after, samples)[:begins])
+    assert {event.alarm.name for event in first} == {"e"}
+    _, events = feed(monitor, with_samples(after, samples)[begins:])
+    assert "y2 (disc y) 2x" in next(event.alarm.note for event in events if event.alarm.name == f"{LEVEL}y2")
 
 
 @pytest.mark.parametrize("place", ["1", "2"])

@@ -206,7 +206,8 @@ class AlarmBook:
             note=note,
         )
         beyond, small = named and size > limits.raise_above, taken_back or size < limits.clear_below
-        danger = beyond and size > limits.danger_above
+        # With reserve the size is one of a parameter that need not be the one; levels say whether it is dangerous.
+        danger = beyond and size > limits.danger_above and not low_confidence
         return self._judge(alarm, time_ns, beyond=beyond, small=small, danger=danger)
 
     def update_state(  # noqa: PLR0913  # what is known of a state
