@@ -86,7 +86,7 @@ def test_a_rub_is_told_and_what_it_is_taken_for_is_named_with_reserve() -> None:
     scenario, machine = load_scenario("healthy")
     rubbing = scenario.model_copy(
         update={"rub": Rub(clearance_m=4e-5), "events": (Event(at_s=0.0, anomaly="rub", size=2.0),)}
-    ).overridden(duration_s=75.0, seed=SEED + 7)
+    ).overridden(duration_s=66.0, seed=SEED + 7)
     windows, events = feed(MachineMonitor(installed()), [block for block, _ in blocks(rubbing, machine)])
     assert "clipped, as by a rub" in full(windows)[-1].suspect
     raised = {event.alarm.name: event.alarm for event in events}
