@@ -147,34 +147,42 @@ def growth(
     shorter : float
         By how much a level scatters more than in the healthy windows, while the window fills.
     """
-    edges_hz, own, mean, high, error = _healthy(reference)
-    if levels.edges_hz.shape != edges_hz.shape or not np.allclose(levels.edges_hz, edges_hz, rtol=1e-3):
+    known = _limits(
+        reference, levels.edges_hz.tobytes(), levels.freedom.tobytes(), ratio, beyond_range, n_errors, shorter
+    )
+    if known is None:
         return None
-    now, chance = levels.rms[:, column], _by_chance(levels.freedom.tobytes(), reference.freedom)
-    relative = n_errors * np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
-    loudest = np.maximum(beyond_range, 1 + relative * np.sqrt(shorter**2 - 1)) * high
-    limit = np.max([np.maximum(ratio, chance) * mean, loudest, (1 + relative * shorter) * mean], axis=0)
+    own, mean, limit = known
+    now = levels.rms[:, column]
     looked_at = (now > _COUNTS * np.sqrt(np.sum(now**2))) & (own > 0)
     if not looked_at.any():
         return None
     # What grows in all bands alike is growth of the excitation, which the overall level is judged by.
-    limit *= max(1.0, float(np.median(now[looked_at] / own[looked_at])))
+    limit = limit * max(1.0, float(np.median(now[looked_at] / own[looked_at])))
     at = int(np.argmax(np.where(looked_at, now / np.where(mean > 0, limit, 1.0), 0.0)))
     edges = levels.edges_hz
     return Growth((float(edges[at]), float(edges[at + 1])), float(now[at] / mean[at]), float(limit[at] / mean[at]))
 
 
 @lru_cache(maxsize=1024)
-def _healthy(reference: BandReference) -> tuple[FloatArray, ...]:
-    """Edges and means of the bands; mean, high and error of the loudest of each neighbourhood."""
-    around = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
-    return (np.array(reference.edges_hz), np.array(reference.mean), *around)
-
-
-@lru_cache(maxsize=1024)
-def _by_chance(freedom: bytes, healthy: tuple[float, ...]) -> FloatArray:
-    """Ratio of rms values that chance exceeds; dear, and the same in every full window."""
-    return np.asarray(np.sqrt(fdtri(np.frombuffer(freedom), np.array(healthy), 1 - _CHANCE)), dtype=np.float64)
+def _limits(
+    reference: BandReference,
+    edges_hz: bytes,
+    freedom: bytes,
+    ratio: float,
+    beyond_range: float,
+    n_errors: float,
+    shorter: float,
+) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+    """Mean of every band, that of the loudest of its neighbourhood, and limit; the same in every full window."""
+    edges, own, degrees = np.frombuffer(edges_hz), np.array(reference.mean), np.frombuffer(freedom)
+    if edges.size != len(reference.edges_hz) or not np.allclose(edges, reference.edges_hz, rtol=1e-3):
+        return None
+    mean, high, error = (_around(np.array(each)) for each in (reference.mean, reference.high, reference.error))
+    chance = np.sqrt(fdtri(degrees, np.array(reference.freedom), 1 - _CHANCE))
+    relative = n_errors * np.divide(error, mean, out=np.zeros_like(mean), where=mean > 0)
+    loudest = np.maximum(beyond_range, 1 + relative * np.sqrt(shorter**2 - 1)) * high
+    return own, mean, np.max([np.maximum(ratio, chance) * mean, loudest, (1 + relative * shorter) * mean], axis=0)
 
 
 def _around(values: FloatArray) -> FloatArray:
