@@ -222,9 +222,9 @@ def levels(options: Options) -> Study:
     """Vibration levels on streams."""
     rotors = [f"{name}, level {level}" for name in SHIPPED for level in ("full", "none")]
     rotors += [f"{name}, level none" for name in SUBJECTS if name not in SHIPPED]
-    plan = [("doubling", machine, 4.0) for machine in KINDS]
+    plan = [("doubling", machine, 14.0) for machine in KINDS]
     plan += [("doubling", machine, 1.0) for machine in (rotors[1:2] if options.small else rotors)]
-    plan += [("bearing", machine, 10.0) for machine in (_BEARING, _IN_SNAPSHOTS)]
+    plan += [("bearing", machine, 25.0) for machine in (_BEARING, _IN_SNAPSHOTS)]
     cells = tuple(
         Cell(
             {"topic": topic, "machine": machine},
