@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -132,6 +133,7 @@ def month_thresholds(
     )
 
 
+@lru_cache(maxsize=256)
 def _crossed(per_hop: float, overlap: int) -> float:
     """Threshold with this crossing rate; never below one standard error, where crossings are as frequent as can be."""
     low, high = 1.0, 37.0
