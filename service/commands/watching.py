@@ -222,8 +222,9 @@ def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health
     from rotorwatch.records.health import Health  # noqa: PLC0415
 
     try:
-        # Without TLS there is nothing to verify, and to read all that this computer trusts takes its time.
-        verify = not url.startswith("http:") if ca is None else ssl.create_default_context(cafile=ca)
+        # Without TLS nobody is trusted: to read all that this computer trusts takes its time.
+        plain = ca is None and url.startswith("http:")
+        verify = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if plain else ssl.create_default_context(cafile=ca)
     except OSError as error:  # of which errors in certificates are a kind
         raise MachineFileError(f"--ca {ca}: cannot be used as an authority's certificate ({error.strerror})") from error
     try:
