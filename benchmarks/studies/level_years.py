@@ -267,7 +267,12 @@ def _goals(records: Sequence[Record]) -> Iterator[Goal]:
 def level_years(options: Options) -> Study:
     """Levels of healthy machines over years."""
     plan = [
-        *(("years", of, f"{spread:g}, {how}", 6.6) for of in REFERENCES for spread in SPREADS for how in DRAWN),
+        *(
+            ("years", of, f"{spread:g}, {how}", weight)
+            for of in REFERENCES
+            for spread in SPREADS
+            for how, weight in zip(DRAWN, (13.0, 1.0), strict=True)
+        ),
         ("beside", "", "", 1.72),
     ]
     cells = tuple(
