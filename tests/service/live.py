@@ -8,11 +8,9 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import fastapi.dependencies.utils as analysis
 import httpx
 import numpy as np
 import numpy.typing as npt
@@ -72,25 +70,6 @@ _ALONE = {
 }
 """Unless a test says otherwise, programs leave nothing behind, are open to everybody on this computer, and lose nothing
 when it is busy."""
-
-
-_analyse = analysis.analyze_param
-
-
-@lru_cache(1000)
-def _analysed(name: str, annotation: Any, value: Any, in_path: bool) -> analysis.ParamDetails:
-    return _analyse(param_name=name, annotation=annotation, value=value, path_param_names={name} if in_path else set())
-
-
-def _analysed_once(param_name: str, annotation: Any, value: Any, path_param_names: set[str]) -> analysis.ParamDetails:
-    try:
-        return _analysed(param_name, annotation, value, param_name in path_param_names)
-    except TypeError:  # a list as the default, which cannot be looked up
-        return _analyse(param_name=param_name, annotation=annotation, value=value, path_param_names=path_param_names)
-
-
-# Arguments that are annotated alike are analysed once, as in a process of its own, and not for every service.
-analysis.analyze_param = _analysed_once
 
 
 def until(condition: Callable[[], bool], what: str, timeout_s: float = 180.0) -> None:
