@@ -17,13 +17,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from sqlalchemy import URL, Connection, Engine, Row, Select, create_engine, event, inspect, make_url, text
+from sqlalchemy import URL, Connection, Engine, Row, Select, create_engine, event, make_url, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, DisconnectionError, SQLAlchemyError
 from sqlalchemy.pool import StaticPool
 
 from service.history.file import HistoryFile, is_damage
 from service.history.records import DamagedError, StoreError
-from service.history.tables import REVISION, create
+from service.history.tables import bring_up_to_date
 
 if TYPE_CHECKING:
     from sqlalchemy.dialects import postgresql, sqlite
@@ -328,18 +328,10 @@ class Database:
         return engine
 
     def _bring_up_to_date(self, connection: Connection) -> None:
-        there = inspect(connection).get_table_names()
-        if not there and self.is_sqlite:
-            create(connection)
-        elif "alembic_version" not in there or connection.scalars(
-            text("SELECT version_num FROM alembic_version")
-        ).all() != [REVISION]:
-            from service.history.migrations import migrate  # noqa: PLC0415  # Alembic takes long to import
-
-            try:
-                migrate(connection)
-            except StoreError as error:
-                raise StoreError(f"{self.shown}: {error}") from error
+        try:
+            bring_up_to_date(connection)
+        except StoreError as error:
+            raise StoreError(f"{self.shown}: {error}") from error
         for table in _NEEDED if self.file is not None else ():
             found = connection.scalars(text(f"PRAGMA quick_check({table})")).all()
             if found != ["ok"]:

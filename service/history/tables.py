@@ -1,4 +1,4 @@
-"""The tables of the history, as the code sees them; `migrations` makes them of what older versions have left.
+"""The tables of the history; `migrations` makes them of what older versions have left.
 
 ::
 
@@ -17,8 +17,11 @@ import sqlalchemy as sa
 from sqlalchemy import BigInteger, Double, Integer, LargeBinary, Text
 from sqlalchemy.types import TypeEngine
 
+from service.history.records import StoreError
+
 REVISION = "0004"
 """The migration that ends with these tables."""
+MIGRATING = (0x726F746F, 0)  # PostgreSQL's advisory lock; second numbers from 1 are machines
 
 metadata = sa.MetaData(
     naming_convention={
@@ -161,14 +164,14 @@ webhook_cursors = sa.Table(
     sa.PrimaryKeyConstraint("name", "machine_key"),
 )
 
-KEPT = ("alarm_events", "audit_log")
+_KEPT = ("alarm_events", "audit_log")
 """What is written there stays as it is."""
 
-SQLITE_TRIGGERS = (
+_SQLITE_TRIGGERS = (
     *(
         f"CREATE TRIGGER {table}_no_{change.lower()} BEFORE {change} ON {table} "
         f"BEGIN SELECT RAISE(ABORT, '{table} is append-only'); END"
-        for table in KEPT
+        for table in _KEPT
         for change in ("UPDATE", "DELETE")
     ),
     # INSERT OR REPLACE removes the former row without a trigger of its own.
@@ -180,13 +183,56 @@ SQLITE_TRIGGERS = (
 )
 
 
-def create(connection: sa.Connection) -> None:
-    """Make in an empty SQLite database at once what the migrations would make, which take long to import."""
+_POSTGRESQL_TRIGGERS = (
+    "CREATE FUNCTION refuse_change() RETURNS trigger LANGUAGE plpgsql AS "
+    "$$ BEGIN RAISE EXCEPTION '% is append-only', TG_TABLE_NAME; END $$",
+    *(
+        f"CREATE TRIGGER {table}_no_{name} BEFORE {change} ON {table} FOR EACH {each} EXECUTE FUNCTION refuse_change()"
+        for table in _KEPT
+        for name, change, each in (("change", "UPDATE OR DELETE", "ROW"), ("truncate", "TRUNCATE", "STATEMENT"))
+    ),
+)
+
+
+def bring_up_to_date(connection: sa.Connection) -> None:
+    """Make the tables in an empty database, and the present ones of those that an older version has made.
+
+    Raises
+    ------
+    StoreError
+        If the database belongs to a newer version, or to something else.
+    """
+    if _revisions(connection) == [REVISION]:
+        return
+    if connection.dialect.name == "postgresql":
+        # A large history may take minutes, another's too. One at a time; SQLite's transaction keeps the others out.
+        connection.execute(sa.text("SET LOCAL statement_timeout = 0"))
+        connection.execute(sa.select(sa.func.pg_advisory_xact_lock(*MIGRATING)))
+    found = _revisions(connection)
+    if found and found != [REVISION]:
+        from service.history.migrations import migrate  # noqa: PLC0415  # Alembic takes long to import
+
+        migrate(connection)
+    elif not found and sa.inspect(connection).has_table("machines"):
+        raise StoreError(
+            "the database holds a table 'machines' that is not ours: give the history a database of its own"
+        )
+    elif not found:
+        _create(connection)
+
+
+def _revisions(connection: sa.Connection) -> list[str]:
+    if not sa.inspect(connection).has_table("alembic_version"):
+        return []
+    return list(connection.scalars(sa.text("SELECT version_num FROM alembic_version")))
+
+
+def _create(connection: sa.Connection) -> None:
     metadata.create_all(connection, checkfirst=False)
     for statement in (
-        *SQLITE_TRIGGERS,
+        *(_SQLITE_TRIGGERS if connection.dialect.name == "sqlite" else _POSTGRESQL_TRIGGERS),
         "CREATE TABLE alembic_version (version_num VARCHAR(32) NOT NULL, "
         "CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num))",
         f"INSERT INTO alembic_version VALUES ('{REVISION}')",  # noqa: S608  # ours
     ):
-        connection.exec_driver_sql(statement)
+        connection.execute(sa.text(statement))

@@ -1,7 +1,7 @@
 """The readings of a window in one value, and what windows are reduced to: the same numbers of many, added up.
 
 Both are arrays with a record for each series, compressed; in them the numbers of series are differences, which halves
-what compressing leaves of them. Migrations write them as well, so their form stays as it is.
+what compressing leaves of them.
 """
 
 from collections.abc import Sequence

@@ -19,9 +19,9 @@ from sqlalchemy import Select, func, literal, select, text
 
 from service.history.database import Database
 from service.history.machine import MachineStore
-from service.history.migrations import MIGRATING
 from service.history.records import Retention, Step, StoreError
 from service.history.store import Store
+from service.history.tables import MIGRATING
 from tests.service.live import until
 from tests.service.postgres import KINDS, USER, PostgresServer, database_url, postgres_server
 from tests.service.test_store import T0, alarm_event, head, hop_step
