@@ -1,7 +1,7 @@
 """From a rotor to its equations of motion, its modes, and its response to harmonic forces.
 
-Coordinates are (v, v') of all nodes in the horizontal plane y, then in the vertical plane z. A positive speed turns
-from y to z.
+Coordinates are (v, v') of all nodes in the horizontal plane y, then in the vertical plane z, then y and z of a stand. A
+positive speed turns from y to z.
 """
 
 from dataclasses import dataclass
@@ -84,11 +84,20 @@ def assemble(rotor: BeamRotor, speed_rad_s: float) -> Equations:
     M = np.asarray(np.kron(both, M1), dtype=np.float64)
     K = np.asarray(np.kron(both, K1), dtype=np.float64)
     C = np.asarray(np.kron(both, rotor.shaft_damping_s * K1) + np.kron(turn, speed_rad_s * G1), dtype=np.float64)
-    for bearing in rotor.bearings:
-        y, z = place(rotor, bearing.node, "y"), place(rotor, bearing.node, "z")
-        K[np.ix_([y, z], [y, z])] += [[bearing.k_y, bearing.k_yz], [bearing.k_zy, bearing.k_z]]
-        C[y, y] += bearing.c_y
-        C[z, z] += bearing.c_z
+    M, C, K = (np.pad(one, (0, rotor.size - 2 * n)) for one in (M, C, K))
+    on_stand = np.zeros((2, rotor.size))
+    if rotor.stand is not None:
+        on_stand[:, -2:] = both
+        for matrix, of_stand in ((M, rotor.stand.mass_kg), (C, rotor.stand.c), (K, rotor.stand.k)):
+            matrix[-2:, -2:] += of_stand * both
+    springs = [(one.node, *one.coefficients(speed_rad_s), on_stand) for one in rotor.bearings]
+    if rotor.gear is not None:
+        mesh = np.outer(rotor.gear.along, rotor.gear.along)
+        springs.append((rotor.gear.node, rotor.gear.k * mesh, rotor.gear.c * mesh, 0 * on_stand))
+    for node, stiffness, damping, moved in springs:
+        against = np.eye(rotor.size)[[place(rotor, node, "y"), place(rotor, node, "z")]] - moved
+        K += against.T @ stiffness @ against
+        C += against.T @ damping @ against
     return Equations(M, C, K)
 
 
@@ -114,7 +123,7 @@ def harmonic_response(equations: Equations, frequency_rad_s: float, force: Compl
 
 def unbalance_force(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
     """Rotating force of all discs, q of f = Re{q e^{jθ}}, shape (n,)."""
-    force = np.zeros(4 * (rotor.elements + 1), dtype=np.complex128)
+    force = np.zeros(rotor.size, dtype=np.complex128)
     for disc in rotor.discs:
         q = disc.unbalance_kg_m * speed_rad_s**2 * np.exp(1j * disc.phase_rad)
         force[place(rotor, disc.node, "y")] += q
@@ -125,3 +134,12 @@ def unbalance_force(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
 def unbalance_response(rotor: BeamRotor, speed_rad_s: float) -> ComplexArray:
     """Synchronous vectors of all coordinates, q of ξ = Re{q e^{jθ}}, shape (n,); of the linear rotor."""
     return harmonic_response(assemble(rotor, speed_rad_s), speed_rad_s, unbalance_force(rotor, speed_rad_s))
+
+
+def mesh_force(rotor: BeamRotor) -> ComplexArray:
+    """Force of the transmission error on the wheel, q of f = Re{q e^{jnθ}} with n teeth, shape (size,)."""
+    force = np.zeros(rotor.size, dtype=np.complex128)
+    if rotor.gear is not None:
+        at = [place(rotor, rotor.gear.node, "y"), place(rotor, rotor.gear.node, "z")]
+        force[at] = rotor.gear.k * rotor.gear.error_m * rotor.gear.along
+    return force

@@ -3,7 +3,8 @@
 import math
 from dataclasses import replace
 
-from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc
+from benchmarks.finite_elements.film import Film
+from benchmarks.finite_elements.rotor import BeamRotor, Bearing, Disc, Gear, Stand
 
 _OVERHUNG = BeamRotor(
     name="overhung",
@@ -89,7 +90,50 @@ _FLUID_FILM = replace(
     speed_rad_s=2 * math.pi * 26.0,
 )
 
-ROTORS: tuple[BeamRotor, ...] = (_OVERHUNG, _BETWEEN, _BOTH_SIDES, _ASYMMETRIC, _STIFFENING, _FLUID_FILM)
+_FILM = Film(diameter_m=0.025, length_m=0.0125, clearance_m=1.0e-4, viscosity_Pa_s=0.02, load_N=30.0)
+
+_PLAIN_BEARINGS = replace(
+    _BETWEEN,
+    name="plain-bearings",
+    description="Two discs between plain bearings, all eight coefficients of an oil film at its speed",
+    diameter_m=_FILM.diameter_m,
+    bearings=(
+        Bearing(node=0, k_y=1.0, k_z=1.0, c_y=1.0, c_z=1.0, film=_FILM),
+        Bearing(node=6, k_y=1.0, k_z=1.0, c_y=1.0, c_z=1.0, film=replace(_FILM, load_N=27.0)),
+    ),
+    speed_rad_s=2 * math.pi * 40.0,
+)
+
+_SOFT_STAND = BeamRotor(
+    name="soft-stand",
+    description="Vertical pump, impeller overhung, isotropic bearings in a stand that sways",
+    length_m=0.9,
+    diameter_m=0.030,
+    elements=6,
+    bearings=(
+        Bearing(node=4, k_y=1.2e6, k_z=1.2e6, c_y=700.0, c_z=700.0, housing_kg=1.5),
+        Bearing(node=1, k_y=1.5e6, k_z=1.5e6, c_y=700.0, c_z=700.0, housing_kg=1.5),
+    ),
+    discs=(
+        Disc(node=6, mass_kg=6.0, radius_m=0.09, unbalance_kg_m=6.0e-5),
+        Disc(node=2, mass_kg=5.0, radius_m=0.07, unbalance_kg_m=2.0e-5, phase_rad=2.0),
+    ),
+    speed_rad_s=2 * math.pi * 24.5,
+    stand=Stand(mass_kg=60.0, k=1.4e5, c=300.0),
+)
+
+_GEARED = replace(
+    _BETWEEN,
+    name="geared",
+    description="Shaft between bearings with a gear wheel, whose mesh couples the planes along the line of pressure",
+    gear=Gear(node=4, k=6.0e5, c=60.0, pressure_rad=math.radians(70.0), teeth=19, error_m=5.0e-6),
+    speed_rad_s=2 * math.pi * 22.0,
+)
+
+ROTORS: tuple[BeamRotor, ...] = (
+    *(_OVERHUNG, _BETWEEN, _BOTH_SIDES, _ASYMMETRIC, _STIFFENING, _FLUID_FILM),
+    *(_PLAIN_BEARINGS, _SOFT_STAND, _GEARED),
+)
 """All machines of the table."""
 
 

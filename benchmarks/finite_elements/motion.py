@@ -2,7 +2,7 @@
 
 The force is linear between samples. For such a force the linear rotor advances exactly, mode by mode, and its
 accelerations are continuous; displacement, velocity and acceleration belong together to the last digit. The unbalance
-response is the stationary one, in closed form.
+response is the stationary one, in closed form, and so is a mesh tone.
 
 A rotor with cubic stiffness advances by the same exact step of its linear part on a finer grid, unbalance included; the
 cubic force joins it as a force that is linear over the step, extrapolated from its last two values. The error falls
@@ -18,10 +18,11 @@ from benchmarks.finite_elements.assembly import (
     ComplexArray,
     Equations,
     assemble,
+    harmonic_response,
+    mesh_force,
     place,
     probed,
     unbalance_force,
-    unbalance_response,
 )
 from benchmarks.finite_elements.forces import Force, force_samples, forced
 from benchmarks.finite_elements.rotor import BeamRotor
@@ -109,10 +110,13 @@ def move(
     angle = np.asarray(start + speed_rad_s * np.arange(count) / rate_hz, dtype=np.float64)
     if rotor.linear:
         values = _linear(modal, probed(rotor), force, rate_hz)
-        whirl = unbalance_response(rotor, speed_rad_s)[list(probed(rotor))]
-        W = 1j * speed_rad_s
-        turning = np.concatenate([whirl, W * whirl, W**2 * whirl])
-        values += np.real(np.exp(1j * angle)[:, None] * turning)
+        turning = [(1, unbalance_force(rotor, speed_rad_s))]
+        if rotor.gear is not None:
+            turning.append((rotor.gear.teeth, mesh_force(rotor)))
+        for order, pull in turning:
+            q = harmonic_response(equations, order * speed_rad_s, pull)[list(probed(rotor))]
+            W = 1j * order * speed_rad_s
+            values += np.real(np.exp(1j * order * angle)[:, None] * np.concatenate([q, W * q, W**2 * q]))
     else:
         fine_angle = np.asarray(start + speed_rad_s * np.arange(count * fine) / (rate_hz * fine), dtype=np.float64)
         pull = unbalance_force(rotor, speed_rad_s)

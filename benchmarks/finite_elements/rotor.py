@@ -4,6 +4,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from benchmarks.finite_elements.film import Film
+from models.signals.block import FloatArray
+
 CHANGEABLE = ("k_by", "c_by", "k_bz", "c_bz", "e")
 """Parameters that can change: stiffness and damping of the measured bearing, unbalance of all discs."""
 
@@ -46,6 +51,8 @@ class Bearing:
         Force over the third power of the displacement, in y.
     cubic_ratio_z : float
         The same in z over that in y.
+    film : Film or None
+        What carries; k_y, k_z, c_y and c_z are then factors on its own, and k_yz and k_zy are left out.
     """
 
     node: int
@@ -58,6 +65,63 @@ class Bearing:
     housing_kg: float = 0.0
     cubic_N_per_m3: float = 0.0
     cubic_ratio_z: float = 1.0
+    film: Film | None = None
+
+    def coefficients(self, speed_rad_s: float) -> tuple[FloatArray, FloatArray]:
+        """Stiffness, N/m, and damping, Ns/m, on (y, z), shape (2, 2) each; cubic stiffness left out."""
+        own = np.diag([self.k_y, self.k_z]), np.diag([self.c_y, self.c_z])
+        coupling = np.array([[0.0, self.k_yz], [self.k_zy, 0.0]])
+        if self.film is None:
+            return own[0] + coupling, own[1]
+        K, C = self.film.coefficients(speed_rad_s)
+        crossed = 1 - np.eye(2)
+        return K * (own[0] + crossed), C * (own[1] + crossed)
+
+
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """What all bearings stand on: a mass that yields sideways, alike in y and z.
+
+    Attributes
+    ----------
+    mass_kg, k, c : float
+        Stiffness, N/m, and damping, Ns/m, between it and the ground.
+    """
+
+    mass_kg: float
+    k: float
+    c: float
+
+
+@dataclass(frozen=True, slots=True)
+class Gear:
+    """A wheel in mesh with one that does not move sideways: a spring along the line of pressure, and its tone.
+
+    What turns is left out: torsion, and how the mesh's stiffness varies from tooth to tooth but for the tone.
+
+    Attributes
+    ----------
+    node : int
+    k, c : float
+        Mean stiffness, N/m, and damping, Ns/m, of the mesh.
+    pressure_rad : float
+        Of the line of pressure from y towards z.
+    teeth : int
+    error_m : float
+        Amplitude of the transmission error at the tooth frequency.
+    """
+
+    node: int
+    k: float
+    c: float
+    pressure_rad: float
+    teeth: int
+    error_m: float
+
+    @property
+    def along(self) -> FloatArray:
+        """Unit vector of the line of pressure in (y, z)."""
+        return np.array([math.cos(self.pressure_rad), math.sin(self.pressure_rad)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +144,9 @@ class BeamRotor:
     E_Pa, poisson, density_kg_m3 : float
     shear : bool
         Timoshenko's beam with rotary inertia; otherwise Euler and Bernoulli's.
+    stand : Stand or None
+        What the bearings stand on; None is the ground.
+    gear : Gear or None
     """
 
     name: str
@@ -95,6 +162,13 @@ class BeamRotor:
     poisson: float = 0.3
     density_kg_m3: float = 7850.0
     shear: bool = True
+    stand: Stand | None = None
+    gear: Gear | None = None
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates: four of every node, and two of a stand."""
+        return 4 * (self.elements + 1) + (2 if self.stand else 0)
 
     @property
     def linear(self) -> bool:

@@ -134,9 +134,9 @@ class Subject:
 
 def _of_beam(beam: BeamRotor, ran: RunCondition, seconds: float, seed: list[int]) -> tuple[Rotor, Seen]:
     found = sampled(beam, ran, seconds, seed)
-    equations, bearing = assemble(beam, ran.speed_rad_s), beam.bearings[0]
-    response = partial(_response, equations, list(probed(beam)))
-    both = (bearing.k_y + bearing.k_z) / 2, (bearing.c_y + bearing.c_z) / 2
+    K, C = beam.bearings[0].coefficients(ran.speed_rad_s)
+    response = partial(_response, assemble(beam, ran.speed_rad_s), list(probed(beam)))
+    both = float(np.trace(K)) / 2, float(np.trace(C)) / 2
     speed_hz = ran.speed_rad_s / (2 * np.pi)
     return Rotor(speed_hz, RATE_HZ, response, both), Seen(found[:, :4], found[:, 4:8], found[:, 8])
 

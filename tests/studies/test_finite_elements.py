@@ -9,7 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.finite_elements.assembly import assemble, harmonic_response, modes, place, probed, unbalance_response
+from benchmarks.finite_elements.assembly import (
+    assemble,
+    harmonic_response,
+    mesh_force,
+    modes,
+    place,
+    probed,
+    unbalance_response,
+)
+from benchmarks.finite_elements.film import Film
 from benchmarks.finite_elements.forces import Force, covariance_under
 from benchmarks.finite_elements.machines import ROTORS, rotor_named
 from benchmarks.finite_elements.motion import PROBES, move
@@ -32,6 +41,7 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.physics.excitation import Source, source_spectrum
+from models.signals.block import FloatArray
 from models.signals.channels import ChannelDescriptor
 from models.signals.recording import read_recording
 from models.signals.wire import decode_block
@@ -131,7 +141,11 @@ def test_an_unbalance_drives_the_forward_whirl_which_is_the_faster_one() -> None
 def test_named_machines_are_of_realistic_size(rotor: BeamRotor) -> None:
     low = [mode for mode in modes(assemble(rotor, rotor.speed_rad_s)) if mode.frequency_hz < 200]
     assert 4 <= len(low) <= 10
-    assert all(mode.frequency_hz > 15 and 0.015 < mode.damping < 0.16 for mode in low), low
+    if rotor.stand is not None:
+        sway, low = low[:2], low[2:]
+        assert all(4 < mode.frequency_hz < 15 for mode in sway)
+    most = 0.16 if all(bearing.film is None for bearing in rotor.bearings) else 1.0
+    assert all(mode.frequency_hz > 15 and 0.015 < mode.damping < most for mode in low), low
 
 
 def test_the_ljapunov_covariance_is_the_integral_of_the_spectrum() -> None:
@@ -221,6 +235,74 @@ def test_an_unstable_rotor_is_refused() -> None:
         move(whirling, rotor.speed_rad_s, (), 1.0, RATE_HZ, np.random.default_rng(0))
 
 
+def film_force(film: Film, speed_rad_s: float, at: FloatArray, rate: FloatArray) -> FloatArray:
+    """Of Reynolds' equation for a short bearing on the journal, by quadrature round it; shape (2,), N."""
+    angle = np.arange(40_000) * (2 * np.pi / 40_000)
+    round_ = np.array([np.cos(angle), np.sin(angle)])
+    wedge = speed_rad_s * (at @ [round_[1], -round_[0]]) - 2 * rate @ round_
+    pressed = np.maximum(-film.viscosity_Pa_s * film.length_m**3 / 2 * wedge / (film.clearance_m - at @ round_) ** 3, 0)
+    return np.asarray(-(round_ @ pressed) * film.diameter_m * np.pi / angle.size)
+
+
+def test_an_oil_film_has_the_derivatives_of_reynolds_equation() -> None:
+    film, speed = Film(0.03, 0.012, 8e-5, 0.03, 30.0), 200.0
+    still, size = np.zeros(2), film.clearance_m * film.eccentricity(speed)
+    attitude = math.atan(math.pi / 4 * math.sqrt(1 / film.eccentricity(speed) ** 2 - 1))
+    at = size * np.array([math.sin(attitude), -math.cos(attitude)])
+    assert film_force(film, speed, at, still) == pytest.approx([0.0, film.load_N], abs=1e-3)
+    steps = 1e-8 * np.eye(2)
+    K = [(film_force(film, speed, at - d, still) - film_force(film, speed, at + d, still)) / 2e-8 for d in steps]
+    C = [(film_force(film, speed, at, -d) - film_force(film, speed, at, d)) / 2e-8 for d in steps]
+    found = film.coefficients(speed)
+    assert found[0] == pytest.approx(np.transpose(K), rel=1e-3)
+    assert found[1] == pytest.approx(np.transpose(C), rel=1e-3)
+
+
+def test_a_film_without_load_whirls_at_half_the_speed_and_a_loaded_one_does_not() -> None:
+    for load_N, stable in ((0.5, False), (3000.0, True)):
+        film = Film(0.03, 0.015, 8e-5, 0.02, load_N)
+        ends = tuple(Bearing(node, 1, 1, 1, 1, film=film) for node in (0, 12))
+        rigid = replace(BEAM, E_Pa=1e14, diameter_m=0.03, density_kg_m3=100.0, bearings=ends)
+        least = max(np.linalg.eigvals(assemble(rigid, 1500.0).A), key=lambda root: root.real)
+        assert (least.real < 0) == stable
+        if not stable:
+            assert abs(least.imag) == pytest.approx(750.0, rel=0.05)
+            K, _ = film.coefficients(1500.0)
+            assert K[0, 1] == pytest.approx(-K[1, 0], rel=1e-2)  # what drives the whirl
+            assert film.eccentricity(1500.0) < 0.05
+
+
+def test_a_stand_sways_with_all_that_stands_on_it_and_a_stiff_one_is_the_ground() -> None:
+    rotor = rotor_named("soft-stand")
+    assert rotor.stand is not None
+    total = rotor.stand.mass_kg + sum(one.mass_kg for one in rotor.discs) + sum(b.housing_kg for b in rotor.bearings)
+    total += rotor.density_kg_m3 * rotor.area_m2 * rotor.length_m
+    slowest = modes(assemble(rotor, 0.0))[0].frequency_hz
+    assert slowest == pytest.approx(math.sqrt(rotor.stand.k / total) / (2 * math.pi), rel=0.05)
+    stiff = replace(rotor, stand=replace(rotor.stand, k=1e12))
+    ground = [mode.frequency_hz for mode in modes(assemble(replace(rotor, stand=None), rotor.speed_rad_s))]
+    found = [mode.frequency_hz for mode in modes(assemble(stiff, rotor.speed_rad_s))]
+    assert found[:6] == pytest.approx(ground[:6], rel=1e-3)
+
+
+def test_a_mesh_is_a_spring_along_its_line_of_pressure_and_sounds_at_its_teeth() -> None:
+    rotor = rotor_named("geared")
+    assert rotor.gear is not None
+    free = assemble(replace(rotor, gear=None), rotor.speed_rad_s)
+    across = np.zeros(rotor.size)
+    across[[place(rotor, rotor.gear.node, plane) for plane in ("y", "z")]] = rotor.gear.along @ [[0, 1], [-1, 0]]
+    difference = assemble(rotor, rotor.speed_rad_s).K - free.K
+    assert np.linalg.norm(difference @ across) < 1e-9 * np.linalg.norm(difference)
+    assert np.trace(difference) == pytest.approx(rotor.gear.k)
+    still = replace(rotor, discs=tuple(replace(disc, unbalance_kg_m=0.0) for disc in rotor.discs))
+    motion = move(still, rotor.speed_rad_s, (), 1, RATE_HZ, np.random.default_rng(1))
+    design = np.column_stack([np.cos(19 * motion.angle_rad), np.sin(19 * motion.angle_rad)])
+    parts = np.linalg.lstsq(design, motion.values[:, 2], rcond=None)[0]
+    assert design @ parts == pytest.approx(motion.values[:, 2], abs=1e-12)
+    response = harmonic_response(assemble(rotor, rotor.speed_rad_s), 19 * rotor.speed_rad_s, mesh_force(rotor))
+    assert math.hypot(*parts) == pytest.approx(abs(response[place(rotor, 0, "z")]))
+
+
 def test_changes_reach_what_they_name() -> None:
     rotor = rotor_named("stiffening")
     other = changed_rotor(rotor, {"k_bz": -0.1, "c_by": -0.3, "e": 0.2})
@@ -228,6 +310,10 @@ def test_changes_reach_what_they_name() -> None:
     assert (two.k_y, two.c_z, two.cubic_N_per_m3) == (one.k_y, one.c_z, one.cubic_N_per_m3)
     assert (two.k_z, two.c_y, two.cubic_ratio_z) == pytest.approx((0.9 * one.k_z, 0.7 * one.c_y, 0.9))
     assert other.discs[1].unbalance_kg_m == pytest.approx(1.2 * rotor.discs[1].unbalance_kg_m)
+    plain = rotor_named("plain-bearings")
+    before, after = (one.bearings[0].coefficients(200.0) for one in (plain, changed_rotor(plain, {"k_by": -0.1})))
+    assert after[0] / before[0] == pytest.approx(np.array([[0.9, 1.0], [1.0, 1.0]]))
+    assert after[1] == pytest.approx(before[1])
     with pytest.raises(ValueError, match="stiffening: change EI"):
         changed_rotor(rotor, {"EI": 0.1})
 
