@@ -14,8 +14,6 @@ from rotorwatch.client.errors import ClientError
 from rotorwatch.client.log_order import LogOrder
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage, AlarmStates
 
-__all__ = ["follow_alarms"]
-
 _PAGE = 500
 _QUEUED = 10_000
 _STOP_S = 0.25

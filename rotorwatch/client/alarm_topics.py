@@ -11,8 +11,6 @@ import zenoh.ext
 
 from rotorwatch.client.errors import ClientError
 
-__all__ = ["AlarmMessage", "AlarmTopics", "LogUnavailable"]
-
 _PREFIX = "rotorwatch"
 _ANSWER_S = 5.0
 _CACHED_EVENTS = 200

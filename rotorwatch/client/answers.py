@@ -8,8 +8,6 @@ from pydantic import BaseModel, ValidationError
 from rotorwatch.client.errors import AccessRefused, ClientError, Conflict, NotFound, RequestRefused, Unavailable
 from rotorwatch.records.monitor import Problem
 
-__all__ = ["refusal", "understood"]
-
 M = TypeVar("M", bound=BaseModel)
 
 _KINDS: dict[int, type[RequestRefused]] = {

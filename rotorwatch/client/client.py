@@ -29,8 +29,6 @@ from rotorwatch.records.machines import DetectableChanges, MachineConfiguration,
 from rotorwatch.records.operations import OperationDone, OperationKind
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 
-__all__ = ["TOKEN_VARIABLE", "Client"]
-
 TOKEN_VARIABLE = "ROTORWATCH_TOKEN"  # noqa: S105  # the name of a variable
 _PAGE = 500
 

@@ -12,17 +12,6 @@
         └── Unavailable           429, 503: try again later
 """
 
-__all__ = [
-    "AccessRefused",
-    "ClientError",
-    "Conflict",
-    "LogReplaced",
-    "NoAnswer",
-    "NotFound",
-    "RequestRefused",
-    "Unavailable",
-]
-
 
 class ClientError(Exception):
     """Everything a client raises."""

@@ -13,8 +13,6 @@ from rotorwatch.client.errors import Conflict, LogReplaced, NoAnswer, Unavailabl
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.health import Health
 
-__all__ = ["ServiceEvent", "service_events"]
-
 _PATH = "/api/v1/events"
 _SILENCE_S = 60.0
 """The service says something every 15 s, if only that it is there."""

@@ -11,8 +11,6 @@ publisher's cache (only the latest), and from the log itself by query (always co
 from rotorwatch.client.errors import LogReplaced
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmLogPage
 
-__all__ = ["LogOrder"]
-
 _MOST_WAITING = 2000
 
 

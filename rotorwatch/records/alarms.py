@@ -3,22 +3,9 @@
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Site
-
-__all__ = [
-    "Alarm",
-    "AlarmCloudEvent",
-    "AlarmEventData",
-    "AlarmLogPage",
-    "AlarmState",
-    "AlarmStates",
-    "EventKind",
-    "Evidence",
-    "Severity",
-    "Shelf",
-]
+from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Name, Number, Record, Site
 
 
 class Severity(StrEnum):
@@ -68,7 +55,6 @@ _STATE_TEXT = (
     "latched-acknowledged (cleared, to be reset), shelved, suppressed (by a rule), out-of-service"
 )
 
-
 _AlarmName = Annotated[
     str,
     Field(
@@ -78,25 +64,20 @@ _AlarmName = Annotated[
     ),
 ]
 
-
 _AlarmChange = Annotated[
     Number, Field(description="relative change that decided; null for what is no parameter", examples=[-0.247])
 ]
 
-
 _AlarmError = Annotated[Number, Field(description="its standard error", examples=[0.0071])]
-
 
 _AlarmInterval = Annotated[
     tuple[float, float] | None, Field(description="its 95 % interval", examples=[(-0.261, -0.233)])
 ]
 
-
 _LowConfidence = Annotated[
     bool,
     Field(description="the data are outside the model: take the parameter named here with reserve", examples=[False]),
 ]
-
 
 _Note = Annotated[
     str,
@@ -106,10 +87,8 @@ _Note = Annotated[
 ]
 
 
-class Evidence(BaseModel):
+class Evidence(Record):
     """The data an alarm was decided on."""
-
-    model_config = JSON
 
     start_ns: int = Field(description="oldest data", examples=[EXAMPLE_NS - 20_000_000_000])
     end_ns: int = Field(description="end of the newest data", examples=[EXAMPLE_NS])
@@ -125,10 +104,8 @@ _Evidence = Annotated[
 ]
 
 
-class Shelf(BaseModel):
+class Shelf(Record):
     """Why an alarm is shelved, and until when."""
-
-    model_config = JSON
 
     until_ns: int = Field(
         description="data time at which it ends at the latest", examples=[EXAMPLE_NS + 3_600_000_000_000]
@@ -138,10 +115,8 @@ class Shelf(BaseModel):
     reason: str = Field(description="why", examples=["sensor cable is being replaced"])
 
 
-class Alarm(BaseModel):
+class Alarm(Record):
     """One alarm of a machine: of a parameter, the model, the data, or the stream."""
-
-    model_config = JSON
 
     name: _AlarmName
     text: str = Field(description="what it is about, in words", examples=["bearing stiffness, horizontal"])
@@ -181,10 +156,8 @@ class Alarm(BaseModel):
     )
 
 
-class AlarmStates(BaseModel):
+class AlarmStates(Record):
     """The alarms of one machine that are not normal (or all there have been, if asked for)."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -196,10 +169,8 @@ class AlarmStates(BaseModel):
     machine_hash: MachineHash
 
 
-class AlarmEventData(BaseModel):
+class AlarmEventData(Record):
     """What happened to an alarm."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -239,10 +210,8 @@ class AlarmEventData(BaseModel):
     program_version: str = Field(description="version of the monitor that wrote the event", examples=["0.1.0"])
 
 
-class AlarmCloudEvent(BaseModel):
+class AlarmCloudEvent(Record):
     """An alarm event as a CloudEvent 1.0 in structured JSON form."""
-
-    model_config = JSON
 
     specversion: Literal["1.0"] = Field(description="version of CloudEvents", examples=["1.0"])
     id: str = Field(
@@ -261,10 +230,8 @@ class AlarmCloudEvent(BaseModel):
     data: AlarmEventData = Field(description="what happened")
 
 
-class AlarmLogPage(BaseModel):
+class AlarmLogPage(Record):
     """Part of a machine's alarm log, from a given sequence number on: the answer to a query on ``alarm/event``."""
-
-    model_config = JSON
 
     site: Site
     machine: Name

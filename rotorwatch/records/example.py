@@ -6,8 +6,6 @@ from typing import get_args, get_origin
 
 from pydantic import BaseModel
 
-__all__ = ["example"]
-
 
 def example(model: type[BaseModel]) -> dict[str, object]:
     """Build one valid JSON object of a model out of the examples of its fields."""

@@ -6,14 +6,12 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import Annotated
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from rotorwatch.records.alarms import Alarm
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, Number, Reason, Site
+from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Name, Number, Reason, Record, Site
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth
 from rotorwatch.records.windows import Detectable, Equation, Opinion, Parameter, SensorFault, Shape, Verdict
-
-__all__ = ["MEASURES", "Health", "HealthState", "Measure", "Quality", "Report", "State", "StreamStatus"]
 
 
 class HealthState(StrEnum):
@@ -54,10 +52,8 @@ class Measure:
     unit: str
 
 
-class Report(BaseModel):
+class Report(Record):
     """One evaluation of the sliding window."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -115,10 +111,8 @@ MEASURES: Mapping[str, tuple[str, Measure]] = MappingProxyType(
 """The fields of a report that are measures, by the name of the measure."""
 
 
-class Quality(BaseModel):
+class Quality(Record):
     """What came in since the monitor started."""
-
-    model_config = JSON
 
     accepted_blocks: int = Field(default=0, description="blocks accepted", examples=[2051])
     refused_blocks: dict[str, int] = Field(
@@ -142,10 +136,8 @@ class Quality(BaseModel):
     )
 
 
-class StreamStatus(BaseModel):
+class StreamStatus(Record):
     """What is known about whoever publishes the stream."""
-
-    model_config = JSON
 
     publisher_alive: bool = Field(
         description="a publisher's liveliness token is there; publishers need not have one", examples=[True]
@@ -169,10 +161,8 @@ class StreamStatus(BaseModel):
     )
 
 
-class Health(BaseModel):
+class Health(Record):
     """Where a machine stands: state, report of the latest window, alarms, quality of the data."""
-
-    model_config = JSON
 
     site: Site
     machine: Name

@@ -1,18 +1,14 @@
 """What has been: lists with cursors, readings over time, the audit log."""
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.fields import EXAMPLE_NS, JSON
+from rotorwatch.records.fields import EXAMPLE_NS, Record
 from rotorwatch.records.health import MEASURES, Report
 
-__all__ = ["AlarmEventList", "AuditList", "AuditRecord", "Reading", "ReadingBucket", "ReadingList", "ReportList"]
 
-
-class ReportList(BaseModel):
+class ReportList(Record):
     """Window reports, the latest to arrive first."""
-
-    model_config = JSON
 
     reports: tuple[Report, ...] = Field(description="the latest to arrive first")
     next_before: int | None = Field(
@@ -20,10 +16,8 @@ class ReportList(BaseModel):
     )
 
 
-class AlarmEventList(BaseModel):
+class AlarmEventList(Record):
     """Alarm events in the order of their sequence, or, without `after`, in the reverse order."""
-
-    model_config = JSON
 
     events: tuple[AlarmCloudEvent, ...] = Field(description="with `after` oldest first, otherwise newest first")
     next_before: int | None = Field(
@@ -35,10 +29,8 @@ class AlarmEventList(BaseModel):
     )
 
 
-class Reading(BaseModel):
+class Reading(Record):
     """One number of one window."""
-
-    model_config = JSON
 
     number: int = Field(description="counts the machine's windows in the order of arrival", examples=[4711])
     end_ns: int = Field(description="end of the window", examples=[EXAMPLE_NS])
@@ -46,10 +38,8 @@ class Reading(BaseModel):
     standard_error: float | None = Field(description="its standard error; null if there is none", examples=[0.0071])
 
 
-class ReadingBucket(BaseModel):
+class ReadingBucket(Record):
     """Readings of one name over a stretch of time."""
-
-    model_config = JSON
 
     name: str = Field(description="which parameter, equation or level", examples=["k_by"])
     start_ns: int = Field(description="windows that end from here on", examples=[EXAMPLE_NS - 60_000_000_000])
@@ -63,10 +53,8 @@ class ReadingBucket(BaseModel):
     )
 
 
-class ReadingList(BaseModel):
+class ReadingList(Record):
     """Readings of one quantity over time: one by one, or reduced to buckets of equal length."""
-
-    model_config = JSON
 
     quantity: str = Field(
         description="parameter (relative change), equation (mean squared difference), level (of a channel, in the unit "
@@ -83,10 +71,8 @@ class ReadingList(BaseModel):
     )
 
 
-class AuditRecord(BaseModel):
+class AuditRecord(Record):
     """One entry of the audit log."""
-
-    model_config = JSON
 
     number: int = Field(description="counts the entries", examples=[291])
     at_ns: int = Field(
@@ -104,10 +90,8 @@ class AuditRecord(BaseModel):
     reason: str = Field(description="why, or why it was refused", examples=["seen, inspection is ordered"])
 
 
-class AuditList(BaseModel):
+class AuditList(Record):
     """Entries of the audit log, newest first."""
-
-    model_config = JSON
 
     entries: tuple[AuditRecord, ...] = Field(description="newest first")
     next_before: int | None = Field(

@@ -2,17 +2,13 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from rotorwatch.records.fields import JSON, Number
-
-__all__ = ["ChannelLevels", "LevelGrowth", "LevelLimits"]
+from rotorwatch.records.fields import Number, Record
 
 
-class LevelLimits(BaseModel):
+class LevelLimits(Record):
     """What one level is judged by, and what came of it."""
-
-    model_config = JSON
 
     measure: str = Field(description="which of the levels", examples=["overall"])
     alert: Number = Field(default=None, description="alert from here on; null without such a limit", examples=[2.8])
@@ -32,10 +28,8 @@ class LevelLimits(BaseModel):
     )
 
 
-class LevelGrowth(BaseModel):
+class LevelGrowth(Record):
     """What growth of vibration would have been seen in a window that is called unchanged, or only watched."""
-
-    model_config = JSON
 
     growth: Number = Field(
         description="smallest growth, relative to the level of the window, with which every channel would have raised "
@@ -53,10 +47,8 @@ class LevelGrowth(BaseModel):
     )
 
 
-class ChannelLevels(BaseModel):
+class ChannelLevels(Record):
     """Vibration levels of one channel in one window."""
-
-    model_config = JSON
 
     channel: str = Field(description="name of the channel", examples=["DE-H"])
     unit: str = Field(description="unit of its levels, but for `velocity`", examples=["m/s2"])

@@ -1,33 +1,22 @@
 """Machines: what they are, what they are monitored with, what would be found on them."""
 
-from pydantic import BaseModel, Field, JsonValue
+from pydantic import Field, JsonValue
 
 from rotorwatch.records.fields import (
     EXAMPLE_NS,
-    JSON,
     BundleIdentity,
     MachineHash,
     Name,
     ParameterName,
     ParameterText,
+    Record,
     Site,
 )
 from rotorwatch.records.health import State
 
-__all__ = [
-    "Channel",
-    "DetectableChanges",
-    "DetectableParameter",
-    "MachineConfiguration",
-    "MachineDescription",
-    "MachineList",
-]
 
-
-class Channel(BaseModel):
+class Channel(Record):
     """One column of a machine's stream."""
-
-    model_config = JSON
 
     name: str = Field(description="name of the channel, unique in the stream", examples=["y1"])
     quantity: str = Field(
@@ -46,10 +35,8 @@ class Channel(BaseModel):
     )
 
 
-class MachineDescription(BaseModel):
+class MachineDescription(Record):
     """A monitored machine: what it is, what its stream looks like, where to find what is said about it."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -84,18 +71,14 @@ class MachineDescription(BaseModel):
     machine_hash: MachineHash
 
 
-class MachineList(BaseModel):
+class MachineList(Record):
     """Every monitored machine."""
-
-    model_config = JSON
 
     machines: tuple[MachineDescription, ...] = Field(description="in the order of the settings")
 
 
-class MachineConfiguration(BaseModel):
+class MachineConfiguration(Record):
     """What a machine is monitored with."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -106,10 +89,8 @@ class MachineConfiguration(BaseModel):
     machine_hash: MachineHash
 
 
-class DetectableParameter(BaseModel):
+class DetectableParameter(Record):
     """What it takes to find a change of one parameter."""
-
-    model_config = JSON
 
     name: ParameterName
     text: ParameterText
@@ -120,10 +101,8 @@ class DetectableParameter(BaseModel):
     )
 
 
-class DetectableChanges(BaseModel):
+class DetectableChanges(Record):
     """What would be found on this machine as it runs now, with 95 % probability."""
-
-    model_config = JSON
 
     site: Site
     machine: Name

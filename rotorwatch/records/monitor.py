@@ -4,24 +4,18 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, Name, Site
+from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
 from rotorwatch.records.health import State
 
-__all__ = ["Alive", "MachineReadiness", "Problem", "Readiness", "WebhookList", "WebhookStatus"]
 
-
-class Alive(BaseModel):
+class Alive(Record):
     """The process answers."""
-
-    model_config = JSON
 
     alive: bool = Field(description="always true", examples=[True])
 
 
-class MachineReadiness(BaseModel):
+class MachineReadiness(Record):
     """Whether one machine's monitor works."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -44,10 +38,8 @@ class MachineReadiness(BaseModel):
     )
 
 
-class Readiness(BaseModel):
+class Readiness(Record):
     """Whether the service can do its work; machines without data are no reason against it."""
-
-    model_config = JSON
 
     ready: bool = Field(description="there is no reason against it", examples=[True])
     reasons: tuple[str, ...] = Field(description="what is wrong, one sentence each; empty if ready", examples=[()])
@@ -73,10 +65,8 @@ class Problem(BaseModel):
     instance: str = Field(description="path of the request", examples=["/api/v1/machines/demo/pump"])
 
 
-class WebhookStatus(BaseModel):
+class WebhookStatus(Record):
     """One webhook: what it is told, and how that goes. Counts are since the monitor started."""
-
-    model_config = JSON
 
     name: str = Field(description="from the settings", examples=["pager"])
     target: str = Field(
@@ -105,9 +95,7 @@ class WebhookStatus(BaseModel):
     last_error_ns: int | None = Field(description="and when", examples=[EXAMPLE_NS - 60_000_000_000])
 
 
-class WebhookList(BaseModel):
+class WebhookList(Record):
     """All webhooks of the settings."""
-
-    model_config = JSON
 
     webhooks: tuple[WebhookStatus, ...] = Field(description="in the order of the settings")

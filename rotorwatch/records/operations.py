@@ -5,17 +5,13 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, Field
 
 from rotorwatch.records.alarms import Alarm, AlarmCloudEvent, AlarmState
-from rotorwatch.records.fields import JSON, REQUEST
-
-__all__ = ["OperationDone", "OperationKind", "OperationOrder", "ReasonedOrder", "ShelveOrder"]
+from rotorwatch.records.fields import REQUEST, Record
 
 OperationKind = Literal["acknowledge", "reset", "shelve", "unshelve", "remove-from-service", "return-to-service"]
 
 _LONGEST_REASON = 500
 
-
 _PRINTABLE = r"^[^\x00-\x1f\x7f]*$"
-
 
 _Reason = Annotated[
     str,
@@ -27,9 +23,7 @@ _Reason = Annotated[
     ),
 ]
 
-
 _GivenReason = Annotated[_Reason, Field(pattern=r"^[^\x00-\x1f\x7f]*[^\x00-\x20\x7f][^\x00-\x1f\x7f]*$")]
-
 
 _ExpectedState = Annotated[
     AlarmState | None,
@@ -74,10 +68,8 @@ class ShelveOrder(BaseModel):
     expected_state: _ExpectedState = None
 
 
-class OperationDone(BaseModel):
+class OperationDone(Record):
     """What came of an operation."""
-
-    model_config = JSON
 
     alarm: Alarm = Field(description="as it is afterwards; its version is the new ETag")
     events: tuple[AlarmCloudEvent, ...] = Field(description="what happened")

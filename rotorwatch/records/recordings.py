@@ -1,16 +1,12 @@
 """Recordings that a monitor keeps."""
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from rotorwatch.records.fields import JSON
-
-__all__ = ["RecordingDetail", "RecordingEntry", "RecordingList"]
+from rotorwatch.records.fields import Record
 
 
-class RecordingEntry(BaseModel):
+class RecordingEntry(Record):
     """One recording."""
-
-    model_config = JSON
 
     id: str = Field(description="site, machine and file name", examples=["demo/lab/20260101T000000Z.mcap"])
     site: str = Field(description="site of the machine", examples=["demo"])
@@ -39,9 +35,7 @@ class RecordingDetail(RecordingEntry):
     data_end_ns: int | None = Field(description="end of the latest data", examples=[1767225900000000000])
 
 
-class RecordingList(BaseModel):
+class RecordingList(Record):
     """Recordings by site, machine and time."""
-
-    model_config = JSON
 
     recordings: tuple[RecordingEntry, ...] = Field(description="by site, machine and time")

@@ -5,26 +5,12 @@ from typing import Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.fields import JSON, REQUEST
+from rotorwatch.records.fields import REQUEST, Record
 from rotorwatch.records.health import Report
 
-__all__ = [
-    "OfflineSummary",
-    "ReplayAlarmList",
-    "ReplayJob",
-    "ReplayLine",
-    "ReplayList",
-    "ReplayProgress",
-    "ReplayReportList",
-    "ReplayRequest",
-    "ReplaySeek",
-]
 
-
-class ReplayProgress(BaseModel):
+class ReplayProgress(Record):
     """How far a replay is."""
-
-    model_config = JSON
 
     fraction: float = Field(ge=0, le=1, description="of the stretch to be replayed; 1 at its end", examples=[0.5])
     position_ns: int = Field(description="time that the data have reached", examples=[1767225805000000000])
@@ -35,10 +21,8 @@ class ReplayProgress(BaseModel):
     paused: bool = Field(description="whether the replay is paused", examples=[False])
 
 
-class OfflineSummary(BaseModel):
+class OfflineSummary(Record):
     """What an offline replay found."""
-
-    model_config = JSON
 
     site: str = Field(description="site of the machine whose file was used", examples=["demo"])
     machine: str = Field(description="its name", examples=["lab"])
@@ -64,10 +48,8 @@ class OfflineSummary(BaseModel):
     sha256: str = Field(description="SHA-256 of all result lines, each with its line end", examples=["9f86d081"])
 
 
-class ReplayLine(BaseModel):
+class ReplayLine(Record):
     """One line of a program that replays: progress, or the summary at the end."""
-
-    model_config = JSON
 
     kind: Literal["progress", "summary"]
     progress: ReplayProgress | None = None
@@ -111,10 +93,8 @@ class ReplayRequest(BaseModel):
     )
 
 
-class ReplayJob(BaseModel):
+class ReplayJob(Record):
     """A replay that was started over HTTP."""
-
-    model_config = JSON
 
     id: str = Field(description="names the replay until the service stops", examples=["5f2b9c0d1a7e"])
     state: Literal["running", "paused", "finished", "stopped", "failed"] = Field(
@@ -171,10 +151,8 @@ class ReplaySeek(BaseModel):
         return self
 
 
-class ReplayList(BaseModel):
+class ReplayList(Record):
     """Replays since the service started, the latest first."""
-
-    model_config = JSON
 
     replays: tuple[ReplayJob, ...] = Field(description="the latest first")
 
@@ -182,19 +160,15 @@ class ReplayList(BaseModel):
 _NEXT = "pass it as offset to go on; null if there is no more yet"
 
 
-class ReplayReportList(BaseModel):
+class ReplayReportList(Record):
     """Window reports of a replay, in the order of the data."""
-
-    model_config = JSON
 
     reports: tuple[Report, ...] = Field(description="oldest first")
     next_offset: int | None = Field(description=_NEXT, examples=[100])
 
 
-class ReplayAlarmList(BaseModel):
+class ReplayAlarmList(Record):
     """Alarm events of a replay, in the order of the data."""
-
-    model_config = JSON
 
     events: tuple[AlarmCloudEvent, ...] = Field(description="oldest first")
     next_offset: int | None = Field(description=_NEXT, examples=[100])

@@ -3,8 +3,6 @@
 from enum import StrEnum
 from typing import Self
 
-__all__ = ["FaultKind"]
-
 
 class FaultKind(StrEnum):
     """Kind of a sensor's fault.

@@ -6,78 +6,51 @@ have one length, which their descriptions name. Numbers have six significant dig
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, BundleIdentity, MachineHash, Name, ParameterName, Site
-
-__all__ = [
-    "ChannelDensity",
-    "CorrelationPair",
-    "CorrelationSnapshot",
-    "CrossSpectrum",
-    "OrbitEllipse",
-    "OrbitSnapshot",
-    "PathSamples",
-    "PlaceOrbit",
-    "PredictedChange",
-    "RunningSpeedVector",
-    "SpectrumSnapshot",
-    "Theory",
-    "Units",
-]
+from rotorwatch.records.fields import EXAMPLE_NS, BundleIdentity, MachineHash, Name, ParameterName, Record, Site
 
 Units = Literal["channel", "SI"]
 
 _Series = tuple[float | None, ...]
 
-
 _StartNs = Annotated[
     int | None, Field(description="oldest data in the window; null without one", examples=[EXAMPLE_NS - 60_000_000_000])
 ]
 
-
 _EndNs = Annotated[int | None, Field(description="end of the newest data in the window", examples=[EXAMPLE_NS])]
 
-
 _Filled = Annotated[float, Field(description="fraction of a full window that is there now", examples=[1.0])]
-
 
 _Speed = Annotated[
     float | None, Field(description="mean speed in the window; null if it is not known", examples=[138.23])
 ]
 
-
 _Reason = Annotated[str, Field(description="why there is nothing to show; empty if there is", examples=[""])]
-
 
 _SumUnit = Annotated[
     str, Field(description="unit of the values: a product of the two channels' units", examples=["um^2"])
 ]
-
 
 _DensityUnit = Annotated[
     str, Field(description="unit of the values: a product of two channels' units, per Hz", examples=["um^2/Hz"])
 ]
 
 
-class PredictedChange(BaseModel):
+class PredictedChange(Record):
     """One parameter of the machine as it is estimated now."""
-
-    model_config = JSON
 
     name: ParameterName
     relative_change: float = Field(description="relative change from nominal", examples=[-0.247])
 
 
-class Theory(BaseModel):
+class Theory(Record):
     """What the predictions are of.
 
     The excitation is not measured. It is the one that explains the window best with the machine as estimated (as
     nominal, where there is no estimate), and the same for both predictions: what they differ by is what the parameters
     have changed.
     """
-
-    model_config = JSON
 
     changes: tuple[PredictedChange, ...] = Field(
         description="parameters of the machine as estimated, from the latest reading; the others are nominal"
@@ -90,10 +63,8 @@ class Theory(BaseModel):
     )
 
 
-class CorrelationPair(BaseModel):
+class CorrelationPair(Record):
     """Correlation function R_ij(τ) = E{x_i(t) x_j(t+τ)} of two channels without mean and 1×; n_lags values each."""
-
-    model_config = JSON
 
     first: str = Field(description="name of channel i, the reference", examples=["y1"])
     second: str = Field(description="name of channel j, the response", examples=["y2"])
@@ -121,10 +92,8 @@ class CorrelationPair(BaseModel):
     )
 
 
-class CorrelationSnapshot(BaseModel):
+class CorrelationSnapshot(Record):
     """Correlation functions of the latest window, measured and predicted."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -149,10 +118,8 @@ class CorrelationSnapshot(BaseModel):
     machine_hash: MachineHash
 
 
-class ChannelDensity(BaseModel):
+class ChannelDensity(Record):
     """One-sided power spectral density (mean square per hertz, no amplitude) without mean and 1×; n_lines values."""
-
-    model_config = JSON
 
     channel: str = Field(description="name of the channel", examples=["y2"])
     quantity: str = Field(description="what it measures", examples=["displacement"])
@@ -170,10 +137,8 @@ class ChannelDensity(BaseModel):
     )
 
 
-class CrossSpectrum(BaseModel):
+class CrossSpectrum(Record):
     """Cross-spectrum of two channels, one-sided, and their coherence; n_lines values each."""
-
-    model_config = JSON
 
     first: str = Field(description="name of channel i", examples=["y1"])
     second: str = Field(description="name of channel j", examples=["y2"])
@@ -198,10 +163,8 @@ class CrossSpectrum(BaseModel):
     )
 
 
-class SpectrumSnapshot(BaseModel):
+class SpectrumSnapshot(Record):
     """Power spectral densities of the latest window, measured and predicted."""
-
-    model_config = JSON
 
     site: Site
     machine: Name
@@ -241,10 +204,8 @@ class SpectrumSnapshot(BaseModel):
     machine_hash: MachineHash
 
 
-class RunningSpeedVector(BaseModel):
+class RunningSpeedVector(Record):
     """Vibration of one channel at running speed."""
-
-    model_config = JSON
 
     channel: str = Field(
         description="name of the channel; of two at an angle, which are turned to y and z: 'y of VE-1X and VE-1Y'",
@@ -265,10 +226,8 @@ class RunningSpeedVector(BaseModel):
     phase_error_deg: float | None = Field(description="standard error of the phase lag", examples=[0.4])
 
 
-class OrbitEllipse(BaseModel):
+class OrbitEllipse(Record):
     """Path of the shaft at running speed."""
-
-    model_config = JSON
 
     semi_major: float = Field(description="half of the long axis, in `unit` of the orbit", examples=[9.4])
     semi_minor: float = Field(description="half of the short axis", examples=[7.2])
@@ -285,20 +244,16 @@ class OrbitEllipse(BaseModel):
     )
 
 
-class PathSamples(BaseModel):
+class PathSamples(Record):
     """The newest whole revolutions as measured, about their mean; n_samples values each."""
-
-    model_config = JSON
 
     times_s: tuple[float, ...] = Field(description="time of each sample after `start_ns`", examples=[(0.0, 0.0005)])
     y: _Series = Field(description="samples of the y channel, in `unit` of the orbit", examples=[(3.2, 4.1)])
     z: _Series = Field(description="samples of the z channel", examples=[(-7.7, -7.1)])
 
 
-class PlaceOrbit(BaseModel):
+class PlaceOrbit(Record):
     """Orbit at one place."""
-
-    model_config = JSON
 
     location: str = Field(description="bearing or disc", examples=["bearing"])
     unit: str = Field(description="unit of all lengths: that of the y channel, or m", examples=["um"])
@@ -312,10 +267,8 @@ class PlaceOrbit(BaseModel):
     path: PathSamples | None = Field(description="samples as measured; null without, see `path_reason`")
 
 
-class OrbitSnapshot(BaseModel):
+class OrbitSnapshot(Record):
     """Orbits at all places where displacements are measured in both directions."""
-
-    model_config = JSON
 
     site: Site
     machine: Name

@@ -2,31 +2,16 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, JSON, Number, ParameterName, ParameterText, Reason
+from rotorwatch.records.fields import EXAMPLE_NS, Number, ParameterName, ParameterText, Reason, Record
 from rotorwatch.records.sensor_faults import FaultKind
-
-__all__ = [
-    "Agreement",
-    "Detectable",
-    "Equation",
-    "Finding",
-    "Opinion",
-    "Parameter",
-    "SensorFault",
-    "Shape",
-    "UnbalanceVector",
-    "Verdict",
-]
 
 Interval = tuple[float, float]
 
 
-class UnbalanceVector(BaseModel):
+class UnbalanceVector(Record):
     """The unbalance over the nominal one; angles count from the nominal heavy spot in the direction of rotation."""
-
-    model_config = JSON
 
     magnitude_change: float = Field(description="relative change of its size, never below -1", examples=[-0.02])
     magnitude_interval_95: Interval = Field(description="95 % interval of that", examples=[(-0.05, 0.01)])
@@ -48,10 +33,8 @@ class UnbalanceVector(BaseModel):
     )
 
 
-class Parameter(BaseModel):
+class Parameter(Record):
     """One physical parameter's relative change in one window."""
-
-    model_config = JSON
 
     name: ParameterName
     text: ParameterText
@@ -73,10 +56,8 @@ class Parameter(BaseModel):
     )
 
 
-class Equation(BaseModel):
+class Equation(Record):
     """Residual of one compatibility equation in one window."""
-
-    model_config = JSON
 
     equation: str = Field(description="number of the compatibility equation: 28 to 31", examples=["28"])
     title: str = Field(description="what the equation is about", examples=["bearing, horizontal"])
@@ -93,10 +74,8 @@ class Equation(BaseModel):
     reason: Reason = ""
 
 
-class Agreement(BaseModel):
+class Agreement(Record):
     """Whether two diagnosticians say the same of one parameter."""
-
-    model_config = JSON
 
     name: ParameterName
     between: tuple[str, str] = Field(description="who is compared", examples=[("likelihood", "relation")])
@@ -108,10 +87,8 @@ class Agreement(BaseModel):
     )
 
 
-class Opinion(BaseModel):
+class Opinion(Record):
     """What a diagnostician other than the likelihood reads in the same window."""
-
-    model_config = JSON
 
     by: str = Field(description="who: network or relation", examples=["relation"])
     parameters: tuple[Parameter, ...] = Field(default=(), description="what it reads")
@@ -119,10 +96,8 @@ class Opinion(BaseModel):
     reason: Reason = ""
 
 
-class Finding(BaseModel):
+class Finding(Record):
     """One parameter that changed, and how that was found."""
-
-    model_config = JSON
 
     name: ParameterName
     text: ParameterText
@@ -134,20 +109,16 @@ class Finding(BaseModel):
     stretch_s: float = Field(description="length of that stretch", examples=[10.0])
 
 
-class Candidate(BaseModel):
+class Candidate(Record):
     """A parameter that may have changed."""
-
-    model_config = JSON
 
     name: ParameterName
     text: ParameterText
     probability: float = Field(description="that it is among those that changed", examples=[0.97])
 
 
-class Verdict(BaseModel):
+class Verdict(Record):
     """What has changed, from stretches of data of all lengths that end with this hop; alarms are decided on it."""
-
-    model_config = JSON
 
     changed: tuple[Finding, ...] = Field(description="parameters that changed; empty: none")
     text: str = Field(
@@ -184,10 +155,8 @@ class Verdict(BaseModel):
     )
 
 
-class Detectable(BaseModel):
+class Detectable(Record):
     """Smallest change of one parameter, alone, that would be found with 95 % probability."""
-
-    model_config = JSON
 
     name: ParameterName
     loss: float = Field(description="relative change downwards; -1: not even a total loss", examples=[-0.025])
@@ -195,10 +164,8 @@ class Detectable(BaseModel):
     length_s: float = Field(description="data that takes", examples=[60.0])
 
 
-class SensorFault(BaseModel):
+class SensorFault(Record):
     """One fault of a sensor, or of one of several that contradict each other."""
-
-    model_config = JSON
 
     states: tuple[str, ...] = Field(description="what the channels in question measure", examples=[("y1",)])
     kind: FaultKind = Field(description="what is wrong with it", examples=["gain"])
@@ -210,10 +177,8 @@ class SensorFault(BaseModel):
     z: Number = Field(default=None, description="in standard errors; null where no chance is involved", examples=[41.0])
 
 
-class Shape(BaseModel):
+class Shape(Record):
     """Whether one channel's vibration is as it was on the healthy machine, where no equation can be evaluated."""
-
-    model_config = JSON
 
     state: str = Field(description="what the channel measures", examples=["y1"])
     verdict: str = Field(description="not changed, changed or not evaluable", examples=["not changed"])

@@ -335,7 +335,7 @@ def test_the_page_names_every_method_and_error() -> None:
     methods = [name for name in vars(Client) if not name.startswith("_")]
     for name in methods:
         assert name == "close" or f"`{name}(" in PAGE or f"`{name}`" in PAGE, f"docs/client.md does not mention {name}"
-    for name in errors.__all__:
+    for name in (name for name, found in vars(errors).items() if isinstance(found, type)):
         assert f"| `{name}` |" in PAGE
 
 

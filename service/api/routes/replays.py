@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from models.signals.link import LinkSettings, is_loopback
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
-from rotorwatch.records.fields import JSON
+from rotorwatch.records.fields import Record
 from rotorwatch.records.health import Report
 from rotorwatch.records.replays import (
     ReplayAlarmList,
@@ -38,10 +38,8 @@ _QUIET_S = 15.0
 _UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # what to connect to, nothing listens there
 
 
-class NoOrder(BaseModel):
+class NoOrder(Record):
     """An empty object: that a request is sent as JSON shows that no page from elsewhere has sent it."""
-
-    model_config = JSON
 
 
 class ReplayDesk:
