@@ -2,7 +2,6 @@
 
 import json
 import re
-import ssl
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -215,39 +214,31 @@ class _JsonLines:
 
 
 def _fetch_healths(url: str, token: str | None, ca: Path | None) -> "list[Health]":
-    import httpx  # noqa: PLC0415  # only here
-    from pydantic import ValidationError  # noqa: PLC0415
+    import httpx  # noqa: PLC0415  # keeps --help quick
 
-    from rotorwatch.client.answers import refusal  # noqa: PLC0415  # keeps --help quick
-    from rotorwatch.records.health import Health  # noqa: PLC0415
+    from rotorwatch import AccessRefused, Client, ClientError, NoAnswer, RequestRefused  # noqa: PLC0415
 
     try:
-        # Without TLS nobody is trusted: to read all that this computer trusts takes its time.
-        plain = ca is None and url.startswith("http:")
-        verify = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if plain else ssl.create_default_context(cafile=ca)
-    except OSError as error:  # of which errors in certificates are a kind
-        raise MachineFileError(f"--ca {ca}: cannot be used as an authority's certificate ({error.strerror})") from error
+        client = Client(url, token, ca=ca, timeout_s=5.0)
+    except (ClientError, httpx.InvalidURL) as error:
+        raise MachineFileError(f"--url, --token, --ca: {error}") from error
     try:
-        headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        with httpx.Client(base_url=url, timeout=5.0, trust_env=False, headers=headers, verify=verify) as client:
-            listed = client.get("/api/v1/machines").raise_for_status().json()["machines"]
-            places = [f"/api/v1/machines/{entry['site']}/{entry['machine']}/health" for entry in listed]
-            return [Health.model_validate_json(client.get(place).raise_for_status().content) for place in places]
-    except httpx.HTTPStatusError as error:
-        if error.response.status_code in {httpx.codes.UNAUTHORIZED, httpx.codes.FORBIDDEN}:
+        with client:
+            return [client.health(f"{one.site}/{one.machine}") for one in client.machines()]
+    except AccessRefused as error:
+        raise RotorwatchError(
+            f"{url}: {error}; set ROTORWATCH_TOKEN to a token with the scope read (rotorwatch token create)"
+        ) from error
+    except RequestRefused as error:
+        raise RotorwatchError(f"{url}: the monitor's HTTP API answers {error.status}: {error}") from error
+    except NoAnswer as error:
+        why = str(error.__cause__)
+        if "CERTIFICATE_VERIFY_FAILED" in why:
             raise RotorwatchError(
-                f"{url}: {refusal(error.response)}; set ROTORWATCH_TOKEN to a token with the scope read "
-                "(rotorwatch token create)"
-            ) from error
-        answer = f"{error.response.status_code} {error.response.reason_phrase}"
-        raise RotorwatchError(f"{url}: the monitor's HTTP API answers {answer}") from error
-    except (httpx.HTTPError, httpx.InvalidURL, OSError) as error:
-        if "CERTIFICATE_VERIFY_FAILED" in str(error):
-            raise RotorwatchError(
-                f"{url}: its certificate is not trusted under this name: {error}; --ca takes the authority (PEM) of a "
+                f"{url}: its certificate is not trusted under this name: {why}; --ca takes the authority (PEM) of a "
                 "certificate of your own, --url the name in it"
             ) from error
-        why = re.sub(r"\[Errno -?\d+\] ", "", str(error)) or type(error).__name__
+        why = re.sub(r"\[Errno -?\d+\] ", "", why) or type(error.__cause__).__name__
         raise RotorwatchError(f"{url}: the monitor's HTTP API does not answer: {why}") from error
-    except (ValidationError, ValueError, KeyError, TypeError) as error:
-        raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor") from error
+    except ClientError as error:
+        raise RotorwatchError(f"{url}: this is not the HTTP API of a monitor: {error}") from error
