@@ -60,11 +60,6 @@ class Runtime:
 
     Building it reads every file; nothing runs or listens before `start`.
 
-    Parameters
-    ----------
-    settings : ServiceSettings
-        From `service.settings.service.load_settings`.
-
     Raises
     ------
     MachineFileError, BundleError

@@ -33,7 +33,6 @@ def band_edges(n_samples: int, used: float) -> npt.NDArray[np.intp]:
 
     Parameters
     ----------
-    n_samples : int
     used : float
         Part of the spectrum that is used.
     """
@@ -110,7 +109,6 @@ class Growth:
 
     Attributes
     ----------
-    band_hz : tuple of float
     ratio : float
         Its level over that of the reference.
     limit : float

@@ -33,7 +33,6 @@ class GainReference(BaseModel):
 
     Attributes
     ----------
-    places : tuple of str
     edges_hz : tuple of float
         Lower edges of the third octaves that are compared.
     levels : nested tuple of float, shape (n_recordings, n_thirds, n_places)

@@ -50,10 +50,8 @@ class LevelJudge:
 
     Parameters
     ----------
-    plan : LevelPlan
     channels : sequence of Channel
         Of its columns.
-    settings : LevelSettings
     """
 
     def __init__(self, plan: LevelPlan, channels: Sequence[Channel], settings: LevelSettings) -> None:

@@ -193,7 +193,6 @@ class FirstWindows:
 
     Parameters
     ----------
-    channels : sequence of str
     count : int
         Windows that do not overlap.
     """

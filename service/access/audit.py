@@ -66,8 +66,6 @@ class AuditTrail:
 
     Parameters
     ----------
-    log : AuditLog
-        Where entries go.
     refusals_per_minute : int
         Refused requests of one address that are written down.
     clock_ns : callable

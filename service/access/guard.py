@@ -70,10 +70,6 @@ class Guard:
     ----------
     tokens : TokenStore
         Looked up at every request, so that a token that is revoked is refused at the next one.
-    audit : AuditLog
-        Where what is done and refused is written down.
-    access : AccessSettings
-        ``[access]``.
     host : str
         Address that is listened on; a name of the service's.
     clock_ns : callable

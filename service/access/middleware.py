@@ -43,12 +43,8 @@ class AccessMiddleware:
 
     Parameters
     ----------
-    app : callable
-        The application inside.
     admit : callable
         Gives the caller of a request, or raises `HTTPException`.
-    trail : AuditTrail
-        Where requests are written down.
     body_bytes : int
         Largest request body.
     """

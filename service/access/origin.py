@@ -25,10 +25,6 @@ def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple
 
     Parameters
     ----------
-    headers : Headers
-        Of the request.
-    method : str
-        Of the request.
     listens_on : str
         Address or name that is listened on.
     hosts : tuple of str

@@ -16,13 +16,7 @@ CALLER = "access_caller"
 
 
 class Requirement:
-    """Gives the caller of a route, who has a scope.
-
-    Parameters
-    ----------
-    scope : Scope
-        What the route needs.
-    """
+    """Gives the caller of a route, who has a scope."""
 
     def __init__(self, scope: Scope) -> None:
         self.scope = scope
@@ -66,8 +60,6 @@ def requires(scope: Scope, *, in_browsers: bool = False) -> Any:
 
     Parameters
     ----------
-    scope : Scope
-        What the route needs.
     in_browsers : bool
         Whether OpenAPI shows that the token may also come as a password.
     """

@@ -24,10 +24,6 @@ class Caller:
     ----------
     name : str
         Name of the token; ``anonymous`` where the API is open on loopback, empty for nobody in particular.
-    scopes : frozenset of Scope
-        What the caller may do.
-    address : str
-        Where the request came from.
     token_id : str
         Public part of the token, empty without one.
     """

@@ -71,7 +71,6 @@ class Revolutions:
     ----------
     excerpt : Excerpt or None
         None where there is no whole revolution.
-    count : int
     pulses : ndarray, shape (count + 1,)
         Where the shaft angle is 0, in samples from the first one; empty where it is not measured.
     reason : str

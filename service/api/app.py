@@ -73,8 +73,6 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     ----------
     service : ServiceView
         Where the answers come from; called from the server's worker threads.
-    guard : Guard
-        Who may call what.
     """
     app = DescribedApp(
         title="rotorwatch",

@@ -116,8 +116,6 @@ class HttpConnections:
 
     Parameters
     ----------
-    settings : HttpSettings
-        Times, and connections of one address.
     most : int
         Connections in all.
     proxies : sequence of str

@@ -29,13 +29,6 @@ class HttpError(RotorwatchError):
 class HttpServer:
     """Serves an application; the address is taken when it is built.
 
-    Parameters
-    ----------
-    settings : HttpSettings
-        ``[http]``.
-    access : AccessSettings
-        Certificate and proxies.
-
     Raises
     ------
     HttpError

@@ -82,8 +82,6 @@ def creation_hint(config: Path | None, history: "HistorySettings") -> str:
     ----------
     config : Path, optional
         Settings file of the monitor.
-    history : HistorySettings
-        As they are in use.
     """
     if history.in_memory:
         return "nobody can have a token for it: the history is in memory, where no other program finds tokens"

@@ -69,8 +69,6 @@ class Claim:
     ----------
     most_reports : int
         Reports that wait while the database fails, and steps whose readings do.
-    machine_id : int
-        Number in the database.
     owner : str
         Mark of this monitor in the database.
     written : int

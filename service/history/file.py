@@ -23,7 +23,6 @@ class HistoryFile:
 
     Attributes
     ----------
-    path : Path
     damage : str
         What SQLite found wrong with it while it was in use; whoever finds it sets it.
     """

@@ -62,8 +62,6 @@ def import_file(
     ----------
     path : Path
         CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4; or a folder of such files.
-    mapping : Mapping
-        Which column is which channel.
     machine : MachineFile
         Whose stream it becomes.
     recording : Path

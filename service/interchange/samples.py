@@ -72,7 +72,6 @@ class Read:
 
     Attributes
     ----------
-    files : int
     rows : int
         Of all files together.
     filled : int

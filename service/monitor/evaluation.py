@@ -54,8 +54,6 @@ class Evaluation:
         Every equation of the table, by its network, or why not.
     opinions : tuple of Opinion
         What the others say.
-    speed_rad_s : float or None
-        Mean speed.
     shapes : tuple of Shape
         Where no equation can be evaluated: whether each channel's vibration is as it was.
     """
@@ -316,7 +314,6 @@ class BaselineEvaluator(_Unremembering):
 
     Parameters
     ----------
-    machine : MachineFile
     commissioned : Commissioned
         With a baseline, or at least the healthy shape of every channel.
     """

@@ -25,7 +25,6 @@ class LevelWatch:
     ----------
     plan : Plan
         With levels.
-    machine : MachineFile
     installed : Installed
         What was learned of the healthy machine.
 
@@ -92,8 +91,6 @@ class LevelWatch:
 
         Parameters
         ----------
-        alarms : AlarmBook
-        end_ns : int
         faulty : collection of str
             States whose sensors are at fault: what they show may be no vibration, so only what is dangerously loud
             counts.

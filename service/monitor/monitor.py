@@ -344,8 +344,6 @@ class MachineMonitor:
 
         Parameters
         ----------
-        alarms : str
-        next_sequence : int, optional
         end_ns : int, optional
             End of the newest data of the other monitor, where nothing else of it was restored: the times of the alarms
             are of the same clock.

@@ -28,7 +28,6 @@ def divided(
 
     Parameters
     ----------
-    arrays : mapping of str to ndarray
     hops : mapping of int to list
         `SequentialState.hops`.
     kept : collection of str

@@ -121,14 +121,10 @@ class MachineHealth:
 
     Attributes
     ----------
-    state : HealthState
     filled : float
         Fraction of a full window.
-    latest : Report or None
-        The latest window.
     alarms : tuple of Alarm
         All that have been seen so far.
-    quality : Quality
     sequence : int
         Number of the latest alarm event.
     reason : str

@@ -90,8 +90,6 @@ class MachineRecorder:
 
     Parameters
     ----------
-    machine : MachineFile
-        Whose messages they are.
     settings : RecordingSettings
         With a directory.
     committed : callable

@@ -82,11 +82,6 @@ class StepWriter:
     to operators. What the log refuses is tried again with the next step: it takes no event that comes after a missing
     one.
 
-    Parameters
-    ----------
-    history : MachineStore
-    identity : Identity
-
     Attributes
     ----------
     refused : Exception or None
@@ -120,9 +115,6 @@ class StepWriter:
 
         Parameters
         ----------
-        monitor : MachineMonitor
-        windows : tuple of Report
-        recorded_ns : int
         whole : bool
             With all that is in the window, so that nothing has to be recalled.
 
@@ -196,8 +188,6 @@ def restored(
         Gives a new monitor.
     identity : Identity
         Of the machine, as it is now.
-    checkpoint : Checkpoint
-        From the history.
     next_sequence : int
         Number of the next alarm event, by the log.
 

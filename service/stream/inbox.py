@@ -17,7 +17,6 @@ class RawBlock:
 
     Attributes
     ----------
-    payload, attachment, encoding : bytes, bytes, str
     source : str
         Of which session's publisher it is, empty if it does not say.
     dropped_before : int

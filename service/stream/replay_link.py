@@ -44,10 +44,6 @@ class NetworkPlan:
 
     Attributes
     ----------
-    link : LinkSettings
-        Endpoints.
-    machines : tuple of MachineKeys
-        Machines to replay.
     everything : bool
         Every recorded key, not only what a machine sends: stream, descriptor and truth.
     prefix : str

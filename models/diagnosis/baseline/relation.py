@@ -71,8 +71,6 @@ def relation_criterion(parts: Sequence[LagMoments], prior: FloatArray, b: FloatA
     ----------
     prior : ndarray, shape (n, n)
         Precision of what was expected of the coefficients.
-    b : ndarray, shape (n,)
-        Coefficients.
     """
     combination = np.concatenate([[1.0], -b])
     total = float(b @ prior @ b)

@@ -278,7 +278,6 @@ def swapped(
 
     Returns
     -------
-    findings : list of SensorFault
     explained : set of MotionPair
         Pairs that need no other explanation.
     """

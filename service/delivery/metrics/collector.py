@@ -66,13 +66,7 @@ class _EventCounts:
 
 
 class Metrics:
-    """The metrics of a service.
-
-    Parameters
-    ----------
-    requests : RequestCounts
-        HTTP requests.
-    """
+    """The metrics of a service."""
 
     def __init__(self, service: MeasuredService, requests: RequestCounts) -> None:
         self._service = service

@@ -40,15 +40,7 @@ class RequestCounts:
 
 
 class RequestMeter:
-    """Middleware around all others; what it counts are answers as they leave.
-
-    Parameters
-    ----------
-    app : callable
-        The application inside.
-    counts : RequestCounts
-        Where to count.
-    """
+    """Middleware around all others; what it counts are answers as they leave."""
 
     def __init__(self, app: ASGIApp, counts: RequestCounts) -> None:
         self._app = app

@@ -10,46 +10,16 @@ from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity,
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """One alarm of a machine.
+    """One alarm of a machine; what a `rotorwatch.records.alarms.Alarm` has as well is described there.
 
     Attributes
     ----------
-    name : str
-        One of `ALARMS`.
-    state : AlarmState
-        Where it is in its life cycle.
-    present : bool
-        Whether the condition is there, delays included.
-    severity : Severity
-        Of the present or last occurrence; it rises with the change and falls only by clearing.
-    since_ns : int
-        Data time at which `state` was entered.
-    raised_ns : int or None
-        Data time at which the present occurrence began; None without one.
-    occurrence : int
-        Counts the times the condition began.
     beyond_ns, small_ns : int or None
         Since when the readings have asked for the condition to begin, or to end: the delays run.
-    change, standard_error : float or None
-        Latest relative change and its standard error; None for what is no parameter.
-    low_confidence : bool
-        The data were outside the model too: that this parameter is the one that changed is to be taken with reserve.
-    note : str
-        What is known of it, in words; for a parameter only where its change has a direction.
-    evidence : Evidence or None
-        Latest data that decided.
-    shelf : Shelf or None
-        Only while shelved.
     rules : tuple of str
         Identities of the rules that suppress it now; empty if none, whatever the state.
-    suppressed_by : str
-        The same in words.
-    out_of_service_by, out_of_service_reason : str
-        Who took it out of service, and why; empty otherwise.
     owed : AlarmState
         While suppressed: where it comes back to without its condition, because somebody has to acknowledge or reset.
-    version : int
-        Sequence number of its latest event; -1 before the first. Who changes an alarm says which version was seen.
     """
 
     name: str
@@ -91,20 +61,8 @@ class AlarmEvent:
 
     Attributes
     ----------
-    kind : EventKind
-        What happened.
-    time_ns : int
-        Data time.
-    sequence : int
-        Counts the events of the machine, from 0, across restarts.
     alarm : Alarm
         As it is afterwards.
-    before : AlarmState
-        Where it was.
-    actor : str
-        Who did it; empty for the monitor.
-    reason : str
-        Why, as the actor or the rule says.
     """
 
     kind: EventKind

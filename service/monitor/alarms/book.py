@@ -49,13 +49,7 @@ NO_ALARMS = _PAGE.dump_json(_Page((), 0)).decode()
 
 
 class AlarmBook:
-    """The alarms of one machine.
-
-    Parameters
-    ----------
-    settings : AlarmSettings
-        Limits, delays, latching, suppression.
-    """
+    """The alarms of one machine."""
 
     def __init__(self, settings: AlarmSettings) -> None:
         self._settings = settings
@@ -105,7 +99,6 @@ class AlarmBook:
 
         Parameters
         ----------
-        verdict : Verdict
         unexplained : str
             Why nothing can be said of parameters; empty if something can.
         suspect : str
@@ -172,10 +165,6 @@ class AlarmBook:
 
         Parameters
         ----------
-        parameter : str
-            Which one.
-        change, standard_error : float
-            Relative change and standard error.
         time_ns : int
             Data time of the end of the hop.
         named : bool
@@ -184,15 +173,8 @@ class AlarmBook:
             Whether a whole window after the change says that it is not.
         low_confidence : bool
             Whether the data are outside the model.
-        evidence : Evidence, optional
-            The data that decided.
         note : str
             The change in words, where a number does not say all.
-
-        Returns
-        -------
-        tuple of AlarmEvent
-            None, or what happened.
         """
         if not (math.isfinite(change) and 0 < standard_error < math.inf):
             return ()
@@ -226,16 +208,8 @@ class AlarmBook:
 
         Parameters
         ----------
-        name : str
-            Which alarm.
-        present : bool
-            Whether it is so now.
-        time_ns : int
-            Data time.
         note : str
             What is known of it, in a sentence.
-        evidence : Evidence, optional
-            The data that decided.
         at_once : bool
             Without a delay: it is a fact rather than an estimate.
         danger : bool
@@ -255,13 +229,6 @@ class AlarmBook:
         """Follow the rules of suppression; where the speed is unknown, what depends on it stays as it is.
 
         An alarm that no rule is about any more, because the machine file has changed, comes back.
-
-        Parameters
-        ----------
-        speed_rpm : float or None
-            Present speed.
-        time_ns : int
-            Data time.
         """
         events: list[AlarmEvent] = []
         ruled = [name for rule in self._settings.suppress for name in rule.alarms]
@@ -312,7 +279,6 @@ class AlarmBook:
 
         Parameters
         ----------
-        operation : OperatorAction
         time_ns : int
             Data time that has been reached.
 

@@ -11,14 +11,7 @@ from service.monitor.alarms.book import AlarmBook
 
 
 class DataPathAlarms:
-    """Judges what happens to the data on their way from the sensors through the monitor.
-
-    Parameters
-    ----------
-    book : AlarmBook
-        Where the alarms are.
-    machine : MachineFile
-    """
+    """Judges what happens to the data on their way from the sensors through the monitor."""
 
     def __init__(self, book: AlarmBook, machine: MachineFile) -> None:
         self._book = book
@@ -32,8 +25,6 @@ class DataPathAlarms:
 
         Parameters
         ----------
-        verdict : Admission
-            Of the gate.
         start_ns : int
             Its beginning.
         dropped : int

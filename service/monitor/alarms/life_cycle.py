@@ -96,10 +96,6 @@ def follow(
 
     Parameters
     ----------
-    state : AlarmState
-        Where it is.
-    happening : Happening
-        What happens.
     present : bool
         Whether the condition is there, after what happens.
     latching : bool

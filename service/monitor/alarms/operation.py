@@ -40,10 +40,6 @@ class OperatorAction:
 
     Attributes
     ----------
-    kind : OperationKind
-        What.
-    alarm : str
-        To which alarm, by name.
     actor, reason : str
         Who, and why; a reason is needed for shelving and for taking out of service.
     duration_s : float or None
