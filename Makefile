@@ -21,6 +21,9 @@ SEED ?= 1
 PACE ?= 10
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# What programs free stays theirs: large arrays handed back to the kernel, and asked for anew, cost tests a tenth.
+export MALLOC_MMAP_THRESHOLD_ := 33554432
+export MALLOC_TRIM_THRESHOLD_ := 268435456
 # Tests start many programs; what they import is compiled once.
 unexport PYTHONDONTWRITEBYTECODE
 
@@ -62,8 +65,9 @@ contracts: $(READY)
 tests: $(READY)
 	$(BIN)/pytest -n $(WORKERS)
 
+# These compute more than they wait.
 quick: $(READY)
-	$(BIN)/pytest -n $(WORKERS) -m "not slow and not long" $(MODELS_AND_MONITOR)
+	$(BIN)/pytest -n logical -m "not slow and not long" $(MODELS_AND_MONITOR)
 
 long: $(READY)
 	$(BIN)/pytest -n $(WORKERS) -m long

@@ -251,24 +251,26 @@ def hop_moments(plan: Plan, samples: FloatArray, level: FloatArray, start_ns: in
         Time of the first sample of the hop itself.
     """
     n_states = len(plan.states)
-    x = samples[:, :n_states] - level
+    rows = np.ascontiguousarray(samples.T)  # a channel's samples side by side: all that follows goes along them
+    a = np.empty((n_states + (1 if plan.angle_column is None and plan.speed_rad_s is None else 3), rows.shape[1]))
+    np.subtract(rows[:n_states], level[:, np.newaxis], out=a[:n_states])
+    a[n_states] = 1
     turned_rad, line = np.nan, None
-    regressors = [x, np.ones((samples.shape[0], 1))]
     theta = None
     if plan.angle_column is not None:
-        theta = samples[:, -1]
+        theta = rows[-1]
         steps = np.diff(theta[plan.preamble - 1 :])
         turned_rad = float(np.sum((steps + np.pi) % (2 * np.pi) - np.pi))
     elif plan.speed_rad_s is not None:
-        every = x if n_states == plan.columns.size else np.hstack([x, samples[:, n_states : plan.columns.size]])
+        every = np.concatenate([a[:n_states], rows[n_states : plan.columns.size]])
         line = rotation_line(every, plan.rate_hz, plan.speed_rad_s, plan.speed_tolerance)
-        t_s = (np.arange(samples.shape[0]) - samples.shape[0] / 2) / plan.rate_hz
+        t_s = (np.arange(rows.shape[1]) - rows.shape[1] / 2) / plan.rate_hz
         theta = np.zeros_like(t_s) if line is None else line.angle(t_s)
     if theta is not None:
-        regressors += [np.cos(theta)[:, None], np.sin(theta)[:, None]]
-    a = np.hstack(regressors)
+        np.cos(theta, out=a[-2])
+        np.sin(theta, out=a[-1])
     segments = _segment_spectra(a, plan)
-    own = samples[-plan.fresh :]
+    own = rows[:, -plan.fresh :].T
     waveform = waveform_of(own)
     if plan.angle_column is not None and plan.others:
         order = [*range(n_states), own.shape[1] - 1, *range(n_states, own.shape[1] - 1)]
@@ -299,15 +301,15 @@ def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
     (each block's reference reaches back by the longest lag, its response is zero there) are added up before one inverse
     transform of a block's length.
     """
-    longest, n = int(plan.lags[-1]), a.shape[1]
+    longest, n = int(plan.lags[-1]), a.shape[0]
     if longest == 0:
-        own = a[plan.preamble :]
-        return np.asarray((own.T @ own)[np.newaxis], dtype=np.float64)
+        own = a[:, plan.preamble :]
+        return np.asarray((own @ own.T)[np.newaxis], dtype=np.float64)
     size = next_fast_len(longest + max(2 * longest, 256), real=True)
     block = size - longest
     count = -(-plan.hop // block)
     padded = np.zeros((n, longest + count * block))
-    padded[:, : longest + plan.hop] = a[plan.preamble - longest :].T
+    padded[:, : longest + plan.hop] = a[:, plan.preamble - longest :]
     reference = np.lib.stride_tricks.sliding_window_view(padded, size, axis=1)[:, ::block]
     response = reference.copy()
     response[:, :, :longest] = 0
@@ -321,15 +323,11 @@ def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:
     """Fourier coefficients of the half-overlapping segments that end within the hop."""
     half = plan.segment // 2
     taper = np.hanning(plan.segment + 1)[:-1]
-    scale = 1 / np.sqrt(plan.rate_hz * np.sum(taper**2))
-    count = plan.hop // half
+    taper /= np.sqrt(plan.rate_hz * np.sum(taper**2))
     first = plan.preamble + half - plan.segment
-    spectra = np.empty((count, plan.bins.size, a.shape[1]), dtype=np.complex128)
-    for number in range(count):
-        start = first + number * half
-        piece = a[start : start + plan.segment] * taper[:, None]
-        spectra[number] = np.fft.rfft(piece, axis=0)[plan.bins] * scale
-    return spectra
+    pieces = np.lib.stride_tricks.sliding_window_view(a[:, first:], plan.segment, axis=1)[:, ::half]
+    spectra = np.fft.rfft(pieces[:, : plan.hop // half] * taper)
+    return np.ascontiguousarray(spectra[:, :, plan.bins[0] : plan.bins[-1] + 1].transpose(1, 2, 0))
 
 
 SpeedSource = Literal["phase reference", "estimated", "unknown"]

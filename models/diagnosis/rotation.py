@@ -50,7 +50,7 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
 
     Parameters
     ----------
-    x : ndarray, shape (n_samples, n)
+    x : ndarray, shape (n, n_samples)
         All samples of the hop and what it needs before it.
     speed_rad_s, tolerance : float
         Expected speed and how far it may be off, relative.
@@ -60,14 +60,14 @@ def rotation_line(x: FloatArray, rate_hz: float, speed_rad_s: float, tolerance: 
     RotationLine or None
         None if no channel fluctuates or the range holds no frequency.
     """
-    n_samples = x.shape[0]
+    n_samples = x.shape[1]
     duration_s, expected_hz = n_samples / rate_hz, speed_rad_s / (2 * np.pi)
     reach_hz = tolerance * expected_hz
     low = max(1, int(np.floor((expected_hz - reach_hz - _MARGIN_HZ) * duration_s)))
     high = min(n_samples // 2 - 1, int(np.ceil((expected_hz + reach_hz + _MARGIN_HZ) * duration_s)))
     if high - low < 8:
         return None
-    spectrum = np.fft.rfft(x - x.mean(axis=0), axis=0)[low : high + 1]
+    spectrum = np.fft.rfft(x - x.mean(axis=1, keepdims=True))[:, low : high + 1].T
     power = np.median(np.abs(spectrum) ** 2, axis=0)
     alive = power > 0
     if not np.any(alive):

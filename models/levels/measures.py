@@ -48,6 +48,8 @@ COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
+_REGRESSORS = 1 + 2 * len(ORDERS)
+"""The mean, and cosine and sine of each order."""
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
@@ -58,6 +60,7 @@ _STANDS = 2 * np.pi * 0.5
 """Slower than this, rad/s, a shaft is not taken to turn."""
 
 _ComplexArray = npt.NDArray[np.complex128]
+_SingleArray = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,38 +204,53 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     angle_rad : ndarray, shape (n_samples,), or None
         Shaft angle, or one that turns with it from an unknown zero.
     """
-    x = np.array(samples.T, order="C")  # a copy: the mean is taken out of it
-    n, n_samples = x.shape
-    mean = x.mean(axis=1)
-    x -= mean[:, None]
-    low, high = x.min(axis=1), x.max(axis=1)
+    rows = np.ascontiguousarray(samples.T)
+    n, n_samples = rows.shape
+    mean = rows @ np.full(n_samples, 1 / n_samples)
+    low, high = rows.min(axis=1) - mean, rows.max(axis=1) - mean
+    peak = np.maximum(high, -low)
+    # Single precision is enough for what is left without the mean, and quicker. In parts of the peak: fourth powers of
+    # metres would leave its range.
+    unit = np.where(peak > 0, peak, 1.0)
+    every = np.zeros((_REGRESSORS + n, n_samples), np.float32)  # with room for what the orders are fitted with
+    x = every[_REGRESSORS:]
+    np.subtract(rows, mean[:, None], out=x, casting="same_kind")
+    x *= (1 / unit[:, None]).astype(np.float32)
     square = x * x
     sums = np.full((len(_SUMS), n), np.nan)
     sums[0] = mean
-    sums[1] = square.mean(axis=1)
-    sums[2] = np.maximum(high, -low)
+    sums[1] = unit**2 * np.vecdot(x, x) / n_samples
+    sums[2] = peak
     sums[3] = high - low
-    sums[4] = np.einsum("ij,ij->i", square, square) / n_samples
+    sums[4] = unit**4 * np.vecdot(square, square) / n_samples
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
     taper = _taper(n_samples)
     spectrum = scipy.fft.rfft(x * taper, axis=1)
+    parts = spectrum.view(np.float32)  # real, imaginary, real ...
+    parts = parts * parts
     scale = 2 / (n_samples * float(taper @ taper))
     casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
     if casing.size:
-        accelerations = (plan.columns(Quantity.ACCELERATION)[:, None] == casing).any(axis=0)
-        sums[5:, casing] = _band_squares(plan, spectrum[casing], n_samples, accelerations)
+        sums[5:, casing] = unit[casing] ** 2 * _band_squares(plan, spectrum, parts, n_samples, casing)
     edges = band_edges(n_samples, NYQUIST_PART)
-    within = spectrum[:, : edges[-1]]
-    bands = scale * np.add.reduceat(within.real**2 + within.imag**2, edges[:-1], axis=1)
-    radius = [
-        float(np.sqrt((square[y] + square[z] - (2 * skew * x[y] * x[z] if skew else 0.0)).max() / (1 - skew**2)))
-        for (y, z), skew in zip(plan.pairs, plan.skew, strict=True)
-    ]
-    return HopLevels(n_samples, sums, _orders(x, angle_rad), np.array(radius), np.ascontiguousarray(bands.T))
+    bands = (scale * unit**2)[:, None] * np.add.reduceat(parts[:, : 2 * edges[-1]], 2 * edges[:-1], axis=1)
+    radius = []
+    for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
+        first, second = float(unit[y]), float(unit[z])
+        distance = first**2 * square[y] + second**2 * square[z]
+        if skew:
+            distance -= 2 * skew * first * second * x[y] * x[z]
+        radius.append(np.sqrt(float(distance.max()) / (1 - skew**2)))
+    orders = unit * _orders(every, angle_rad)
+    return HopLevels(n_samples, sums, orders, np.array(radius), np.ascontiguousarray(bands.T))
 
 
 def _band_squares(
-    plan: LevelPlan, spectrum: _ComplexArray, n_samples: int, accelerations: npt.NDArray[np.bool_]
+    plan: LevelPlan,
+    spectrum: npt.NDArray[np.complex64],
+    parts: _SingleArray,
+    n_samples: int,
+    casing: npt.NDArray[np.intp],
 ) -> FloatArray:
     """Mean squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n)."""
     taper = _taper(n_samples)
@@ -240,60 +258,69 @@ def _band_squares(
     scale = 2 / (n_samples * float(taper @ taper))
     first, last = (round(edge / step_hz) for edge in plan.band_hz)
     first = max(first, 1)
-    found = np.full((3, spectrum.shape[0]), np.nan)
-    band = spectrum[:, first : last + 1]
-    power = band.real**2 + band.imag**2
-    found[0] = power.sum(axis=1)
-    omega = 2 * np.pi * step_hz * np.arange(first, first + power.shape[1])
-    found[0, accelerations] = power[accelerations] @ omega**-2
+    found = np.full((3, casing.size), np.nan)
+    band = parts[:, 2 * first : 2 * last + 2]
+    accelerations = np.isin(casing, plan.columns(Quantity.ACCELERATION))
+    found[0] = band.sum(axis=1)[casing]
+    if accelerations.any():
+        omega = 2 * np.pi * step_hz * np.arange(first, first + band.shape[1] // 2)
+        found[0, accelerations] = band[casing[accelerations]] @ np.repeat(omega**-2, 2)
     found[0] *= scale
     if plan.high_hz is not None and accelerations.any():
         first, last = (round(edge / step_hz) for edge in plan.high_hz)
-        band = spectrum[accelerations, first : last + 1]
-        found[1, accelerations] = scale * np.sum(np.abs(band) ** 2, axis=1)
+        high = spectrum[casing[accelerations], first : last + 1]
+        found[1, accelerations] = scale * np.sum(np.abs(high) ** 2, axis=1)
         # The band shifted to zero frequency: its magnitude is the envelope, a sample for each of its bins.
-        envelope = np.abs(scipy.fft.ifft(band, axis=1)) * (2 * band.shape[1] / n_samples)
-        weights = np.interp(np.arange(band.shape[1]) / band.shape[1], np.arange(n_samples) / n_samples, taper)
+        envelope = np.abs(scipy.fft.ifft(high, axis=1)) * (2 * high.shape[1] / n_samples)
+        weights = np.interp(np.arange(high.shape[1]) / high.shape[1], np.arange(n_samples) / n_samples, taper)
         level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: compared with its like
         found[2, accelerations] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2)
     return found
 
 
-def _orders(x: FloatArray, angle_rad: FloatArray | None) -> _ComplexArray:
-    """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions."""
+def _orders(every: _SingleArray, angle_rad: FloatArray | None) -> _ComplexArray:
+    """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions.
+
+    Parameters
+    ----------
+    every : ndarray, shape (n_regressors + n, n_samples)
+        Room for the regressors, and the samples.
+    """
+    x = every[_REGRESSORS:]
     nothing = np.full((len(ORDERS), x.shape[0]), np.nan, dtype=np.complex128)
     if angle_rad is None:
         return nothing
-    # Half the angle, from the sign that whole turns leave: sines of small arguments are quicker.
-    turns = np.cumsum(np.round(np.diff(angle_rad, prepend=angle_rad[0]) / (2 * np.pi)))
-    half = angle_rad / 2
-    sign = 1 - 2 * np.mod(turns, 2)
-    count = 1 + 2 * len(ORDERS)
-    rows = np.empty((count + x.shape[0], half.size))
-    rows[count:] = x
-    regressors, cos, sin = rows[:count], rows[1:count:2], rows[2:count:2]
+    # Half the angle, without the steps of whole turns.
+    steps = np.diff(angle_rad)
+    at = np.flatnonzero(np.abs(steps) > np.pi)
+    turns = np.concatenate([[0.0], np.cumsum(np.round(steps[at] / (2 * np.pi)))])
+    half = angle_rad / 2 - np.repeat(np.pi * turns, np.diff(at + 1, prepend=0, append=angle_rad.size))
+    many = abs(half[-1] - half[0]) >= np.pi * _MANY_REVOLUTIONS
+    half -= 2 * np.pi * np.round(half / (2 * np.pi))
+    if many:
+        half = half.astype(np.float32)
+    else:  # orders are nearly alike then: what tells them apart needs the digits
+        every = every.astype(np.float64)
+    regressors, cos, sin = every[:_REGRESSORS], every[1:_REGRESSORS:2], every[2:_REGRESSORS:2]
     regressors[0] = 1
-    np.multiply(np.cos(half), sign, out=cos[0])
-    np.multiply(np.sin(half), sign, out=sin[0])
+    np.cos(half, out=cos[0])
+    np.sin(half, out=sin[0])
     for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):  # cos and sin of a sum of angles
         cos[row] = cos[first] * cos[second] - sin[first] * sin[second]
         sin[row] = sin[first] * cos[second] + cos[first] * sin[second]
-    turned = abs(half[-1] - half[0] - np.pi * turns[-1]) / np.pi
-    weighted = regressors
-    if turned >= _MANY_REVOLUTIONS:
-        weighted = regressors * _taper(half.size)  # so that other lines stay out
+    # Many are tapered, so that other lines stay out.
+    products = ((regressors * _taper(half.size) if many else regressors) @ every.T).astype(np.float64)
     try:
-        products = weighted @ rows.T
-        solved = np.linalg.solve(products[:, :count], products[:, count:])
+        solved = np.linalg.solve(products[:, :_REGRESSORS], products[:, _REGRESSORS:])
     except np.linalg.LinAlgError:  # a shaft that stands still
         return nothing
     return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
 
 
 @lru_cache(maxsize=8)
-def _taper(size: int) -> FloatArray:
+def _taper(size: int) -> _SingleArray:
     """Hann's, of so many samples."""
-    taper = np.hanning(size + 1)[:-1]
+    taper = np.hanning(size + 1)[:-1].astype(np.float32)
     taper.flags.writeable = False
     return taper
 

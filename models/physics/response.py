@@ -151,17 +151,16 @@ def advance(system: DiscreteSystem, state: FloatArray, noise: FloatArray) -> Flo
     pieces = -(-n_samples // length)
     driven = np.zeros((pieces * length, n))
     driven[:n_samples] = noise @ system.G.T
-    x = driven.reshape(pieces, length, n)
-    F_T = system.F.T
+    x = np.ascontiguousarray(driven.reshape(pieces, length, n).transpose(1, 0, 2))
+    powers = system.F.T[np.newaxis]  # of the transposed matrix, from the first on
+    while len(powers) < length:
+        powers = np.concatenate([powers, powers @ powers[-1]])
     for k in range(1, length):
-        x[:, k] += x[:, k - 1] @ F_T
+        x[k] += x[k - 1] @ powers[0]
     starts = np.empty((pieces, n))
-    F_length = np.linalg.matrix_power(system.F, length)
     carried = np.asarray(state, dtype=np.float64)
     for piece in range(pieces):
         starts[piece] = carried
-        carried = F_length @ carried + x[piece, -1]
-    for k in range(length):
-        starts = starts @ F_T
-        x[:, k] += starts
-    return x.reshape(-1, n)[:n_samples]
+        carried = carried @ powers[length - 1] + x[-1, piece]
+    x += starts @ powers[:length]
+    return x.transpose(1, 0, 2).reshape(-1, n)[:n_samples]

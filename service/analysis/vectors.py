@@ -136,7 +136,7 @@ def estimated_vectors(data: Recorded, channels: Sequence[Channel], between_rad_s
 
 def _estimated(stretch: Excerpt, channels: Sequence[Channel], speed_rad_s: float, tolerance: float) -> Vectors:
     si = stretch.samples * np.array([channel.to_si for channel in channels])
-    line = rotation_line(si, stretch.rate_hz, speed_rad_s, tolerance)
+    line = rotation_line(si.T, stretch.rate_hz, speed_rad_s, tolerance)
     there = line is not None and line.strength > _STANDS_OUT
     orders, means, speeds = [], [], []
     if line is not None and there:
