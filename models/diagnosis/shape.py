@@ -159,17 +159,11 @@ class HealthyShape(BaseModel, extra="forbid", frozen=True, strict=True):
 
 @dataclass(frozen=True, slots=True)
 class ShapePower:
-    """What is seen of one channel's shape.
+    """What is seen of one channel's shape."""
 
-    Attributes
-    ----------
-    growth : float
-        So many times as loud noise must make it to be called a change with 95 % probability; infinite where none is.
-    windows : int or None
-        Healthy windows with which `SEEN_GROWTH` suffices, if they scatter as these do; None where none do.
-    """
-
+    # So many times as loud noise must make it to be called a change with 95 % probability; infinite where none is.
     growth: float
+    # Healthy windows with which `SEEN_GROWTH` suffices, if they scatter as these do; None where none do.
     windows: int | None
 
 

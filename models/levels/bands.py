@@ -45,45 +45,24 @@ def band_edges(n_samples: int, used: float) -> npt.NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True)
 class BandLevels:
-    """Levels of a window in bands.
+    """Levels of a window in bands."""
 
-    Attributes
-    ----------
-    edges_hz : ndarray, shape (n_bands + 1,)
-    rms : ndarray, shape (n_bands, n)
-        SI units.
-    errors : ndarray, shape (n_bands, n)
-        Standard errors by the scatter of the hops.
-    freedom : ndarray, shape (n_bands,)
-        Degrees of freedom of a mean square of Gaussian noise.
-    """
-
-    edges_hz: FloatArray
-    rms: FloatArray
-    errors: FloatArray
-    freedom: FloatArray
+    edges_hz: FloatArray  # (n_bands + 1,)
+    rms: FloatArray  # (n_bands, n), SI units
+    errors: FloatArray  # (n_bands, n), standard errors by the scatter of the hops
+    freedom: FloatArray  # (n_bands,), degrees of freedom of a mean square of Gaussian noise
 
 
 class BandReference(BaseModel):
-    """Healthy levels of one channel in bands, SI units.
-
-    Attributes
-    ----------
-    high : tuple of float
-        Largest of the windows.
-    error : tuple of float
-        Mean standard error of one window.
-    freedom : tuple of float
-        Degrees of freedom of `mean`.
-    """
+    """Healthy levels of one channel in bands, SI units."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     edges_hz: tuple[_Level, ...]
     mean: tuple[_Level, ...]
-    high: tuple[_Level, ...]
-    error: tuple[_Level, ...]
-    freedom: tuple[_Level, ...]
+    high: tuple[_Level, ...]  # largest of the windows
+    error: tuple[_Level, ...]  # mean standard error of one window
+    freedom: tuple[_Level, ...]  # degrees of freedom of `mean`
 
 
 def learn_bands(windows: Sequence[BandLevels], column: int) -> BandReference:
@@ -105,19 +84,11 @@ def _short(values: FloatArray) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """The band that is nearest to its limit, or farthest beyond.
-
-    Attributes
-    ----------
-    ratio : float
-        Its level over that of the reference.
-    limit : float
-        Ratio from which on it is an alert.
-    """
+    """The band that is nearest to its limit, or farthest beyond."""
 
     band_hz: tuple[float, float]
-    ratio: float
-    limit: float
+    ratio: float  # its level over that of the reference
+    limit: float  # ratio from which on it is an alert
 
 
 def growth(

@@ -29,27 +29,17 @@ windows leave up to 2.4; of changed stiffness and damping, what looks most like 
 
 
 class GainReference(BaseModel):
-    """Levels of the places of a healthy machine side by side.
-
-    Attributes
-    ----------
-    edges_hz : tuple of float
-        Lower edges of the third octaves that are compared.
-    levels : nested tuple of float, shape (n_recordings, n_thirds, n_places)
-        Mean logarithm of the rms.
-    scatter : nested tuple of float, shape (n_thirds, n_places)
-        Standard deviation of one window's contrast within its recording.
-    windows : int
-        Fewest of a recording.
-    """
+    """Levels of the places of a healthy machine side by side."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     places: tuple[str, ...] = Field(min_length=_FEWEST_PLACES)
-    edges_hz: tuple[float, ...] = Field(min_length=_FEWEST_THIRDS)
+    edges_hz: tuple[float, ...] = Field(min_length=_FEWEST_THIRDS)  # lower edges of the third octaves that are compared
+    # (n_recordings, n_thirds, n_places), mean logarithm of the rms.
     levels: tuple[tuple[tuple[float, ...], ...], ...] = Field(min_length=1)
+    # (n_thirds, n_places), standard deviation of one window's contrast within its recording.
     scatter: tuple[tuple[float, ...], ...]
-    windows: int = Field(ge=1)
+    windows: int = Field(ge=1)  # fewest of a recording
 
 
 def place_of(channel: Channel) -> str:

@@ -30,24 +30,14 @@ def random_kurtosis(square: FloatArray, fourth: FloatArray, lines: npt.NDArray[n
 
 
 class KurtosisReference(BaseModel):
-    """That of one channel in the healthy windows.
-
-    Attributes
-    ----------
-    scatter : float
-        Standard deviation of one hop.
-    hops : int
-        How many were seen.
-    range : float
-        Largest distance of a window's mean from `mean`.
-    """
+    """That of one channel in the healthy windows."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     mean: float = Field(allow_inf_nan=False)
-    scatter: float = Field(ge=0, allow_inf_nan=False)
-    hops: int = Field(ge=2)
-    range: float = Field(ge=0, allow_inf_nan=False)
+    scatter: float = Field(ge=0, allow_inf_nan=False)  # standard deviation of one hop
+    hops: int = Field(ge=2)  # how many were seen
+    range: float = Field(ge=0, allow_inf_nan=False)  # largest distance of a window's mean from `mean`
 
 
 def learn_kurtosis(windows: Sequence[FloatArray]) -> KurtosisReference | None:

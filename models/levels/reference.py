@@ -23,73 +23,44 @@ _SAME_SPEED = 0.03
 
 
 class ReferenceLevel(BaseModel):
-    """One measure of one channel over the healthy windows of an operating state, SI units.
-
-    Attributes
-    ----------
-    low, high : float
-        Smallest and largest of them.
-    error : float
-        Mean standard error of one window.
-    vector : tuple of float or None
-        Of 1x, with a phase reference: real and imaginary part of the mean of q.
-    turned : float
-        Largest distance of a window's vector from that.
-    """
+    """One measure of one channel over the healthy windows of an operating state, SI units."""
 
     model_config = _STORED
 
     mean: _Level
+    # Smallest and largest of them.
     low: _Level
     high: _Level
-    error: _Level
+    error: _Level  # mean standard error of one window
+    # Of 1x, with a phase reference: real and imaginary part of the mean of q.
     vector: tuple[_Finite, _Finite] | None = None
-    turned: _Level = 0.0
+    turned: _Level = 0.0  # largest distance of a window's vector from that
 
 
 class OperatingState(BaseModel):
-    """Levels at one speed.
-
-    Attributes
-    ----------
-    speed_rad_s : tuple of float or None
-        Slowest and fastest window; None where the speed is not known.
-    levels : dict
-        By channel and measure.
-    hops : float
-        Mean number of hops in a window.
-    bands, kurtosis : dict
-        By channel.
-    """
+    """Levels at one speed."""
 
     model_config = _STORED
 
     windows: int = Field(ge=1)
-    speed_rad_s: tuple[_Finite, _Finite] | None
-    levels: dict[str, dict[str, ReferenceLevel]]
-    hops: float = Field(ge=1)
+    speed_rad_s: tuple[_Finite, _Finite] | None  # slowest and fastest window; None where the speed is not known
+    levels: dict[str, dict[str, ReferenceLevel]]  # by channel and measure
+    hops: float = Field(ge=1)  # mean number of hops in a window
+    # By channel.
     bands: dict[str, BandReference] = {}
     kurtosis: dict[str, KurtosisReference] = Field(default={}, exclude_if=lambda found: not found)
 
 
 class LevelReference(BaseModel):
-    """Healthy levels, state by state.
-
-    Attributes
-    ----------
-    source : str
-        Where they are from, as operators will read it.
-    gains : GainReference or None
-        Of the places side by side.
-    lines : tuple or None
-        Frequency, Hz, and order of each line; None where they were not looked for.
-    """
+    """Healthy levels, state by state."""
 
     model_config = _STORED
 
-    source: str
+    source: str  # where they are from, as operators will read it
     states: tuple[OperatingState, ...] = Field(min_length=1)
+    # Of the places side by side.
     gains: GainReference | None = Field(default=None, exclude_if=lambda found: found is None)
+    # Frequency, Hz, and order of each line; None where they were not looked for.
     lines: tuple[tuple[_Level, _Level], ...] | None = Field(default=None, exclude_if=lambda found: found is None)
 
     @model_validator(mode="after")

@@ -12,17 +12,11 @@ from types import MappingProxyType
 
 @dataclass(frozen=True, slots=True)
 class Zones:
-    """Boundaries A/B, B/C and C/D of one measure.
+    """Boundaries A/B, B/C and C/D of one measure."""
 
-    Attributes
-    ----------
-    shaft : bool
-        Of the peak-to-peak displacement of the shaft relative to its bearing, else of the rms velocity of the casing.
-    boundaries : tuple of float
-        Casing: m/s rms. Shaft: times 1/√n, m peak to peak with n in rpm.
-    """
-
+    # Of the peak-to-peak displacement of the shaft relative to its bearing, else of the rms velocity of the casing.
     shaft: bool
+    # Casing: m/s rms. Shaft: times 1/√n, m peak to peak with n in rpm.
     boundaries: tuple[float, float, float]
 
     def at(self, speed_rad_s: float | None) -> tuple[float, float, float] | None:

@@ -22,21 +22,11 @@ class LogUnavailable(ClientError):  # noqa: N818  # said to whoever follows, by 
 
 @dataclass(frozen=True, slots=True)
 class AlarmMessage:
-    """Something heard of a machine's alarms.
+    """Something heard of a machine's alarms."""
 
-    Attributes
-    ----------
-    place : str
-        ``<site>/<machine>``.
-    kind : {"event", "state", "monitor"}
-        An alarm event, the alarms as they are now, or a monitor that has come.
-    text : bytes
-        JSON; empty for a monitor.
-    """
-
-    place: str
-    kind: Literal["event", "state", "monitor"]
-    text: bytes
+    place: str  # ``<site>/<machine>``
+    kind: Literal["event", "state", "monitor"]  # an alarm event, the alarms as they are now, or a monitor that has come
+    text: bytes  # JSON; empty for a monitor
 
 
 class AlarmTopics:

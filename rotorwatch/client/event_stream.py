@@ -24,21 +24,11 @@ _log = logging.getLogger("rotorwatch.client")
 
 @dataclass(frozen=True, slots=True)
 class ServiceEvent:
-    """Something that happened: one of `alarm` and `health` is there.
+    """Something that happened: one of `alarm` and `health` is there."""
 
-    Attributes
-    ----------
-    cursor : str
-        Where to go on after this event: keep it, and give it back as `after`.
-    alarm : AlarmCloudEvent or None
-        What happened to an alarm.
-    health : Health or None
-        Health of a machine that has changed.
-    """
-
-    cursor: str
-    alarm: AlarmCloudEvent | None = None
-    health: Health | None = None
+    cursor: str  # where to go on after this event: keep it, and give it back as `after`
+    alarm: AlarmCloudEvent | None = None  # what happened to an alarm
+    health: Health | None = None  # health of a machine that has changed
 
 
 def service_events(http: httpx.Client, parameters: Mapping[str, str | list[str]], after: str) -> Iterator[ServiceEvent]:

@@ -39,16 +39,9 @@ State = Annotated[HealthState, Field(description="health in one word", examples=
 
 @dataclass(frozen=True, slots=True)
 class Measure:
-    """Marks a number of the window that is kept over time, exported and shown.
+    """Marks a number of the window that is kept over time, exported and shown."""
 
-    Attributes
-    ----------
-    name : str
-        What it is asked for by.
-    unit : str
-    """
-
-    name: str
+    name: str  # what it is asked for by
     unit: str
 
 

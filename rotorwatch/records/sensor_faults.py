@@ -5,18 +5,10 @@ from typing import Self
 
 
 class FaultKind(StrEnum):
-    """Kind of a sensor's fault.
+    """Kind of a sensor's fault."""
 
-    Attributes
-    ----------
-    text : str
-        The same in words, for its alarm.
-    measure : str
-        What the value of a fault of this kind is.
-    """
-
-    text: str
-    measure: str
+    text: str  # the same in words, for its alarm
+    measure: str  # what the value of a fault of this kind is
 
     def __new__(cls, name: str, text: str, measure: str) -> Self:
         """A row: name in records, words, meaning of the value."""

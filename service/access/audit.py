@@ -31,22 +31,13 @@ _log = logger(part="access")
 
 @dataclass(frozen=True, slots=True)
 class AuditNote:
-    """What a route says of what it does, as ``request.state.audit``.
+    """What a route says of what it does, as ``request.state.audit``."""
 
-    Attributes
-    ----------
-    action : str
-        In one word, such as ``acknowledge``.
-    machine, alarm : str
-        What it is done to: ``site/machine``, and the alarm's name.
-    reason : str
-        Why, in the words of the caller.
-    """
-
-    action: str = ""
+    action: str = ""  # in one word, such as ``acknowledge``
+    # What it is done to: ``site/machine``, and the alarm's name.
     machine: str = ""
     alarm: str = ""
-    reason: str = ""
+    reason: str = ""  # why, in the words of the caller
 
 
 @dataclass(slots=True)

@@ -18,20 +18,12 @@ class Scope(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who sent a request.
+    """Who sent a request."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the token; ``anonymous`` where the API is open on loopback, empty for nobody in particular.
-    token_id : str
-        Public part of the token, empty without one.
-    """
-
-    name: str
+    name: str  # name of the token; ``anonymous`` where the API is open on loopback, empty for nobody in particular
     scopes: frozenset[Scope] = field(default_factory=frozenset)
     address: str = ""
-    token_id: str = ""
+    token_id: str = ""  # public part of the token, empty without one
 
 
 ANONYMOUS = "anonymous"

@@ -22,18 +22,10 @@ from service.monitor.levels import LevelWatch
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """What was seen.
+    """What was seen."""
 
-    Attributes
-    ----------
-    lines : tuple of str
-        What arrives, in words.
-    troubles : tuple of str
-        What is missing or differs from the machine file.
-    """
-
-    lines: tuple[str, ...]
-    troubles: tuple[str, ...]
+    lines: tuple[str, ...]  # what arrives, in words
+    troubles: tuple[str, ...]  # what is missing or differs from the machine file
 
 
 def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arrival:

@@ -21,21 +21,13 @@ _LEAST_OF_ALL = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Centreline:
-    """Mean positions at some places, in order of time (API 670: average shaft centreline).
-
-    Attributes
-    ----------
-    time_ns : ndarray of int, shape (n,)
-        Middle of the samples of each.
-    speed_rad_s : ndarray, shape (n,)
-        Nan without a shaft angle.
-    y_um, z_um : ndarray, shape (n, n_pairs)
-    """
+    """Mean positions at some places, in order of time (API 670: average shaft centreline)."""
 
     pairs: tuple[tuple[Channel, Channel], ...]
     each_s: float
-    time_ns: npt.NDArray[np.int64]
-    speed_rad_s: FloatArray
+    time_ns: npt.NDArray[np.int64]  # (n,), middle of the samples of each
+    speed_rad_s: FloatArray  # (n,), nan without a shaft angle
+    # (n, n_pairs).
     y_um: FloatArray
     z_um: FloatArray
 

@@ -22,17 +22,11 @@ from service.monitor.descriptor import descriptor_mismatch
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One reference's correlation.
+    """One reference's correlation."""
 
-    Attributes
-    ----------
-    label : str
-        Reference channel's state, or plane.
-    measured, predicted : ndarray, shape (n_points,)
-        Target as estimated in the window, and by the network from the other correlations; over the target's rms.
-    """
-
-    label: str
+    label: str  # reference channel's state, or plane
+    # (n_points,), target as estimated in the window, and by the network from the other correlations; over the target's
+    # rms.
     measured: FloatArray
     predicted: FloatArray
 
@@ -44,46 +38,27 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One equation.
+    """One equation."""
 
-    Attributes
-    ----------
-    number, title, target : str
-        Number and subject of the equation, and name of its target correlation.
-    over : str
-        ``lag`` or ``angle``: what `x` is.
-    x : ndarray, shape (n_points,)
-        Lags, s; or shaft angles, rad.
-    curves : tuple of Curve
-        Empty if it cannot be evaluated.
-    reading : EquationReading
-        What the monitor reports of it: mean squared deviation, that of healthy windows, parameters, or the reason.
-    """
-
+    # Number and subject of the equation, and name of its target correlation.
     number: str
     title: str
     target: str
-    over: str
-    x: FloatArray
-    curves: tuple[Curve, ...]
+    over: str  # ``lag`` or ``angle``: what `x` is
+    x: FloatArray  # (n_points,), lags, s; or shaft angles, rad
+    curves: tuple[Curve, ...]  # empty if it cannot be evaluated
+    # What the monitor reports of it: mean squared deviation, that of healthy windows, parameters, or the reason.
     reading: EquationReading
 
 
 @dataclass(frozen=True, slots=True)
 class Correlations:
-    """All equations of one window.
+    """All equations of one window."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Oldest and newest data in the window.
-    speed_rad_s : float
-        Mean speed; nan without a shaft angle.
-    """
-
+    # Oldest and newest data in the window.
     start_ns: int
     end_ns: int
-    speed_rad_s: float
+    speed_rad_s: float  # mean speed; nan without a shaft angle
     panels: tuple[Panel, ...]
 
 
@@ -179,23 +154,14 @@ def _blocks(data: Recorded, machine: MachineFile) -> Iterator[tuple[SampleBlock,
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCorrelations:
-    """Correlation functions of some pairs, SI.
+    """Correlation functions of some pairs, SI."""
 
-    Attributes
-    ----------
-    lags_s : ndarray, shape (n_lags,)
-    values, errors : ndarray, shape (n_lags, n_pairs)
-        R_ij(τ) and its standard error.
-    band_hz : tuple of float or None
-        What they are limited to; None where they come from the samples.
-    outside_band : ndarray, shape (n_pairs,)
-        What that leaves out at lag zero, over the product of the rms; nan where they come from the samples.
-    """
-
-    lags_s: FloatArray
+    lags_s: FloatArray  # (n_lags,)
+    # (n_lags, n_pairs), R_ij(τ) and its standard error.
     values: FloatArray
     errors: FloatArray
-    band_hz: tuple[float, float] | None
+    band_hz: tuple[float, float] | None  # what they are limited to; None where they come from the samples
+    # (n_pairs,), what that leaves out at lag zero, over the product of the rms; nan where they come from the samples.
     outside_band: FloatArray
 
 

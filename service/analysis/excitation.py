@@ -32,30 +32,15 @@ _SMOOTH = 2000.0
 
 @dataclass(frozen=True, slots=True)
 class Excitation:
-    """Forces and sensor noise of one window.
+    """Forces and sensor noise of one window."""
 
-    Attributes
-    ----------
-    machine : Machine
-        Whose rotor they were found with.
-    motions : Motions
-        What was measured.
-    theta : ndarray
-        Point of `SpectralModel` with all structural ratios at nought.
-    force_scale : float
-        Its unit of force, N/√Hz.
-    speed_rad_s : float
-        Speed of the gyroscopic terms.
-    noise : dict of str to ndarray
-        Parameters of every sensor's noise (`service.analysis.excitation`), by state; an
-        accelerometer's as that of the velocity it was integrated to.
-    """
-
-    machine: Machine
-    motions: Motions
-    theta: FloatArray
-    force_scale: float
-    speed_rad_s: float
+    machine: Machine  # whose rotor they were found with
+    motions: Motions  # what was measured
+    theta: FloatArray  # point of `SpectralModel` with all structural ratios at nought
+    force_scale: float  # its unit of force, N/√Hz
+    speed_rad_s: float  # speed of the gyroscopic terms
+    # Parameters of every sensor's noise (`service.analysis.excitation`), by state; an accelerometer's as that of the
+    # velocity it was integrated to.
     noise: dict[str, FloatArray]
 
     def spectra(self, rotor: RotorParameters, states: tuple[str, ...], frequencies_hz: FloatArray) -> ComplexArray:

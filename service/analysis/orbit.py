@@ -33,11 +33,6 @@ class Ellipse:
     In the plane y + jz it is a part that goes round with the shaft and one that goes against it:
     y(θ) + j z(θ) = F e^{jθ} + B e^{-jθ}.
 
-    Attributes
-    ----------
-    y, z : complex
-        Vectors, both in one unit; so are all lengths below.
-
     Examples
     --------
     >>> circle = Ellipse(2.0, -2.0j)
@@ -45,6 +40,7 @@ class Ellipse:
     (2.0, 2.0, 'forward')
     """
 
+    # Vectors, both in one unit; so are all lengths below.
     y: complex
     z: complex
 
@@ -91,46 +87,26 @@ def phase_lag_deg(vector: complex, direction: int) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Orbit:
-    """The orbit at one place.
+    """The orbit at one place."""
 
-    Attributes
-    ----------
-    location : str
-        ``bearing`` or ``disc``.
-    names : tuple of str
-        Of y and z: the channels', or what two at an angle are turned to.
-    ellipse : Ellipse
-        The part at running speed, µm.
-    y_um, z_um : ndarray, shape (n,)
-        As measured, about the mean.
-    marks_um : ndarray, shape (n_pulses, 2)
-        Where the shaft was at each pulse of the keyphasor.
-    """
-
-    location: str
-    names: tuple[str, str]
-    ellipse: Ellipse
+    location: str  # ``bearing`` or ``disc``
+    names: tuple[str, str]  # of y and z: the channels', or what two at an angle are turned to
+    ellipse: Ellipse  # the part at running speed, µm
+    # (n,), as measured, about the mean.
     y_um: FloatArray
     z_um: FloatArray
-    marks_um: FloatArray
+    marks_um: FloatArray  # (n_pulses, 2), where the shaft was at each pulse of the keyphasor
 
 
 @dataclass(frozen=True, slots=True)
 class Orbits:
-    """Orbits of the same revolutions at all places where both directions are measured.
+    """Orbits of the same revolutions at all places where both directions are measured."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        First and last pulse of the keyphasor.
-    speed_rad_s : float
-        Mean speed; negative where the shaft turns from z to y.
-    """
-
+    # First and last pulse of the keyphasor.
     start_ns: int
     end_ns: int
     revolutions: int
-    speed_rad_s: float
+    speed_rad_s: float  # mean speed; negative where the shaft turns from z to y
     orbits: tuple[Orbit, ...]
 
     @property
@@ -150,18 +126,10 @@ def orbit_pairs(channels: Iterable[Channel]) -> list[tuple[Channel, Channel]]:
 
 @dataclass(frozen=True, slots=True)
 class Planes:
-    """Two sensors of one place as sensors in y and z.
+    """Two sensors of one place as sensors in y and z."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Of y and z: the channels' own, or what they are turned to.
-    turn : ndarray, shape (2, 2)
-        From what they show to y and z; None where they are in y and z.
-    """
-
-    names: tuple[str, str]
-    turn: FloatArray | None
+    names: tuple[str, str]  # of y and z: the channels' own, or what they are turned to
+    turn: FloatArray | None  # (2, 2), from what they show to y and z; None where they are in y and z
 
     def turned(self, values: npt.NDArray[_Value]) -> npt.NDArray[_Value]:
         """Values of both, shape (2, ...), in y and z."""

@@ -37,21 +37,12 @@ _OVER_BAND = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """Theory for one window.
+    """Theory for one window."""
 
-    Attributes
-    ----------
-    machine : Machine
-        As nominal.
-    changes : dict of str to float
-        Relative changes of the machine as estimated.
-    nominal_reason, estimated_reason : str
-        Why there is no prediction for the machine as nominal, or as estimated; empty where there is one.
-    """
-
-    machine: Machine | None
+    machine: Machine | None  # as nominal
     excitation: Excitation | None
-    changes: dict[str, float]
+    changes: dict[str, float]  # relative changes of the machine as estimated
+    # Why there is no prediction for the machine as nominal, or as estimated; empty where there is one.
     nominal_reason: str
     estimated_reason: str
 

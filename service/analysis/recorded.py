@@ -27,18 +27,10 @@ def begins_again(end_ns: int, start_ns: int) -> bool:
 
 
 class Described(ABC):
-    """Data of one machine whose channels are known.
+    """Data of one machine whose channels are known."""
 
-    Attributes
-    ----------
-    name : str
-        ``site/machine``.
-    place : str
-        Where they are.
-    """
-
-    name: str
-    place: str
+    name: str  # ``site/machine``
+    place: str  # where they are
 
     @property
     @abstractmethod

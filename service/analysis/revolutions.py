@@ -12,21 +12,12 @@ from models.signals.block import FloatArray, SampleBlock
 
 @dataclass(frozen=True, slots=True)
 class Excerpt:
-    """Consecutive samples of some channels, in the units of the channels.
+    """Consecutive samples of some channels, in the units of the channels."""
 
-    Attributes
-    ----------
-    start_ns : int
-        Acquisition time of the first sample.
-    samples : ndarray, shape (n_samples, n_channels)
-    angle_rad : ndarray, shape (n_samples,) or None
-        Shaft angle; None if it is not measured.
-    """
-
-    start_ns: int
+    start_ns: int  # acquisition time of the first sample
     rate_hz: float
-    samples: FloatArray
-    angle_rad: FloatArray | None
+    samples: FloatArray  # (n_samples, n_channels)
+    angle_rad: FloatArray | None  # (n_samples,), shaft angle; None if it is not measured
 
     @property
     def length_s(self) -> float:
@@ -65,22 +56,13 @@ class Excerpt:
 
 @dataclass(frozen=True, slots=True)
 class Revolutions:
-    """Samples of whole revolutions.
+    """Samples of whole revolutions."""
 
-    Attributes
-    ----------
-    excerpt : Excerpt or None
-        None where there is no whole revolution.
-    pulses : ndarray, shape (count + 1,)
-        Where the shaft angle is 0, in samples from the first one; empty where it is not measured.
-    reason : str
-        Why there are none, or fewer than asked for.
-    """
-
-    excerpt: Excerpt | None
+    excerpt: Excerpt | None  # None where there is no whole revolution
     count: int
+    # (count + 1,), where the shaft angle is 0, in samples from the first one; empty where it is not measured.
     pulses: FloatArray
-    reason: str
+    reason: str  # why there are none, or fewer than asked for
 
 
 def pulses(angle_rad: npt.NDArray[np.floating] | None) -> tuple[int, FloatArray]:

@@ -17,33 +17,19 @@ from service.analysis.vectors import estimated_vectors, read_vectors
 
 @dataclass(frozen=True, slots=True)
 class RunUp:
-    """Vectors of some channels, in order of time.
-
-    Attributes
-    ----------
-    revolutions : int or None
-        That each vector is of; None where it is of a window of the monitor.
-    time_ns : ndarray of int, shape (n,)
-    speed_rad_s : ndarray, shape (n,)
-        Negative where the shaft turns from z to y.
-    amplitude, lag_deg : ndarray, shape (n, n_channels)
-        In `units`, and 0 to 360°.
-    slow_roll_rpm : float or None
-        The mean vector up to this speed was taken away.
-    estimated : bool
-        Whether the speed was found in the vibration, so that there is no phase.
-    """
+    """Vectors of some channels, in order of time."""
 
     channels: tuple[Channel, ...]
     units: tuple[str, ...]
     order: int
-    revolutions: int | None
-    time_ns: npt.NDArray[np.int64]
-    speed_rad_s: FloatArray
+    revolutions: int | None  # that each vector is of; None where it is of a window of the monitor
+    time_ns: npt.NDArray[np.int64]  # (n,)
+    speed_rad_s: FloatArray  # (n,), negative where the shaft turns from z to y
+    # (n, n_channels), in `units`, and 0 to 360°.
     amplitude: FloatArray
     lag_deg: FloatArray
-    slow_roll_rpm: float | None
-    estimated: bool
+    slow_roll_rpm: float | None  # the mean vector up to this speed was taken away
+    estimated: bool  # whether the speed was found in the vibration, so that there is no phase
 
     @property
     def direction(self) -> int:

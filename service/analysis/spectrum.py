@@ -59,34 +59,18 @@ def shown_as(channel: Channel, scaling: Scaling) -> tuple[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """Averaged spectra of some channels.
+    """Averaged spectra of some channels."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Oldest and newest data in it.
-    frequencies_hz : ndarray, shape (n_bins,)
-    values : ndarray, shape (n_channels, n_bins)
-        As `shown_as` states them.
-    scaling : str
-        ``amplitude`` or ``density``.
-    resolution_hz : float
-        Distance of the lines.
-    averages : int
-        Segments, overlapping by half, whose power was averaged.
-    speed_rad_s : float
-        Mean speed; nan without a shaft angle.
-    """
-
+    # Oldest and newest data in it.
     start_ns: int
     end_ns: int
     channels: tuple[Channel, ...]
-    frequencies_hz: FloatArray
-    values: FloatArray
-    scaling: Scaling
-    resolution_hz: float
-    averages: int
-    speed_rad_s: float
+    frequencies_hz: FloatArray  # (n_bins,)
+    values: FloatArray  # (n_channels, n_bins), as `shown_as` states them
+    scaling: Scaling  # ``amplitude`` or ``density``
+    resolution_hz: float  # distance of the lines
+    averages: int  # segments, overlapping by half, whose power was averaged
+    speed_rad_s: float  # mean speed; nan without a shaft angle
 
     @property
     def useful_hz(self) -> float:
@@ -101,26 +85,18 @@ class FullSpectrum:
     y + jz is a sum of F e^{jωt}, which goes round from y to z, and R e^{-jωt}, which goes from z to y: the one with the
     rotation is forward precession, the other reverse. Together they make an ellipse with the axes 2(|F| + |R|) and
     2||F| - |R|| (D. E. Bently, C. T. Hatch, "Fundamentals of Rotating Machinery Diagnostics", full spectrum).
-
-    Attributes
-    ----------
-    lines : ndarray, shape (n_lines,)
-        Frequencies, Hz, or orders: positive ones are forward, or from y to z where the rotation is not known.
-    values_um : ndarray, shape (n_pairs, n_lines)
-        Diameter of each circle: peak to peak.
-    speed_rad_s : float
-        Mean speed; nan without a shaft angle.
     """
 
     start_ns: int
     end_ns: int
     pairs: tuple[tuple[Channel, Channel], ...]
+    # (n_lines,), frequencies, Hz, or orders: positive ones are forward, or from y to z where the rotation is not known.
     lines: FloatArray
-    values_um: FloatArray
+    values_um: FloatArray  # (n_pairs, n_lines), diameter of each circle: peak to peak
     orders: bool
     resolution: float
     averages: int
-    speed_rad_s: float
+    speed_rad_s: float  # mean speed; nan without a shaft angle
 
     @property
     def useful(self) -> float:
@@ -133,28 +109,16 @@ class FullSpectrum:
 
 @dataclass(frozen=True, slots=True)
 class Waterfall:
-    """Spectra of one channel, one after the other.
-
-    Attributes
-    ----------
-    frequencies_hz : ndarray, shape (n_bins,)
-    start_ns, end_ns : ndarray of int, shape (n_spectra,)
-        Data in each.
-    speed_rad_s : ndarray, shape (n_spectra,)
-        Mean speed; nan without a shaft angle.
-    values : ndarray, shape (n_spectra, n_bins)
-        As `shown_as` states them.
-    scaling : str
-        ``amplitude`` or ``density``.
-    """
+    """Spectra of one channel, one after the other."""
 
     channel: Channel
-    frequencies_hz: FloatArray
+    frequencies_hz: FloatArray  # (n_bins,)
+    # (n_spectra,), data in each.
     start_ns: npt.NDArray[np.int64]
     end_ns: npt.NDArray[np.int64]
-    speed_rad_s: FloatArray
-    values: FloatArray
-    scaling: Scaling
+    speed_rad_s: FloatArray  # (n_spectra,), mean speed; nan without a shaft angle
+    values: FloatArray  # (n_spectra, n_bins), as `shown_as` states them
+    scaling: Scaling  # ``amplitude`` or ``density``
     resolution_hz: float
 
     @property

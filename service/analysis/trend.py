@@ -28,16 +28,11 @@ SHOWN = frozenset({EventKind.RAISED, EventKind.ESCALATED, EventKind.CLEARED})
 
 @dataclass(frozen=True, slots=True)
 class ParameterTrend:
-    """Relative change of one parameter, window by window; nan where it was not read.
-
-    Attributes
-    ----------
-    change, low, high : ndarray, shape (n_reports,)
-        Change and the ends of its 95 % interval, plain ratios.
-    """
+    """Relative change of one parameter, window by window; nan where it was not read."""
 
     name: str
     text: str
+    # (n_reports,), change and the ends of its 95 % interval, plain ratios.
     change: FloatArray
     low: FloatArray
     high: FloatArray
@@ -45,17 +40,10 @@ class ParameterTrend:
 
 @dataclass(frozen=True, slots=True)
 class LevelTrend:
-    """Overall level of one channel, window by window; nan where there was none.
+    """Overall level of one channel, window by window; nan where there was none."""
 
-    Attributes
-    ----------
-    title : str
-        Channel, what of it, and unit.
-    level, alert, danger : ndarray, shape (n_reports,)
-        In that unit; the limits that held, nan without.
-    """
-
-    title: str
+    title: str  # channel, what of it, and unit
+    # (n_reports,), in that unit; the limits that held, nan without.
     level: FloatArray
     alert: FloatArray
     danger: FloatArray
@@ -63,31 +51,18 @@ class LevelTrend:
 
 @dataclass(frozen=True, slots=True)
 class Trend:
-    """Reports and alarm events of one machine.
+    """Reports and alarm events of one machine."""
 
-    Attributes
-    ----------
-    name : str
-        ``site/machine``.
-    end_ns : ndarray of int, shape (n_reports,)
-        End of each window.
-    measures : dict of str to ndarray, shape (n_reports,)
-        Measures of the windows by name, see `MEASURES`; nan where one is not known.
-    limits : AlarmSettings or None
-        Those in force, where the machine file is at hand.
-    origin : str
-        Where the reports come from, in words.
-    """
-
-    name: str
-    end_ns: npt.NDArray[np.int64]
+    name: str  # ``site/machine``
+    end_ns: npt.NDArray[np.int64]  # (n_reports,), end of each window
     states: tuple[HealthState, ...]
+    # (n_reports,), measures of the windows by name, see `MEASURES`; nan where one is not known.
     measures: Mapping[str, FloatArray]
     parameters: tuple[ParameterTrend, ...]
     levels: tuple[LevelTrend, ...]
     alarms: tuple[AlarmEventData, ...]
-    limits: AlarmSettings | None
-    origin: str
+    limits: AlarmSettings | None  # those in force, where the machine file is at hand
+    origin: str  # where the reports come from, in words
 
 
 def past_trend(data: Past, *, levels: bool = False) -> Trend:

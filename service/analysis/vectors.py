@@ -25,25 +25,14 @@ _FOLLOWS, _FOLLOWS_S = 0.05, 2.5 * _ESTIMATED_S
 
 @dataclass(frozen=True, slots=True)
 class Vectors:
-    """Of some channels, piece by piece, SI units.
+    """Of some channels, piece by piece, SI units."""
 
-    Attributes
-    ----------
-    time_ns : ndarray of int, shape (n_pieces,)
-        Middle of each.
-    speed_rad_s : ndarray, shape (n_pieces,)
-        Mean speed; negative where the shaft turns from z to y.
-    revolutions : ndarray of int, shape (n_pieces,)
-    orders : ndarray of complex, shape (n_pieces, 4, n_channels)
-        q of x = Re{q e^{jkθ}} at the orders k of `models.levels.measures.ORDERS`.
-    mean : ndarray, shape (n_pieces, n_channels)
-    """
-
-    time_ns: npt.NDArray[np.int64]
-    speed_rad_s: FloatArray
-    revolutions: npt.NDArray[np.int64]
+    time_ns: npt.NDArray[np.int64]  # (n_pieces,), middle of each
+    speed_rad_s: FloatArray  # (n_pieces,), mean speed; negative where the shaft turns from z to y
+    revolutions: npt.NDArray[np.int64]  # (n_pieces,)
+    # (n_pieces, 4, n_channels), q of x = Re{q e^{jkθ}} at the orders k of `models.levels.measures.ORDERS`.
     orders: npt.NDArray[np.complex128]
-    mean: FloatArray
+    mean: FloatArray  # (n_pieces, n_channels)
 
 
 def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) -> Vectors:

@@ -91,54 +91,27 @@ class Truth(BaseModel, extra="ignore", frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class DemoOptions:
-    """What to show.
+    """What to show."""
 
-    Attributes
-    ----------
-    fault : str
-        What breaks first, one of `FAULTS`, or "none".
-    seed : int
-        Of the simulation; training used none of the small numbers.
-    pace : float
-        Data seconds per second.
-    once : bool
-        End after the first fault, or after as long without one.
-    http_port : int, optional
-        0 takes free ones, for Zenoh as well; if left out, the usual ones are taken where they are free.
-    """
-
-    fault: str
-    seed: int
-    pace: float
-    once: bool
+    fault: str  # what breaks first, one of `FAULTS`, or "none"
+    seed: int  # of the simulation; training used none of the small numbers
+    pace: float  # data seconds per second
+    once: bool  # end after the first fault, or after as long without one
+    # 0 takes free ones, for Zenoh as well; if left out, the usual ones are taken where they are free.
     http_port: int | None = None
 
 
 @dataclass(slots=True)
 class Outcome:
-    """What was injected and what was said about it.
+    """What was injected and what was said about it."""
 
-    Attributes
-    ----------
-    injected : dict of str to float
-        True relative changes, from the truth topic.
-    raised : dict of str to float
-        Relative changes of the raised alarms, from the alarm topic.
-    over_http : set of str
-        Parameters whose alarm the HTTP API showed too.
-    windows : int
-        Reports on evaluated windows.
-    others : set of str
-        Other raised alarms.
-    of_the_data : set of str
-        Raised alarms on the stream, as a busy computer brings them about.
-    """
-
-    injected: dict[str, float] = field(default_factory=dict)
+    injected: dict[str, float] = field(default_factory=dict)  # true relative changes, from the truth topic
+    # Relative changes of the raised alarms, from the alarm topic.
     raised: dict[str, float] = field(default_factory=dict)
-    over_http: set[str] = field(default_factory=set)
-    windows: int = 0
-    others: set[str] = field(default_factory=set)
+    over_http: set[str] = field(default_factory=set)  # parameters whose alarm the HTTP API showed too
+    windows: int = 0  # reports on evaluated windows
+    others: set[str] = field(default_factory=set)  # other raised alarms
+    # Raised alarms on the stream, as a busy computer brings them about.
     of_the_data: set[str] = field(default_factory=set)
 
     def verdict(self) -> str:

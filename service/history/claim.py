@@ -64,38 +64,19 @@ class Claim:
     """The right to write one machine, and what it has to write.
 
     What waits, the attempt included, is changed only by whoever holds the writer's lock.
-
-    Attributes
-    ----------
-    most_reports : int
-        Reports that wait while the database fails, and steps whose readings do.
-    owner : str
-        Mark of this monitor in the database.
-    written : int
-        Number of the latest attempt that is known to be in the database.
-    locked : bool
-        Whether the lock in PostgreSQL is held, as far as is known.
-    lost : StoreError or None
-        Why this monitor must not write the machine any more.
-    trouble : str
-        Why the database, which works, does not take what waits; empty if it does.
-    retry_s : float
-        When that is tried again, by the monotonic clock.
-    generation : int
-        Goes up when the history goes on in another file, which may lack what was written before.
     """
 
     site: str
     name: str
-    most_reports: int
+    most_reports: int  # reports that wait while the database fails, and steps whose readings do
     machine_id: int = 0
-    owner: str = ""
-    written: int = 0
-    locked: bool = True
-    lost: StoreError | None = None
-    trouble: str = ""
-    retry_s: float = 0.0
-    generation: int = 0
+    owner: str = ""  # mark of this monitor in the database
+    written: int = 0  # number of the latest attempt that is known to be in the database
+    locked: bool = True  # whether the lock in PostgreSQL is held, as far as is known
+    lost: StoreError | None = None  # why this monitor must not write the machine any more
+    trouble: str = ""  # why the database, which works, does not take what waits; empty if it does
+    retry_s: float = 0.0  # when that is tried again, by the monotonic clock
+    generation: int = 0  # goes up when the history goes on in another file, which may lack what was written before
     waiting: Bundle = field(default_factory=Bundle)
     attempt: Bundle | None = None
     dropped_reports: int = 0

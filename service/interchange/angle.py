@@ -75,19 +75,12 @@ class AngleColumn:
     """Puts the shaft angle where the machine file has it, and brings angles into [0, 2π).
 
     Rows whose angle is not known are left out; they make a gap.
-
-    Attributes
-    ----------
-    reverse : bool
-        Whether the shaft turns from z to y.
-    unknown : int
-        Rows left out.
     """
 
     machine: MachineFile
     pulses: PulseTrain | None
-    reverse: bool
-    unknown: int = 0
+    reverse: bool  # whether the shaft turns from z to y
+    unknown: int = 0  # rows left out
 
     def feed(self, parts: Iterator[Piece]) -> Iterator[Piece]:
         """Complete a file's pieces."""

@@ -18,22 +18,13 @@ _TURN = 2 * np.pi
 
 @dataclass(slots=True)
 class Written:
-    """What went into the recording.
-
-    Attributes
-    ----------
-    stretches : int
-        Contiguous stretches.
-    too_short : int
-        Samples in stretches too short for a block, left out.
-    start_ns, end_ns : int
-        Time of the first sample, and of the one after the last.
-    """
+    """What went into the recording."""
 
     blocks: int = 0
     samples: int = 0
-    stretches: int = 0
-    too_short: int = 0
+    stretches: int = 0  # contiguous stretches
+    too_short: int = 0  # samples in stretches too short for a block, left out
+    # Time of the first sample, and of the one after the last.
     start_ns: int = 0
     end_ns: int = 0
 

@@ -18,33 +18,15 @@ _MOST_RATIO = 2000
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """How times are read, and how fast the rows come.
+    """How times are read, and how fast the rows come."""
 
-    Attributes
-    ----------
-    path : Path
-        The file, for messages.
-    column : Reference or None
-        Column with the times; without one, rows are equally spaced.
-    unit_ns : float
-        Nanoseconds per unit of that column.
-    origin_ns : int
-        Time of the first row, nanoseconds since 1970-01-01 UTC.
-    first : Array
-        The first row's entry in the column, shape (1,); times are counted from it.
-    rate_hz : float
-        Rows per second.
-    ratio : Fraction
-        The machine's rate over `rate_hz`; other than 1 if the file is to be resampled.
-    """
-
-    path: Path
-    column: Reference | None
-    unit_ns: float
-    origin_ns: int
-    first: Array
-    rate_hz: float
-    ratio: Fraction
+    path: Path  # the file, for messages
+    column: Reference | None  # column with the times; without one, rows are equally spaced
+    unit_ns: float  # nanoseconds per unit of that column
+    origin_ns: int  # time of the first row, nanoseconds since 1970-01-01 UTC
+    first: Array  # the first row's entry in the column, shape (1,); times are counted from it
+    rate_hz: float  # rows per second
+    ratio: Fraction  # the machine's rate over `rate_hz`; other than 1 if the file is to be resampled
 
     def times(self, entries: Array | None, first_row: int, count: int) -> FloatArray:
         """Times of rows, nanoseconds since the first row of the file; nan where there is none.

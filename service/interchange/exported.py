@@ -38,25 +38,14 @@ _SI_UNITS = {
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """What to take of which recordings.
+    """What to take of which recordings."""
 
-    Attributes
-    ----------
-    recordings : tuple of Path
-        In any order; they are read in the order of their beginnings.
-    machine : str or None
-        ``site/machine``; may be left out where the recordings hold only one.
-    from_ns, to_ns : int or None
-        Data time, from the first to without the last.
-    si : bool
-        Whether samples are converted to SI units.
-    """
-
-    recordings: tuple[Path, ...]
-    machine: str | None = None
+    recordings: tuple[Path, ...]  # in any order; they are read in the order of their beginnings
+    machine: str | None = None  # ``site/machine``; may be left out where the recordings hold only one
+    # Data time, from the first to without the last.
     from_ns: int | None = None
     to_ns: int | None = None
-    si: bool = False
+    si: bool = False  # whether samples are converted to SI units
 
     def ordered(self) -> list[Path]:
         """Recordings by the time they begin."""
@@ -89,20 +78,12 @@ class Selection:
 
 @dataclass(slots=True)
 class Table:
-    """Columns with units, and rows.
-
-    Attributes
-    ----------
-    rows : int
-        Rows that were taken so far.
-    skipped : list of str
-        Messages that could not be used, and why.
-    """
+    """Columns with units, and rows."""
 
     schema: pa.Schema
     batches: Iterator[pa.RecordBatch]
-    rows: int = 0
-    skipped: list[str] = field(default_factory=list)
+    rows: int = 0  # rows that were taken so far
+    skipped: list[str] = field(default_factory=list)  # messages that could not be used, and why
 
 
 def stream_table(selection: Selection) -> Table:

@@ -26,16 +26,11 @@ _UNIX = re.compile(r"(?<!\d)(\d{10})(\d{3}|\d{6}|\d{9})?(?!\d)")
 
 @dataclass(frozen=True, slots=True)
 class SnapshotFile:
-    """A file of a folder.
-
-    Attributes
-    ----------
-    start_ns : int or None
-        Time of its first row, nanoseconds since 1970-01-01 UTC, where its name or its place among the others tells;
-        None where the file itself does.
-    """
+    """A file of a folder."""
 
     path: Path
+    # Time of its first row, nanoseconds since 1970-01-01 UTC, where its name or its place among the others tells; None
+    # where the file itself does.
     start_ns: int | None
 
 

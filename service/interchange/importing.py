@@ -27,30 +27,18 @@ from service.interchange.source import Reference, SourceError
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What an import did.
-
-    Attributes
-    ----------
-    read : Read
-        What was met in the file.
-    written : Written
-        What went into the recording.
-    cut_rows : int
-        Rows at the ends of stretches where filters are not settled.
-    unknown_angle : int
-        Rows left out because the shaft angle is not known.
-    """
+    """What an import did."""
 
     source: Path
     recording: Path
     machine: MachineFile
     mapping: Mapping
     clock: Clock
-    read: Read
-    written: Written
+    read: Read  # what was met in the file
+    written: Written  # what went into the recording
     pulses: PulseTrain | None
-    cut_rows: int
-    unknown_angle: int
+    cut_rows: int  # rows at the ends of stretches where filters are not settled
+    unknown_angle: int  # rows left out because the shaft angle is not known
 
 
 def import_file(

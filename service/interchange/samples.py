@@ -16,45 +16,23 @@ from service.interchange.source import Array, Reference, Source, SourceError, as
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """How a column becomes a channel: sample = number · factor + offset, in the channel's unit.
+    """How a column becomes a channel: sample = number · factor + offset, in the channel's unit."""
 
-    Attributes
-    ----------
-    name : str
-        Channel of the machine.
-    reference : Reference
-        Where its numbers are.
-    integrations : int
-        How often it is integrated: 0, or 1 or 2 for an accelerometer.
-    is_angle : bool
-        Whether it runs in circles.
-    """
-
-    name: str
-    reference: Reference
+    name: str  # channel of the machine
+    reference: Reference  # where its numbers are
     factor: float
     offset: float
-    integrations: int
-    is_angle: bool
+    integrations: int  # how often it is integrated: 0, or 1 or 2 for an accelerometer
+    is_angle: bool  # whether it runs in circles
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Rows without a gap.
+    """Rows without a gap."""
 
-    Attributes
-    ----------
-    begins : bool
-        Whether there is a gap before it, or nothing; otherwise it continues the last piece.
-    time_ns : ndarray, shape (n,)
-        Nanoseconds since the first row of the file.
-    samples : ndarray, shape (n, n_channels)
-        In the units of the channels.
-    """
-
-    begins: bool
-    time_ns: FloatArray
-    samples: FloatArray
+    begins: bool  # whether there is a gap before it, or nothing; otherwise it continues the last piece
+    time_ns: FloatArray  # (n,), nanoseconds since the first row of the file
+    samples: FloatArray  # (n, n_channels), in the units of the channels
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,23 +46,13 @@ class Gap:
 
 @dataclass(slots=True)
 class Read:
-    """What was met on the way.
-
-    Attributes
-    ----------
-    rows : int
-        Of all files together.
-    filled : int
-        Rows that were put into short gaps.
-    left_out : int
-        Rows left out for an empty cell, NaN or infinity.
-    """
+    """What was met on the way."""
 
     files: int = 1
-    rows: int = 0
+    rows: int = 0  # of all files together
     gaps: list[Gap] = field(default_factory=list)
-    filled: int = 0
-    left_out: int = 0
+    filled: int = 0  # rows that were put into short gaps
+    left_out: int = 0  # rows left out for an empty cell, NaN or infinity
 
 
 def signals_of(source: Source, mapping: Mapping, machine: MachineFile) -> list[Signal]:

@@ -27,17 +27,10 @@ class SourceError(MachineFileError):
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """A column of a file.
+    """A column of a file."""
 
-    Attributes
-    ----------
-    column : str
-        Name of the column, array, channel or data set.
-    index : int or None
-        Which column of an array with two dimensions, counted from 0; samples run along its longer side.
-    """
-
-    column: str
+    column: str  # name of the column, array, channel or data set
+    # Which column of an array with two dimensions, counted from 0; samples run along its longer side.
     index: int | None = None
 
     def __str__(self) -> str:
@@ -46,20 +39,11 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """What a file says about the time of its rows.
+    """What a file says about the time of its rows."""
 
-    Attributes
-    ----------
-    rate_hz : float or None
-        Samples per second.
-    start_ns : int or None
-        Time of the first row (or of time 0 in `time`), nanoseconds since 1970-01-01 UTC.
-    time : Reference or None
-        The column with the time of each row, in seconds from `start_ns`, where the format has one by itself.
-    """
-
-    rate_hz: float | None = None
-    start_ns: int | None = None
+    rate_hz: float | None = None  # samples per second
+    start_ns: int | None = None  # time of the first row (or of time 0 in `time`), nanoseconds since 1970-01-01 UTC
+    # The column with the time of each row, in seconds from `start_ns`, where the format has one by itself.
     time: Reference | None = None
 
 

@@ -42,28 +42,15 @@ rotor kit readings stay unbiased at ramps of 5, 10 and 15 % (16 seeds each, ``te
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """What the diagnosticians say about a window.
+    """What the diagnosticians say about a window."""
 
-    Attributes
-    ----------
-    deciding : Diagnosis
-        The likelihood's, every parameter in the order of `PARAMETERS`.
-    short : dict of int to Diagnosis
-        The same of the latest hops, by how many; without those that could not be evaluated.
-    equations : tuple of Equation
-        Every equation of the table, by its network, or why not.
-    opinions : tuple of Opinion
-        What the others say.
-    shapes : tuple of Shape
-        Where no equation can be evaluated: whether each channel's vibration is as it was.
-    """
-
-    deciding: Diagnosis
+    deciding: Diagnosis  # the likelihood's, every parameter in the order of `PARAMETERS`
+    # The same of the latest hops, by how many; without those that could not be evaluated.
     short: Mapping[int, Diagnosis]
-    equations: tuple[Equation, ...]
-    opinions: tuple[Opinion, ...]
+    equations: tuple[Equation, ...]  # every equation of the table, by its network, or why not
+    opinions: tuple[Opinion, ...]  # what the others say
     speed_rad_s: float | None
-    shapes: tuple[Shape, ...] = ()
+    shapes: tuple[Shape, ...] = ()  # where no equation can be evaluated: whether each channel's vibration is as it was
 
     def calm(self, *, outside: bool) -> HealthState:
         """State without raised alarms: healthy only if something was read that could have said otherwise."""

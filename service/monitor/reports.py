@@ -67,100 +67,48 @@ def counted(quality: Quality, verdict: Admission) -> Quality:
 
 @dataclass(frozen=True, slots=True)
 class MonitorReport:
-    """What one block did.
+    """What one block did."""
 
-    Attributes
-    ----------
-    verdict : Admission
-        Accepted or refused, and why.
-    windows : tuple of Report
-        One per hop that the block completed.
-    events : tuple of AlarmEvent
-        What happened to alarms.
-    data_s : float
-        Length of the block, if it was accepted.
-    fault : Exception or None
-        A defect of the monitor that came to light with the block; what it cost is said in `windows` and `events`.
-    """
-
-    verdict: Admission
-    windows: tuple[Report, ...] = ()
-    events: tuple[AlarmEvent, ...] = ()
-    data_s: float = 0.0
+    verdict: Admission  # accepted or refused, and why
+    windows: tuple[Report, ...] = ()  # one per hop that the block completed
+    events: tuple[AlarmEvent, ...] = ()  # what happened to alarms
+    data_s: float = 0.0  # length of the block, if it was accepted
+    # A defect of the monitor that came to light with the block; what it cost is said in `windows` and `events`.
     fault: Exception | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class MonitorState:
-    """All that a monitor remembers between two blocks.
+    """All that a monitor remembers between two blocks."""
 
-    Attributes
-    ----------
-    alarms : str
-        The alarms, JSON.
-    state : bytes
-        Everything else that is small (`models.checkpoint`).
-    new_parts : tuple of (str, bytes)
-        What is large and is not known to be kept already, by name.
-    parts : tuple of str
-        Names of all parts that belong to the state.
-    end_ns : int or None
-        End of the newest data; None before the first.
-    """
-
-    alarms: str
-    state: bytes
-    new_parts: tuple[tuple[str, bytes], ...]
-    parts: tuple[str, ...]
-    end_ns: int | None
+    alarms: str  # the alarms, JSON
+    state: bytes  # everything else that is small (`models.checkpoint`)
+    new_parts: tuple[tuple[str, bytes], ...]  # what is large and is not known to be kept already, by name
+    parts: tuple[str, ...]  # names of all parts that belong to the state
+    end_ns: int | None  # end of the newest data; None before the first
 
 
 @dataclass(frozen=True, slots=True)
 class MachineHealth:
-    """Where the machine stands.
-
-    Attributes
-    ----------
-    filled : float
-        Fraction of a full window.
-    alarms : tuple of Alarm
-        All that have been seen so far.
-    sequence : int
-        Number of the latest alarm event.
-    reason : str
-        Why nothing is said of the machine; empty if something is.
-    end_ns : int or None
-        End of the newest data; None before the first.
-    """
+    """Where the machine stands."""
 
     state: HealthState
-    filled: float
+    filled: float  # fraction of a full window
     latest: Report | None
-    alarms: tuple[Alarm, ...]
+    alarms: tuple[Alarm, ...]  # all that have been seen so far
     quality: Quality
-    sequence: int = -1
-    reason: str = ""
-    end_ns: int | None = None
+    sequence: int = -1  # number of the latest alarm event
+    reason: str = ""  # why nothing is said of the machine; empty if something is
+    end_ns: int | None = None  # end of the newest data; None before the first
 
 
 @dataclass(frozen=True, slots=True)
 class Tally:
-    """What a worker has done since it started, for whoever measures the service.
+    """What a worker has done since it started, for whoever measures the service."""
 
-    Attributes
-    ----------
-    windows, blocks : int
-        Windows evaluated, blocks taken.
-    step_s : float
-        Time spent in the monitor altogether.
-    commit_s : float
-        Time spent waiting for the history altogether.
-    data_s : float
-        Length of the data taken altogether.
-    """
-
+    # Windows evaluated, blocks taken.
     windows: int = 0
     blocks: int = 0
-    step_s: float = 0.0
-    commit_s: float = 0.0
-    data_s: float = 0.0
+    step_s: float = 0.0  # time spent in the monitor altogether
+    commit_s: float = 0.0  # time spent waiting for the history altogether
+    data_s: float = 0.0  # length of the data taken altogether

@@ -40,44 +40,20 @@ _ASSUMED = "application/json;assumed-from-machine-file"
 
 @dataclass(frozen=True, slots=True)
 class RecorderStatus:
-    """Where a recorder stands; counts since it was started.
-
-    Attributes
-    ----------
-    state : str
-        ``idle`` (no message yet), ``recording`` or ``failing``.
-    problem : str
-        Why it is failing; empty otherwise.
-    file : str
-        Name of the file being written; empty between files.
-    received : int
-        Messages that arrived.
-    safe : int
-        Messages in complete chunks: they survive a killed recorder.
-    synced : int
-        Messages that the disk has confirmed: they survive a power failure as well.
-    dropped : int
-        Messages thrown away because the queue was full.
-    lost : int
-        Messages that had been taken and then could not be written, or vanished with their file.
-    files : int
-        Files closed.
-    failures : int
-        Attempts at writing that failed.
-    """
+    """Where a recorder stands; counts since it was started."""
 
     site: str
     machine: str
-    state: str = "idle"
-    problem: str = ""
-    file: str = ""
-    received: int = 0
-    safe: int = 0
-    synced: int = 0
-    dropped: int = 0
-    lost: int = 0
-    files: int = 0
-    failures: int = 0
+    state: str = "idle"  # ``idle`` (no message yet), ``recording`` or ``failing``
+    problem: str = ""  # why it is failing; empty otherwise
+    file: str = ""  # name of the file being written; empty between files
+    received: int = 0  # messages that arrived
+    safe: int = 0  # messages in complete chunks: they survive a killed recorder
+    synced: int = 0  # messages that the disk has confirmed: they survive a power failure as well
+    dropped: int = 0  # messages thrown away because the queue was full
+    lost: int = 0  # messages that had been taken and then could not be written, or vanished with their file
+    files: int = 0  # files closed
+    failures: int = 0  # attempts at writing that failed
 
     @property
     def text(self) -> str:

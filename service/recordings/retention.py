@@ -24,34 +24,18 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class AlarmMark:
-    """An alarm event that a monitor committed.
+    """An alarm event that a monitor committed."""
 
-    Attributes
-    ----------
-    time_ns : int
-        When it was recorded, by the computer's clock.
-    text : str
-        What it was, for people.
-    """
-
-    time_ns: int
-    text: str
+    time_ns: int  # when it was recorded, by the computer's clock
+    text: str  # what it was, for people
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What retention decided.
+    """What retention decided."""
 
-    Attributes
-    ----------
-    kept : dict of str to str
-        Files that an alarm keeps, by name, with the alarm.
-    dropped : tuple of (Recording, str)
-        Files to be deleted, with the limit they exceed.
-    """
-
-    kept: dict[str, str]
-    dropped: tuple[tuple[Recording, str], ...]
+    kept: dict[str, str]  # files that an alarm keeps, by name, with the alarm
+    dropped: tuple[tuple[Recording, str], ...]  # files to be deleted, with the limit they exceed
 
 
 def decide(

@@ -13,21 +13,13 @@ _MOST_ODD = 16
 
 @dataclass(frozen=True, slots=True)
 class RawBlock:
-    """One message of the stream as it arrived.
-
-    Attributes
-    ----------
-    source : str
-        Of which session's publisher it is, empty if it does not say.
-    dropped_before : int
-        Messages that arrived before it and were thrown away because the queue was full.
-    """
+    """One message of the stream as it arrived."""
 
     payload: bytes
     attachment: bytes
     encoding: str
-    source: str = ""
-    dropped_before: int = 0
+    source: str = ""  # of which session's publisher it is, empty if it does not say
+    dropped_before: int = 0  # messages that arrived before it and were thrown away because the queue was full
 
     @property
     def sender(self) -> tuple[str, str, int | None]:

@@ -40,35 +40,19 @@ _Publisher = zenoh.Publisher | zenoh.ext.AdvancedPublisher
 
 @dataclass(frozen=True, slots=True)
 class NetworkPlan:
-    """How recordings are replayed onto the network.
-
-    Attributes
-    ----------
-    everything : bool
-        Every recorded key, not only what a machine sends: stream, descriptor and truth.
-    prefix : str
-        What goes before every key; with several passes, the number of the pass comes after it.
-    pace : float or None
-        Seconds of data per second; None is as fast as subscribers take it.
-    passes : int or None
-        Repetitions; None is without end.
-    from_ns, to_ns : int
-        Times of the data.
-    wait_for_subscriber_s : float
-        Hold the first message of a pass back at most this long.
-    linger_s : float
-        How long a pass stays open after its last message, so that a subscriber can fetch what it missed.
-    """
+    """How recordings are replayed onto the network."""
 
     link: LinkSettings
     machines: tuple[MachineKeys, ...]
-    everything: bool
-    prefix: str
-    pace: float | None
-    passes: int | None
+    everything: bool  # every recorded key, not only what a machine sends: stream, descriptor and truth
+    prefix: str  # what goes before every key; with several passes, the number of the pass comes after it
+    pace: float | None  # seconds of data per second; None is as fast as subscribers take it
+    passes: int | None  # repetitions; None is without end
+    # Times of the data.
     from_ns: int
     to_ns: int
-    wait_for_subscriber_s: float = 0.0
+    wait_for_subscriber_s: float = 0.0  # hold the first message of a pass back at most this long
+    # How long a pass stays open after its last message, so that a subscriber can fetch what it missed.
     linger_s: float = 2.0
 
     def prefix_of(self, number: int) -> str:
@@ -99,21 +83,12 @@ class _PatientLink(LinkSettings):
 
 @dataclass(frozen=True, slots=True)
 class ReplayTarget:
-    """Where a replay goes.
+    """Where a replay goes."""
 
-    Attributes
-    ----------
-    machines : sequence of (MachineKeys, bytes or None)
-        Machines whose messages are replayed, each with its recorded channel descriptor.
-    prefix : str
-        What goes before every key; empty is the original keys.
-    wait : bool
-        Subscribers slow the replay down instead of missing messages.
-    """
-
+    # Machines whose messages are replayed, each with its recorded channel descriptor.
     machines: Sequence[tuple[MachineKeys, bytes | None]]
-    prefix: str
-    wait: bool
+    prefix: str  # what goes before every key; empty is the original keys
+    wait: bool  # subscribers slow the replay down instead of missing messages
 
     def key(self, key: str) -> str:
         """Key under the prefix."""

@@ -57,35 +57,21 @@ class _Declared(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MachineCallbacks:
-    """What a machine's link calls, each on a thread of Zenoh's: be short.
+    """What a machine's link calls, each on a thread of Zenoh's: be short."""
 
-    Attributes
-    ----------
-    on_block : callable
-        Takes a message of the stream.
-    on_missed : callable
-        Takes the number of messages that were lost on the way and could not be fetched again.
-    on_descriptor : callable
-        Takes a channel descriptor (JSON) that a publisher announced.
-    on_publisher : callable
-        Takes whether a publisher is alive.
-    health, alarm_state : callable
-        Return the present answer (JSON) to a query.
-    alarm_events : callable
-        Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
-        time; what it raises is told to whoever asked.
-    on_replay : callable
-        Takes whether a replay is announced on the machine's own keys. Anybody may announce one, so the stream is handed
-        on all the same, but for blocks that say themselves that they are replayed.
-    """
-
-    on_block: Callable[[RawBlock], None]
+    on_block: Callable[[RawBlock], None]  # takes a message of the stream
+    # Takes the number of messages that were lost on the way and could not be fetched again.
     on_missed: Callable[[int], None]
-    on_descriptor: Callable[[bytes], None]
-    on_publisher: Callable[[bool], None]
+    on_descriptor: Callable[[bytes], None]  # takes a channel descriptor (JSON) that a publisher announced
+    on_publisher: Callable[[bool], None]  # takes whether a publisher is alive
+    # Return the present answer (JSON) to a query.
     health: Callable[[], str]
     alarm_state: Callable[[], str]
+    # Takes a sequence number and a limit, returns (JSON) at most so many alarm events after that number. May take its
+    # time; what it raises is told to whoever asked.
     alarm_events: Callable[[int, int], str]
+    # Takes whether a replay is announced on the machine's own keys. Anybody may announce one, so the stream is handed
+    # on all the same, but for blocks that say themselves that they are replayed.
     on_replay: Callable[[bool], None] = lambda _: None
 
 

@@ -42,18 +42,10 @@ _LONGEST_ERROR = 500
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The computer's clocks; a test puts others in.
+    """The computer's clocks; a test puts others in."""
 
-    Attributes
-    ----------
-    monotonic_s : callable
-        Seconds that only pass.
-    utc_ns : callable
-        Time of day.
-    """
-
-    monotonic_s: Callable[[], float] = time.monotonic
-    utc_ns: Callable[[], int] = time.time_ns
+    monotonic_s: Callable[[], float] = time.monotonic  # seconds that only pass
+    utc_ns: Callable[[], int] = time.time_ns  # time of day
 
 
 class MachineWorker:

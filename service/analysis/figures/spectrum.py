@@ -38,23 +38,13 @@ _ORDERS = (1, 2)
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """How spectra are taken and shown.
-
-    Attributes
-    ----------
-    scaling : str
-        ``amplitude`` or ``density``.
-    log : bool
-        Whether amplitudes are on a logarithmic scale.
-    to_hz : float or None
-        Highest frequency shown; None is as far as there is something to be seen.
-    """
+    """How spectra are taken and shown."""
 
     window_s: float
     resolution_hz: float
-    scaling: Scaling
-    log: bool
-    to_hz: float | None = None
+    scaling: Scaling  # ``amplitude`` or ``density``
+    log: bool  # whether amplitudes are on a logarithmic scale
+    to_hz: float | None = None  # highest frequency shown; None is as far as there is something to be seen
 
     def __post_init__(self) -> None:
         if self.to_hz is not None and self.to_hz < 4 * self.resolution_hz:

@@ -67,21 +67,11 @@ _STYLE = {
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """What the command line says of the picture itself.
+    """What the command line says of the picture itself."""
 
-    Attributes
-    ----------
-    title : str or None
-        Instead of the picture's own.
-    size_in : (float, float) or None
-        Width and height, inches; the kind's own if left out.
-    dpi : float
-        Pixels per inch of a PNG.
-    """
-
-    title: str | None = None
-    size_in: tuple[float, float] | None = None
-    dpi: float = 120.0
+    title: str | None = None  # instead of the picture's own
+    size_in: tuple[float, float] | None = None  # width and height, inches; the kind's own if left out
+    dpi: float = 120.0  # pixels per inch of a PNG
 
 
 Paint = Callable[[Look], Figure]

@@ -15,42 +15,23 @@ from service.monitor.reports import Identity
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """The machine that a snapshot is of.
-
-    Attributes
-    ----------
-    known : Machine or None
-        The machine with all its parameters.
-    """
+    """The machine that a snapshot is of."""
 
     identity: Identity
     machine: MachineFile
-    known: Machine | None
+    known: Machine | None  # the machine with all its parameters
 
 
 @dataclass(frozen=True, slots=True)
 class LatestData:
-    """What a monitor holds at one moment; nothing in it is changed afterwards.
+    """What a monitor holds at one moment; nothing in it is changed afterwards."""
 
-    Attributes
-    ----------
-    window : WindowStatistics or None
-        The latest full window.
-    filled : float
-        Fraction of a full window that is there now.
-    parameters : tuple of Parameter
-        Readings of that window by the diagnostician that decides; empty if it was not evaluated.
-    why_not : str
-        Why it was not evaluated.
-    blocks : tuple of SampleBlock
-        The newest blocks, without a gap.
-    """
-
-    window: WindowStatistics | None = None
-    filled: float = 0.0
+    window: WindowStatistics | None = None  # the latest full window
+    filled: float = 0.0  # fraction of a full window that is there now
+    # Readings of that window by the diagnostician that decides; empty if it was not evaluated.
     parameters: tuple[Parameter, ...] = ()
-    why_not: str = ""
-    blocks: tuple[SampleBlock, ...] = ()
+    why_not: str = ""  # why it was not evaluated
+    blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
 
 
 class Heading(Identity):

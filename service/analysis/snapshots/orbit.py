@@ -26,22 +26,12 @@ _NO_SPEED = "the speed of rotation is not known"
 
 @dataclass(frozen=True, slots=True)
 class _Vectors:
-    """Vectors q of x = Re{q e^{jθ}} in the window, SI, of all its states.
+    """Vectors q of x = Re{q e^{jθ}} in the window, SI, of all its states."""
 
-    Attributes
-    ----------
-    mean : ndarray, shape (n,)
-    hops : ndarray, shape (n_hops, n)
-        The same of every hop; their scatter gives standard errors.
-    direction : int
-        1 if θ grows, -1 if it falls.
-    absolute : bool
-        Whether θ is the shaft's own angle; else it begins anywhere, and which way the shaft turns is not known.
-    """
-
-    mean: ComplexArray
-    hops: ComplexArray
-    direction: int
+    mean: ComplexArray  # (n,)
+    hops: ComplexArray  # (n_hops, n), the same of every hop; their scatter gives standard errors
+    direction: int  # 1 if θ grows, -1 if it falls
+    # Whether θ is the shaft's own angle; else it begins anywhere, and which way the shaft turns is not known.
     absolute: bool
 
 

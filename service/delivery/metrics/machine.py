@@ -17,23 +17,13 @@ _RECORDER_STATES = ("off", "idle", "recording", "failing")
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """A machine at the moment of asking.
-
-    Attributes
-    ----------
-    busy_s : float
-        How long its thread has been at work on the same block.
-    recorder : RecorderStatus or None
-        None if it is not recorded.
-    events : mapping of str to int
-        Alarm events since the start, by kind.
-    """
+    """A machine at the moment of asking."""
 
     worker: MachineWorker
     health: Health
-    busy_s: float
-    recorder: RecorderStatus | None
-    events: Mapping[str, int]
+    busy_s: float  # how long its thread has been at work on the same block
+    recorder: RecorderStatus | None  # None if it is not recorded
+    events: Mapping[str, int]  # alarm events since the start, by kind
 
     @property
     def place(self) -> tuple[str, str]:

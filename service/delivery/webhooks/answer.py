@@ -27,19 +27,11 @@ class Meaning(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """An attempt's outcome.
-
-    Attributes
-    ----------
-    text : str
-        In a few words; empty if delivered.
-    retry_after_s : float
-        How long the receiver wishes to be left alone, in seconds.
-    """
+    """An attempt's outcome."""
 
     meaning: Meaning
-    text: str = ""
-    retry_after_s: float = 0.0
+    text: str = ""  # in a few words; empty if delivered
+    retry_after_s: float = 0.0  # how long the receiver wishes to be left alone, in seconds
 
 
 def answer_of(status: int, headers: Mapping[str, str], now_s: float) -> Answer:

@@ -10,17 +10,7 @@ from rotorwatch.records.alarms import AlarmState, EventKind, Evidence, Severity,
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """One alarm of a machine; what a `rotorwatch.records.alarms.Alarm` has as well is described there.
-
-    Attributes
-    ----------
-    beyond_ns, small_ns : int or None
-        Since when the readings have asked for the condition to begin, or to end: the delays run.
-    rules : tuple of str
-        Identities of the rules that suppress it now; empty if none, whatever the state.
-    owed : AlarmState
-        While suppressed: where it comes back to without its condition, because somebody has to acknowledge or reset.
-    """
+    """One alarm of a machine; fields that it shares with `rotorwatch.records.alarms.Alarm` are described there."""
 
     name: str
     state: AlarmState = AlarmState.NORMAL
@@ -29,6 +19,7 @@ class Alarm:
     since_ns: int = 0
     raised_ns: int | None = None
     occurrence: int = 0
+    # Since when the readings have asked for the condition to begin, or to end: the delays run.
     beyond_ns: int | None = None
     small_ns: int | None = None
     change: float | None = None
@@ -37,10 +28,11 @@ class Alarm:
     note: str = ""
     evidence: Evidence | None = None
     shelf: Shelf | None = None
-    rules: tuple[str, ...] = ()
+    rules: tuple[str, ...] = ()  # identities of the rules that suppress it now; empty if none, whatever the state
     suppressed_by: str = ""
     out_of_service_by: str = ""
     out_of_service_reason: str = ""
+    # While suppressed: where it comes back to without its condition, because somebody has to acknowledge or reset.
     owed: AlarmState = AlarmState.NORMAL
     version: int = -1
 
@@ -57,18 +49,12 @@ class Alarm:
 
 @dataclass(frozen=True, slots=True)
 class AlarmEvent:
-    """One entry of the log: what happened to an alarm.
-
-    Attributes
-    ----------
-    alarm : Alarm
-        As it is afterwards.
-    """
+    """One entry of the log: what happened to an alarm."""
 
     kind: EventKind
     time_ns: int
     sequence: int
-    alarm: Alarm
+    alarm: Alarm  # as it is afterwards
     before: AlarmState = AlarmState.NORMAL
     actor: str = ""
     reason: str = ""

@@ -36,27 +36,14 @@ class NotInTime(RotorwatchError):  # noqa: N818
 
 @dataclass(frozen=True, slots=True)
 class OperatorAction:
-    """Something an operator wants done to an alarm.
-
-    Attributes
-    ----------
-    actor, reason : str
-        Who, and why; a reason is needed for shelving and for taking out of service.
-    duration_s : float or None
-        For how long to shelve; None: as long as the machine file allows.
-    one_shot : bool
-        Shelve only until the condition clears.
-    expected_state : str or None
-        State in which the operator saw it.
-    expected_version : int or None
-        Its `version` when the operator saw it.
-    """
+    """Something an operator wants done to an alarm."""
 
     kind: OperationKind
     alarm: str
+    # Who, and why; a reason is needed for shelving and for taking out of service.
     actor: str
     reason: str = ""
-    duration_s: float | None = None
-    one_shot: bool = False
-    expected_state: str | None = None
-    expected_version: int | None = None
+    duration_s: float | None = None  # for how long to shelve; None: as long as the machine file allows
+    one_shot: bool = False  # shelve only until the condition clears
+    expected_state: str | None = None  # state in which the operator saw it
+    expected_version: int | None = None  # its `version` when the operator saw it

@@ -22,19 +22,13 @@ _LATEST_NS = 2**63
 
 @dataclass(frozen=True, slots=True)
 class DataSpan:
-    """Data of a machine in a recording.
+    """Data of a machine in a recording."""
 
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        Beginning of the earliest and end of the latest data.
-    first_ns, newest_ns : int
-        Beginning of what was recorded first, and end of what was recorded last; others than the earliest and latest
-        where the publisher was started again at an earlier time, or its clock was set.
-    """
-
+    # Beginning of the earliest and end of the latest data.
     start_ns: int
     end_ns: int
+    # Beginning of what was recorded first, and end of what was recorded last; others than the earliest and latest where
+    # the publisher was started again at an earlier time, or its clock was set.
     first_ns: int
     newest_ns: int
 

@@ -41,18 +41,10 @@ class TooManyReplaysError(ReplayJobError):
 
 @dataclass(frozen=True, slots=True)
 class JobPlan:
-    """A job as it is to be started.
+    """A job as it is to be started."""
 
-    Attributes
-    ----------
-    job : ReplayJob
-        What the API says of it; id, state, times and results are filled in.
-    arguments : tuple of str
-        Of ``rotorwatch replay``: files and options other than those for the output.
-    """
-
-    job: ReplayJob
-    arguments: tuple[str, ...]
+    job: ReplayJob  # what the API says of it; id, state, times and results are filled in
+    arguments: tuple[str, ...]  # of ``rotorwatch replay``: files and options other than those for the output
 
 
 class ReplayJobs:

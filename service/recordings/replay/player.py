@@ -23,25 +23,14 @@ class Sink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PlayPlan:
-    """What is replayed, and how fast.
+    """What is replayed, and how fast."""
 
-    Attributes
-    ----------
-    keys : collection of str or None
-        Only these keys; None is everything.
-    pace : float or None
-        Seconds of data per second; None is as fast as the sink takes it.
-    from_ns, to_ns : int
-        Times of the data: from `from_ns` up to, and without, `to_ns`.
-    pass_number : int
-        Which repetition this is, from 1.
-    """
-
-    keys: Collection[str] | None
-    pace: float | None
+    keys: Collection[str] | None  # only these keys; None is everything
+    pace: float | None  # seconds of data per second; None is as fast as the sink takes it
+    # Times of the data: from `from_ns` up to, and without, `to_ns`.
     from_ns: int
     to_ns: int
-    pass_number: int = 1
+    pass_number: int = 1  # which repetition this is, from 1
 
 
 def play(
