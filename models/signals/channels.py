@@ -168,6 +168,11 @@ class Channel(BaseModel, extra="forbid", frozen=True):
         """Factor that turns samples into SI units."""
         return UNIT_TO_SI[self.quantity][self.unit]
 
+    @property
+    def si_unit(self) -> str:
+        """SI unit of the quantity."""
+        return next(unit for unit, factor in UNIT_TO_SI[self.quantity].items() if factor == 1.0)
+
 
 class Sensor(Channel):
     """A channel, and what is known of its sensor besides: its run-out, as it shows when the shaft turns slowly."""

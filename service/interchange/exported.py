@@ -16,7 +16,7 @@ from models.errors import RecordingError, WireError
 from models.mistakes import mistakes
 from models.physics.rotor import PARAMETER_TEXT
 from models.signals.block import SampleBlock
-from models.signals.channels import ChannelDescriptor, Quantity
+from models.signals.channels import ChannelDescriptor
 from models.signals.keys import PREFIX
 from models.signals.recording import RecordedMessage, read_recording, summarize_recording
 from models.signals.wire import decode_block
@@ -26,14 +26,6 @@ from rotorwatch.records.health import MEASURES, Report
 _ROWS = 65536
 _MESSAGES = 1000
 _Row = dict[str, object]
-_SI_UNITS = {
-    Quantity.DISPLACEMENT: "m",
-    Quantity.VELOCITY: "m/s",
-    Quantity.ACCELERATION: "m/s2",
-    Quantity.TILT: "rad",
-    Quantity.TILT_RATE: "rad/s",
-    Quantity.SHAFT_ANGLE: "rad",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +93,7 @@ def stream_table(selection: Selection) -> Table:
     for channel in descriptor.channels:
         factors.append(channel.to_si if selection.si else 1.0)
         kind = pa.float32() if descriptor.dtype == "float32" and not selection.si else pa.float64()
-        unit = _SI_UNITS[channel.quantity] if selection.si else channel.unit
+        unit = channel.si_unit if selection.si else channel.unit
         place = f"{channel.quantity}, {channel.location}, {channel.way}"
         fields.append(_field(channel.name, kind, unit, place))
     metadata = {

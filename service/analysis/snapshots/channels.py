@@ -15,14 +15,6 @@ MOST_PAIRS = 8
 """Pairs in a snapshot that no pair was asked for."""
 _MOST_CHANNELS = 64
 _DIGITS = 6
-_SI_UNITS = {
-    Quantity.DISPLACEMENT: "m",
-    Quantity.VELOCITY: "m/s",
-    Quantity.ACCELERATION: "m/s2",
-    Quantity.TILT: "rad",
-    Quantity.TILT_RATE: "rad/s",
-    Quantity.SHAFT_ANGLE: "rad",
-}
 
 
 class SnapshotError(RotorwatchError):
@@ -56,7 +48,7 @@ def chosen_channels(machine: MachineFile, names: Sequence[str], field: str = "ch
             )
     if names:
         return tuple(there[name] for name in dict.fromkeys(names))
-    for quantity in _SI_UNITS:
+    for quantity in Quantity:
         found = tuple(channel for channel in there.values() if channel.quantity is quantity)
         if found:
             return found
@@ -113,11 +105,6 @@ def seen_by(channels: Sequence[Channel]) -> tuple[tuple[str, ...], FloatArray | 
     return states, np.array([[each.get(state, 0.0) for state in states] for each in parts])
 
 
-def si_unit(channel: Channel) -> str:
-    """SI unit of a channel's quantity."""
-    return _SI_UNITS[channel.quantity]
-
-
 def product_unit(first: Channel, second: Channel, units: Units) -> tuple[str, float]:
     """Unit of a product of two channels' samples, and the factor from SI to it.
 
@@ -127,7 +114,7 @@ def product_unit(first: Channel, second: Channel, units: Units) -> tuple[str, fl
     >>> product_unit(probe, probe, "channel")[0], product_unit(probe, probe, "SI")
     ('um^2', ('m^2', 1.0))
     """
-    one, other = (channel.unit if units == "channel" else si_unit(channel) for channel in (first, second))
+    one, other = (channel.unit if units == "channel" else channel.si_unit for channel in (first, second))
     factor = 1.0 if units == "SI" else 1 / (first.to_si * second.to_si)
     if one == other:
         return (f"({one})^2" if "/" in one else f"{one}^2"), factor
