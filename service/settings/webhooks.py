@@ -1,26 +1,13 @@
 """Settings of webhooks: who is told of alarm events, of which, and how patiently."""
 
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 from urllib.parse import SplitResult, urlsplit
 
 from pydantic import BaseModel, Field, model_validator
 
 from models.signals.link import is_loopback
-
-WebhookKind = Literal[
-    "raised",
-    "escalated",
-    "cleared",
-    "acknowledged",
-    "reset",
-    "shelved",
-    "unshelved",
-    "suppressed",
-    "unsuppressed",
-    "removed-from-service",
-    "returned-to-service",
-]
+from rotorwatch.records.alarms import EventKind, Severity
 
 
 class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_errors=True):
@@ -50,10 +37,8 @@ class WebhookSettings(BaseModel, extra="forbid", frozen=True, hide_input_in_erro
     machines: tuple[str, ...] = Field(
         default=("*/*",), min_length=1, description="only of these machines, as site/machine with * and ?"
     )
-    kinds: tuple[WebhookKind, ...] = Field(default=(), description="only these kinds of event; all if left out")
-    severities: tuple[Literal["alert", "danger"], ...] = Field(
-        default=(), description="only of these severities; all if left out"
-    )
+    kinds: tuple[EventKind, ...] = Field(default=(), description="only these kinds of event; all if left out")
+    severities: tuple[Severity, ...] = Field(default=(), description="only of these severities; all if left out")
     annunciated_only: bool = Field(
         default=False, description="leave out what happens to alarms that are shelved, suppressed or out of service"
     )

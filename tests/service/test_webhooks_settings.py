@@ -5,7 +5,6 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import get_args
 
 import httpx
 import pytest
@@ -13,14 +12,13 @@ import typer
 from typer.testing import CliRunner
 
 from models.errors import MachineFileError
-from rotorwatch.records.alarms import EventKind, Severity
 from service.commands import webhook as webhook_commands
 from service.delivery.webhooks.answer import Answer, Meaning, answer_of, no_answer, pause_s
 from service.delivery.webhooks.receiver import Receiver
 from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
 from service.runtime import Runtime
 from service.settings.service import load_settings
-from service.settings.webhooks import WebhookKind, WebhookSettings
+from service.settings.webhooks import WebhookSettings
 from tests.service.hooked import Got, Hook, hook, settings_for
 from tests.service.live import (
     ROOT,
@@ -102,12 +100,6 @@ def test_mistakes_are_named_and_show_no_secret(tmp_path: Path, old: str, new: st
 def test_http_elsewhere_only_if_it_is_said() -> None:
     fields = {"name": "a", "url": "http://pager.example/", "secret_variable": "S", "insecure": True}
     assert WebhookSettings.model_validate(fields).target == "http://pager.example"
-
-
-def test_kinds_and_severities_are_those_of_alarms() -> None:
-    assert list(get_args(WebhookKind)) == [kind.value for kind in EventKind]
-    severities = WebhookSettings.model_fields["severities"].annotation
-    assert list(get_args(get_args(severities)[0])) == [severity.value for severity in Severity]
 
 
 def test_every_setting_is_documented() -> None:
