@@ -5,10 +5,10 @@ which only healthy recordings are known is compared with its baseline (`Baseline
 no equation, each channel with its own healthy form.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -104,21 +104,27 @@ class Evaluation:
         )
 
 
-class WindowEvaluator(Protocol):
-    """Evaluates the windows of one machine."""
+class WindowEvaluator(ABC):
+    """Evaluates the windows of one machine.
+
+    Unless it says otherwise, each evaluation stands for itself: only the whole window is taken, and nothing is
+    remembered of it.
+    """
+
+    takes_short: bool = False
+    """Whether stretches shorter than the window can be evaluated."""
 
     @property
+    @abstractmethod
     def by(self) -> str:
         """Name of the diagnostician that decides."""
 
     @property
-    def takes_short(self) -> bool:
-        """Whether stretches shorter than the window can be evaluated."""
-
-    @property
+    @abstractmethod
     def needs_lags(self) -> bool:
         """Whether correlations are needed at all lags, or at lag zero alone."""
 
+    @abstractmethod
     def evaluate(self, window: WindowStatistics, short: Mapping[int, WindowStatistics]) -> Evaluation:
         """Evaluate one window.
 
@@ -137,6 +143,7 @@ class WindowEvaluator(Protocol):
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Everything that the next evaluations depend on, as named arrays; empty if each stands for itself."""
+        return {}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on where `checkpoint` was called: the next evaluations are the same to the last bit.
@@ -146,6 +153,8 @@ class WindowEvaluator(Protocol):
         CheckpointError
             If the arrays are not those of such an evaluator of this machine; nothing is changed then.
         """
+        if arrays:
+            raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
 
 
 def evaluator_for(installed: Installed) -> WindowEvaluator:
@@ -159,22 +168,7 @@ def evaluator_for(installed: Installed) -> WindowEvaluator:
     return BaselineEvaluator(installed.machine, commissioned)
 
 
-class _Unremembering:
-    """Whose evaluations each stand for themselves: only the whole window is taken, and nothing is remembered of it."""
-
-    takes_short = False
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Nothing."""
-        return {}
-
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Go on where `checkpoint` was called, see `WindowEvaluator`."""
-        if arrays:
-            raise CheckpointError(f"{', '.join(sorted(arrays))} is of another diagnostician")
-
-
-class NoEvaluator(_Unremembering):
+class NoEvaluator(WindowEvaluator):
     """Of a machine of which nothing is known: its levels are watched, and nothing is diagnosed."""
 
     by = "nobody"
@@ -186,7 +180,7 @@ class NoEvaluator(_Unremembering):
         raise EstimationError("only vibration levels are watched: the machine is neither known nor commissioned")
 
 
-class KnownMachineEvaluator:
+class KnownMachineEvaluator(WindowEvaluator):
     """Compares the windows of one machine with theory.
 
     Parameters
@@ -296,7 +290,7 @@ class KnownMachineEvaluator:
         return stated if self._shared is None else with_shared_error(stated, self._shared)
 
 
-class BaselineEvaluator(_Unremembering):
+class BaselineEvaluator(WindowEvaluator):
     """Compares the windows of one machine with what was learned on it when it was healthy.
 
     Parameters
