@@ -30,8 +30,6 @@ from itertools import combinations
 from models.ingest import EARLIER_COURSES, Course
 from models.signals.block import SampleBlock
 
-_ALWAYS_NS = 2**63  # later than any time of a block
-
 
 @dataclass(frozen=True, slots=True)
 class Arrived:
@@ -124,10 +122,6 @@ class Arrivals:
             self._next = min(self._waiting)
             found += self._continued()
         return tuple(found)
-
-    def expect(self, run: int, sequence: int) -> None:
-        """Go on in a stream of which everything before a block is there already."""
-        self.resume((Course(run, 0, -_ALWAYS_NS, sequence, _ALWAYS_NS),))
 
     def resume(self, courses: Iterable[Course]) -> None:
         """Go on where a restored gate stands."""

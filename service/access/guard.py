@@ -43,9 +43,6 @@ from service.history.shared import AuditLog, TokenStore
 from service.settings.access import AccessSettings
 from service.terminal.logs import Limiter, logger
 
-ACCESS_PROBLEMS = (401, 403, 429, 503)
-"""What any guarded route may answer besides its own; those that take a body also 413 and 415."""
-
 _log = logger(part="access")
 _KNOWN_TOKENS = 1_000
 _WITHOUT_DATABASE_S = 900.0

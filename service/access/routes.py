@@ -29,15 +29,6 @@ def declared_scopes(app: FastAPI, endpoint: Callable[..., Any] | None) -> frozen
     return frozenset(found)
 
 
-def undeclared_routes(app: FastAPI) -> list[str]:
-    """Routes that declare no scope and are not public, as ``GET /path``; there should be none."""
-    return sorted(
-        _title(context)
-        for context in iter_route_contexts(app.routes)
-        if not _scopes(context) and not (context.path in PUBLIC_PATHS and context.methods == {"GET"})
-    )
-
-
 def unguarded_routes(app: FastAPI, gate: Callable[..., Any]) -> list[str]:
     """Routes before which `gate` does not stand: static files, sockets, mounted programs, or routes without it."""
     return sorted(

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Protocol
 
 import zenoh
 import zenoh.ext
@@ -24,7 +23,7 @@ from rotorwatch.records.replays import ReplayProgress
 from service.recordings.replay.control import Control
 from service.recordings.replay.player import PlayPlan, play
 from service.recordings.replay.source import RecordingSource
-from service.stream.transport import Link
+from service.stream.transport import Declared, Link
 
 _JSON = "application/json"
 _CACHE_STREAM = 300
@@ -66,10 +65,6 @@ class NetworkPlan:
 
 class LiveMachineError(RotorwatchError):
     """A replay on the original keys would meet a live machine; the message says which."""
-
-
-class _Declared(Protocol):
-    def undeclare(self) -> object: ...
 
 
 class _PatientLink(LinkSettings):
@@ -204,7 +199,7 @@ class ReplayLink:
             raise RuntimeError("no pass was begun")
         return self._target
 
-    def _keep(self, declared: _Declared) -> None:
+    def _keep(self, declared: Declared) -> None:
         self._undo.callback(declared.undeclare)
 
     def _publisher(self, key: str) -> _Publisher:

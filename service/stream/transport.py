@@ -51,8 +51,11 @@ class LinkError(RotorwatchError):
     """No Zenoh session with these endpoints; the message names them."""
 
 
-class _Declared(Protocol):
-    def undeclare(self) -> object: ...
+class Declared(Protocol):
+    """What Zenoh gives for a declaration."""
+
+    def undeclare(self) -> object:
+        """Take it back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +174,7 @@ class MachineLink:
     def _declare(self, session: zenoh.Session, undo: ExitStack, wait_when_full: bool) -> None:
         keys, guarded = self._keys, self._link.guarded
 
-        def keep(declared: _Declared) -> None:
+        def keep(declared: Declared) -> None:
             undo.callback(declared.undeclare)
 
         self._report = session.declare_publisher(

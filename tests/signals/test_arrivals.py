@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from models.arrivals import Arrivals
-from models.ingest import Gate, Reason
+from models.ingest import Course, Gate, Reason
 from models.machine import load_machine
 from models.signals.block import SampleBlock
 
@@ -253,7 +253,7 @@ def test_blocks_of_odd_form_keep_their_place() -> None:
 
 def test_a_restored_gate_says_what_is_expected() -> None:
     arrivals = Arrivals(3)
-    arrivals.expect(run=1, sequence=7)
+    arrivals.resume((Course(1, 0, -(2**63), 7, 2**63),))
     assert len(arrivals.take(block(3))) == 1  # there already
     assert arrivals.take(block(8)) == ()
     assert [arrived.block.sequence for arrived in arrivals.take(block(7))] == [7, 8]
