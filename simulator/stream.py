@@ -97,7 +97,7 @@ def descriptor_payload(machine: MachineFile) -> bytes:
 
 # 2026-01-01T00:00:00Z: a fixed start, so that the same scenario makes the same bytes.
 DEFAULT_START_NS = 1_767_225_600_000_000_000
-_PIECE_S = 0.5
+_PIECE = 4000  # samples that are simulated at a time
 
 
 def blocks(
@@ -182,14 +182,13 @@ class _Simulation:
             timeline.sensor_faults,
             [np.random.default_rng(seed) for seed in sensor_seeds],
         )
-        self._piece = max(1, round(_PIECE_S * machine.rate_hz))
         self._made = self._taken = 0
         self._rest = np.empty((0, len(machine.sensors)), dtype=machine.dtype)
 
     def skip(self, first: int) -> None:
         """Go on to a sample; the machine moves meanwhile."""
         while self._taken < first:
-            self.take(min(self._piece, first - self._taken))
+            self.take(min(_PIECE, first - self._taken))
 
     def take(self, n_samples: int) -> npt.NDArray[np.float32] | FloatArray:
         """Next samples of all channels."""
@@ -208,7 +207,7 @@ class _Simulation:
         if self._conditions and self._conditions[0][0] == first:
             self._past.append(self._conditions.popleft())
             self._plant.change(self._past[-1][1])
-        end = (first // self._piece + 1) * self._piece
+        end = (first // _PIECE + 1) * _PIECE
         if self._conditions:
             end = min(end, self._conditions[0][0])
         self._made = end

@@ -253,10 +253,17 @@ class SlidingWindow:
 
     The same samples give the same hops, whatever blocks they come in. A gap costs the hop it falls into; earlier hops
     stay until the window's allowed span has passed.
+
+    Parameters
+    ----------
+    plan : Plan
+    remembered : bool
+        Whether `checkpoint` will be asked for: the samples of every hop have their digest taken then.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: Plan, *, remembered: bool = False) -> None:
         self.plan = plan
+        self._remembered = remembered
         self._hops: deque[HopMoments] = deque(maxlen=plan.hops)
         self._pieces: deque[Piece] = deque(maxlen=plan.hops)  # what each of them is made of
         self._pending: list[FloatArray] = []
@@ -333,9 +340,11 @@ class SlidingWindow:
         hop = hop_moments(self.plan, samples, self._level, start_ns)
         while self._hops and hop.end_ns - self._hops[0].start_ns > self.plan.max_span_ns:
             self._hops.popleft()
-            self._pieces.popleft()
+            if self._remembered:
+                self._pieces.popleft()
         self._hops.append(hop)
-        self._pieces.append(Piece(start_ns, block_ns, row, samples.shape[0], digest_of(samples)))
+        if self._remembered:
+            self._pieces.append(Piece(start_ns, block_ns, row, samples.shape[0], digest_of(samples)))
         return hop.end_ns
 
     def gap(self) -> None:
@@ -395,7 +404,14 @@ class SlidingWindow:
         ----------
         whole : bool
             With moments and samples, megabytes; otherwise the same samples have to be taken again with `recall`.
+
+        Raises
+        ------
+        ValueError
+            If the window is not one that is remembered.
         """
+        if not self._remembered:
+            raise ValueError("the window takes no digests: it cannot be remembered")
         if self._recall is not None:
             return dict(self._recall.arrays)
         pending = np.concatenate(self._pending) if self._pending else np.empty((0, self.plan.width))

@@ -71,7 +71,7 @@ class MachineMonitor:
         self._due: deque[Arrived] = deque()
         self._done: list[MonitorReport] = []
         self._gate = Gate(machine)
-        self._window = SlidingWindow(self._plan)
+        self._window = SlidingWindow(self._plan, remembered=True)
         settings = SequentialSettings.for_machine(machine, short=self._evaluator.takes_short)
         self._test = SequentialTest(settings, by=self._evaluator.by)
         self._alarms = AlarmBook(machine.alarms)
