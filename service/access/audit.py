@@ -61,8 +61,6 @@ class AuditTrail:
         Refused requests of one address that are written down.
     clock_ns : callable
         Time of day, nanoseconds since 1970 UTC.
-    monotonic : callable
-        Monotonic seconds.
     """
 
     def __init__(

@@ -71,8 +71,6 @@ class Guard:
         Address that is listened on; a name of the service's.
     clock_ns : callable
         Time of day, nanoseconds since 1970 UTC.
-    monotonic : callable
-        Monotonic seconds.
 
     Attributes
     ----------

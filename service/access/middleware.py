@@ -45,8 +45,6 @@ class AccessMiddleware:
     ----------
     admit : callable
         Gives the caller of a request, or raises `HTTPException`.
-    body_bytes : int
-        Largest request body.
     """
 
     def __init__(

@@ -58,18 +58,10 @@ def responses(
 
     Parameters
     ----------
-    model : type
-        Of the answer.
     *problems : int
         Besides those that any request may meet.
-    status_code : int
-        Of the answer.
-    guarded : bool
-        Whether a token is needed.
     shown : object, optional
         Example, if not the one made of the examples of the model's fields.
-    headers : dict, optional
-        Of the answer, as OpenAPI has them.
     """
     answer: dict[str, Any] = {"content": {"application/json": {"example": example(model) if shown is None else shown}}}
     if headers is not None:

@@ -33,8 +33,6 @@ def examined(machine: MachineFile, messages: Sequence[RecordedMessage]) -> Arriv
 
     Parameters
     ----------
-    machine : MachineFile
-        What is expected.
     messages : sequence of RecordedMessage
         In the order of their arrival.
     """

@@ -168,8 +168,6 @@ class Recorded(Described):
         ----------
         longest_s : float, optional
             Length of a stretch, s; without it only gaps cut.
-        from_ns : int, optional
-            Only data from this time on.
         """
         names = [channel.name for channel in self.descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]

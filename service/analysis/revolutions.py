@@ -141,11 +141,6 @@ class NewestBlocks:
     """The newest accepted blocks of a stream, without a gap between them.
 
     One thread adds, any thread may read: what is read is replaced as a whole.
-
-    Parameters
-    ----------
-    length_s : float
-        Data that are kept, s.
     """
 
     def __init__(self, length_s: float = 10.0) -> None:

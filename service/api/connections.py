@@ -116,8 +116,6 @@ class HttpConnections:
 
     Parameters
     ----------
-    most : int
-        Connections in all.
     proxies : sequence of str
         Addresses and networks of whom only the connections in all count.
     plain : bool

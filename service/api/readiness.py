@@ -21,8 +21,6 @@ def readiness_of(
 
     Parameters
     ----------
-    session_open : bool
-        The Zenoh session is.
     history_open : bool
         The database is connected and its tables are up to date.
     history_trouble : str

@@ -181,8 +181,6 @@ class Database:
 
         Parameters
         ----------
-        limit_s : float
-            In seconds.
         connection : Connection, optional
             Otherwise one from the pool.
 

@@ -81,8 +81,6 @@ class HistoryFile:
 
         Parameters
         ----------
-        why : str
-            Part of the new name.
         only_opened : bool
             Leave what belongs to another file than was opened.
         """

@@ -145,8 +145,6 @@ class MachineStore:
             Only those with a sequence greater than `after`, less than `before`.
         since_ns, until_ns : int, optional
             Only those with since_ns ≤ time_ns < until_ns.
-        alarm, kind, severity : str, optional
-            Only those.
         limit, newest_first : int, bool
             At most so many, in this order.
         """

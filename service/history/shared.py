@@ -27,8 +27,6 @@ class AlarmLog:
         ----------
         site, name : str
             The machine; of one that has no history there are none.
-        recorded_ns : int
-            Only those recorded then or later.
 
         Raises
         ------

@@ -33,12 +33,8 @@ def export(
 
     Parameters
     ----------
-    what : {"stream", "reports", "alarms"}
-    kind : {"parquet", "csv", "mat"}
     out : Path
         What is written; nothing is left of it if that fails.
-    overwrite : bool
-        Replace a file that is already there.
 
     Returns
     -------

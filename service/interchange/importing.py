@@ -50,12 +50,8 @@ def import_file(
     ----------
     path : Path
         CSV, Parquet, .npz, .mat, WAV, UFF 58, TDMS or MF4; or a folder of such files.
-    machine : MachineFile
-        Whose stream it becomes.
     recording : Path
         What is written; nothing is left of it if the import fails.
-    overwrite : bool
-        Replace a recording that is already there.
 
     Raises
     ------

@@ -21,8 +21,6 @@ def descriptor_mismatch(announced: bytes, machine: MachineFile) -> tuple[str, ..
     ----------
     announced : bytes
         JSON from the ``descriptor`` key.
-    machine : MachineFile
-        What is expected.
 
     Returns
     -------

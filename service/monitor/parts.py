@@ -30,8 +30,6 @@ def divided(
     ----------
     hops : mapping of int to list
         `SequentialState.hops`.
-    kept : collection of str
-        Names of parts that are stored already.
     """
     large = {name: array for name, array in arrays.items() if array.nbytes >= _LARGE}
     names = {f"{_HOP}{end_ns:019}": came for end_ns, came in hops.items()}

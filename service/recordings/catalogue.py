@@ -57,13 +57,7 @@ class Catalogue:
         self._read: dict[Path, tuple[int, int, Recording]] = {}
 
     def recordings(self, site: str | None = None, machine: str | None = None) -> tuple[Recording, ...]:
-        """List recordings, sorted by site, machine and file name, which is by time.
-
-        Parameters
-        ----------
-        site, machine : str, optional
-            Only these; without one, all.
-        """
+        """List recordings, sorted by site, machine and file name, which is by time."""
         found: list[Recording] = []
         for folder in self._folders(site, machine):
             kept = kept_reasons(folder)

@@ -25,8 +25,6 @@ def recent_messages(files: Sequence[Path], key: str, since_ns: int) -> Iterator[
     ----------
     files : sequence of Path
         Oldest first. What a crash left may be completed, and so get another name, at the same time.
-    since_ns : int
-        Only those recorded since then.
     """
     for path in files:
         try:

@@ -72,8 +72,6 @@ def check_access(place: str, access: AccessSettings, host: str) -> None:
     ----------
     place : str
         Settings file, for the message.
-    host : str
-        ``host`` in ``[http]``.
 
     Raises
     ------

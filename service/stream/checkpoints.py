@@ -184,10 +184,6 @@ def restored(
 
     Parameters
     ----------
-    build : callable
-        Gives a new monitor.
-    identity : Identity
-        Of the machine, as it is now.
     next_sequence : int
         Number of the next alarm event, by the log.
 

@@ -260,11 +260,6 @@ def replay_to_network(
 ) -> int:
     """Publish recordings until the end of the last pass, or until `control` says stop.
 
-    Returns
-    -------
-    int
-        Number of messages published.
-
     Raises
     ------
     LinkError

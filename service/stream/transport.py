@@ -91,8 +91,6 @@ class Link:
 
     Parameters
     ----------
-    settings : LinkSettings
-        Role and endpoints.
     fail_fast : bool
         Give up when no endpoint in `connect` answers within three seconds. Otherwise a client tries for ten, and a
         peer for ever, in the background.
@@ -152,10 +150,6 @@ class MachineLink:
     ----------
     link : Link
         Open session; must outlive this object.
-    keys : MachineKeys
-        The machine's keys.
-    callbacks : MachineCallbacks
-        Where messages go.
     wait_when_full : bool
         `on_block` may wait, which slows the publisher down. It then runs on the network's own thread, and heartbeats of
         the publisher are not listened to: one that overtakes waiting blocks would make Zenoh skip them.
@@ -263,8 +257,6 @@ class MachineTap:
     ----------
     link : Link
         Open session; must outlive this object.
-    keys : MachineKeys
-        The machine's keys.
     on_message : callable
         Takes each message on a thread of Zenoh's: be short. Descriptors also come as answers to a query, at the start
         and whenever a publisher appears, so that one announced earlier is known.

@@ -58,7 +58,6 @@ class MachineWorker:
     ----------
     installed : Installed
         The machine file, and what was trained and commissioned for it.
-    queue : QueueSettings
     history : MachineStore
         Where everything is kept; what is there from an earlier run is gone on from.
     clocks : Clocks
@@ -231,8 +230,6 @@ class MachineWorker:
         ----------
         after : int
             -1 for the beginning.
-        limit : int
-            At most so many events.
 
         Raises
         ------

@@ -30,8 +30,6 @@ def correlation_snapshot(
     first, second : sequence of str
         Channels by name: the references, and as many responses; without `second` every channel with itself, without
         both a few pairs (`service.analysis.snapshots.channels.chosen_pairs`).
-    units : str
-        ``channel`` or ``SI``.
 
     Raises
     ------

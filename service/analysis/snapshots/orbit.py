@@ -42,8 +42,6 @@ def orbit_snapshot(subject: Subject, data: LatestData, revolutions: int = 0, uni
     ----------
     revolutions : int
         Whole revolutions to be shown as measured; none with 0.
-    units : str
-        ``channel`` or ``SI``.
 
     Raises
     ------

@@ -63,8 +63,6 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
         Pairs to be given with cross-spectrum and coherence; none without names.
     band_hz : tuple of float, optional
         Lines from and to, within those of the machine file's band.
-    units : str
-        ``channel`` or ``SI``.
 
     Raises
     ------

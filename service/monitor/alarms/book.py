@@ -171,8 +171,6 @@ class AlarmBook:
             Whether the parameter is among those found to have changed.
         taken_back : bool
             Whether a whole window after the change says that it is not.
-        low_confidence : bool
-            Whether the data are outside the model.
         note : str
             The change in words, where a number does not say all.
         """
@@ -208,12 +206,8 @@ class AlarmBook:
 
         Parameters
         ----------
-        note : str
-            What is known of it, in a sentence.
         at_once : bool
             Without a delay: it is a fact rather than an estimate.
-        danger : bool
-            Whether it is more than an alert.
         small : bool, optional
             Whether it is gone for good; where it is not present without it.
         """

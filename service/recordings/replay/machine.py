@@ -14,8 +14,6 @@ def choose_machine(keys: MachineKeys, wanted: str | None) -> Installed:
 
     Parameters
     ----------
-    keys : MachineKeys
-        The recorded machine.
     wanted : str, optional
         ``FILE`` or ``FILE@BUNDLE``, shipped names or paths. Without it, the shipped machine with the recorded site and
         name is taken, with its shipped networks.

@@ -36,8 +36,6 @@ class OfflineReplay:
 
     Parameters
     ----------
-    keys : MachineKeys
-        The recorded machine whose stream is replayed.
     installed : Installed
         The machine file to evaluate it with, and what was trained and commissioned for it.
     write : callable

@@ -45,11 +45,6 @@ def play(
     Messages go out at the distances in time at which their data were taken, divided by the pace. After a seek, a pause
     of more than an hour, or where data are earlier than what went before, the replay goes on at once.
 
-    Returns
-    -------
-    int
-        Number of messages handed out.
-
     Raises
     ------
     RecordingError

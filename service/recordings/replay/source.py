@@ -186,8 +186,6 @@ class RecordingSource:
 
         Parameters
         ----------
-        keys : collection of str, optional
-            Only these.
         from_ns, to_ns : int, optional
             Only from `from_ns` up to, and without, `to_ns`. A block is where its first sample is; what was recorded
             between two blocks of a machine goes with the first of them.
@@ -301,8 +299,6 @@ def parse_moment(text: str, start_ns: int, option: str) -> int:
     text : str
         ``90``, ``+90`` or ``90s``; or ``2026-01-01T00:02:30Z`` (UTC if it has no zone); or nanoseconds since 1970 as
         ``1767225750000000000ns``.
-    start_ns : int
-        Start of the data.
     option : str
         Name of the option, for the message.
 
