@@ -25,7 +25,6 @@ from service.commands.running import (
     ListenOption,
     VersionOption,
     check_address_space,
-    exit_codes,
     prepare_numerics,
     raise_file_limit,
 )
@@ -92,31 +91,30 @@ def run(
     A simulation as fast as this computer can, started with [cyan]rotorsim publish k_by --pace max[/cyan] elsewhere:
     [cyan]rotorwatch run --when-full wait[/cyan]
     """
-    with exit_codes():
-        check_address_space()
-        prepare_numerics()
-        raise_file_limit()
-        from service.runtime import running  # noqa: PLC0415  # must see the variables set above
-        from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
-        from service.terminal.logs import configure_logging  # noqa: PLC0415
-        from service.terminal.stopping import stop_request  # noqa: PLC0415
+    check_address_space()
+    prepare_numerics()
+    raise_file_limit()
+    from service.runtime import running  # noqa: PLC0415  # must see the variables set above
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+    from service.terminal.logs import configure_logging  # noqa: PLC0415
+    from service.terminal.stopping import stop_request  # noqa: PLC0415
 
-        settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
-        configure_logging(settings.log)
-        with stop_request() as stop, running(settings) as service:
-            for worker in service.machines():
-                networks = worker.identity["bundle"] or "none: the equations are not evaluated"
-                typer.echo(f"machine {worker.machine.site}/{worker.machine.name}, bundle {networks}")
-            if settings.link.namespace:
-                typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing from outside it is heard")
-            for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):
-                if ends:
-                    typer.echo(f"Zenoh {what} {', '.join(ends)}")
-            typer.echo(f"HTTP API {service.http_url}")
-            if not settings.access.open_on_loopback and not service.store.tokens.all():
-                typer.echo(access_commands.creation_hint(config, settings.history))
-            sys.stdout.flush()
-            stop.wait()
+    settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
+    configure_logging(settings.log)
+    with stop_request() as stop, running(settings) as service:
+        for worker in service.machines():
+            networks = worker.identity["bundle"] or "none: the equations are not evaluated"
+            typer.echo(f"machine {worker.machine.site}/{worker.machine.name}, bundle {networks}")
+        if settings.link.namespace:
+            typer.echo(f"Zenoh namespace {settings.link.namespace}: nothing from outside it is heard")
+        for what, ends in (("listening on", settings.link.listen), ("connecting to", settings.link.connect)):
+            if ends:
+                typer.echo(f"Zenoh {what} {', '.join(ends)}")
+        typer.echo(f"HTTP API {service.http_url}")
+        if not settings.access.open_on_loopback and not service.store.tokens.all():
+            typer.echo(access_commands.creation_hint(config, settings.history))
+        sys.stdout.flush()
+        stop.wait()
 
 
 @app.command("check-config")
@@ -167,19 +165,18 @@ def router(
     On a network where everybody may do everything:
     [cyan]rotorwatch router --listen tcp/0.0.0.0:7447 --without-grants[/cyan]
     """
-    with exit_codes():
-        from models.signals.link import LinkSettings, load_link  # noqa: PLC0415  # keeps --help quick
-        from service.stream.transport import route  # noqa: PLC0415
-        from service.terminal.stopping import stop_request  # noqa: PLC0415
+    from models.signals.link import LinkSettings, load_link  # noqa: PLC0415  # keeps --help quick
+    from service.stream.transport import route  # noqa: PLC0415
+    from service.terminal.stopping import stop_request  # noqa: PLC0415
 
-        settings = LinkSettings(listen=(ENDPOINT,)) if link is None else load_link(link)
-        changes: dict[str, Any] = {n: tuple(given) for n, given in (("listen", listen), ("connect", connect)) if given}
-        settings = settings.model_copy(update=changes | ({"without_grants": True} if without_grants else {}))
-        settings.check_reach("command line" if link is None else str(link))
-        with stop_request() as stop, route(settings):
-            typer.echo(f"router listening on {', '.join(settings.listen)}")
-            sys.stdout.flush()
-            stop.wait()
+    settings = LinkSettings(listen=(ENDPOINT,)) if link is None else load_link(link)
+    changes: dict[str, Any] = {n: tuple(given) for n, given in (("listen", listen), ("connect", connect)) if given}
+    settings = settings.model_copy(update=changes | ({"without_grants": True} if without_grants else {}))
+    settings.check_reach("command line" if link is None else str(link))
+    with stop_request() as stop, route(settings):
+        typer.echo(f"router listening on {', '.join(settings.listen)}")
+        sys.stdout.flush()
+        stop.wait()
 
 
 @app.command()
@@ -212,14 +209,13 @@ def demo(
 
     [cyan]rotorwatch demo --fault c_by --once[/cyan]
     """
-    with exit_codes():
-        check_address_space()
-        prepare_numerics()
-        typer.echo("starting a simulated machine and a monitor (some seconds) ...")
-        sys.stdout.flush()
-        from service.commands.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
+    check_address_space()
+    prepare_numerics()
+    typer.echo("starting a simulated machine and a monitor (some seconds) ...")
+    sys.stdout.flush()
+    from service.commands.demo import DemoOptions, run_demo  # noqa: PLC0415  # keeps --help quick
 
-        code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
+    code = run_demo(DemoOptions(fault=fault, seed=seed, pace=pace, once=once, http_port=http_port))
     raise typer.Exit(code)
 
 

@@ -17,14 +17,22 @@ from rich.progress import (
 )
 from typer.core import TyperGroup
 
+from models.errors import MachineFileError, RotorwatchError
+
 
 class Commands(TyperGroup):
-    """The commands of a program; an argument that is refused is told like a field of a file."""
+    """The commands of a program; a refused argument is told like a field of a file.
+
+    Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the command line."""
         try:
             return super().invoke(ctx)
+        except RotorwatchError as error:
+            typer.echo(str(error), err=True)
+            raise typer.Exit(2 if isinstance(error, MachineFileError) else 1) from error
         except typer.BadParameter as error:
             from models.mistakes import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
 

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn
 
-from models.errors import MachineFileError, RotorwatchError
+from models.errors import MachineFileError
 from models.machine import Machine, load_machine
 from models.signals.link import LinkSettings, load_link
 from simulator.commands import Commands, VersionOption
@@ -127,25 +127,24 @@ def publish(
     Two faults of your own in ten minutes, as fast as the monitor can take them:
     [cyan]rotorsim publish --duration 600 --fault e=0.3@200 --fault c_by=-0.3@400 --pace max[/cyan]
     """
-    with _exit_codes():
-        loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
-        factor = _pace(pace)
-        start_ns = None if start is None else _time_ns(start)
-        from simulator.publisher import PublishSettings  # noqa: PLC0415  # keeps --help quick
-        from simulator.publisher import publish as publish_stream  # noqa: PLC0415
+    loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
+    factor = _pace(pace)
+    start_ns = None if start is None else _time_ns(start)
+    from simulator.publisher import PublishSettings  # noqa: PLC0415  # keeps --help quick
+    from simulator.publisher import publish as publish_stream  # noqa: PLC0415
 
-        settings = PublishSettings(
-            link=_link(link_file, mode, listen, connect),
-            pace=factor,
-            encoding=encoding,
-            wait_for_subscriber_s=wait_for_subscriber_s,
-            linger_s=linger_s,
-        )
-        number = int(time.time()) % 65535 + 1 if run is None else run
-        with _stop_on_signal() as stop, _progress(loaded.duration_s, rig.keys.stream) as on_block:
-            stream = _stream(loaded, rig, block_s, start_ns, number)
-            summary = publish_stream(rig, stream, settings, stop=stop, on_block=on_block)
-        typer.echo(f"published {summary.blocks} blocks, {summary.data_s:.1f} s of data, on {rig.keys.stream}")
+    settings = PublishSettings(
+        link=_link(link_file, mode, listen, connect),
+        pace=factor,
+        encoding=encoding,
+        wait_for_subscriber_s=wait_for_subscriber_s,
+        linger_s=linger_s,
+    )
+    number = int(time.time()) % 65535 + 1 if run is None else run
+    with _stop_on_signal() as stop, _progress(loaded.duration_s, rig.keys.stream) as on_block:
+        stream = _stream(loaded, rig, block_s, start_ns, number)
+        summary = publish_stream(rig, stream, settings, stop=stop, on_block=on_block)
+    typer.echo(f"published {summary.blocks} blocks, {summary.data_s:.1f} s of data, on {rig.keys.stream}")
 
 
 @app.command()
@@ -174,22 +173,21 @@ def record(
     Another realisation of the healthy machine, ten minutes long:
     [cyan]rotorsim record healthy healthy-7.mcap --seed 7 --duration 600[/cyan]
     """
-    with _exit_codes():
-        loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
-        start_ns = _time_ns(start)
-        if not output.parent.is_dir():
-            raise MachineFileError(f"{output}: the folder {output.parent} does not exist")
-        for existing in (output, output.with_name(output.name + ".part")):
-            if existing.exists() and not overwrite:
-                raise MachineFileError(f"{existing}: exists already; --overwrite replaces it")
-        from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
+    loaded, rig = _load(scenario, machine, seed, duration_s, fault, block_s)
+    start_ns = _time_ns(start)
+    if not output.parent.is_dir():
+        raise MachineFileError(f"{output}: the folder {output.parent} does not exist")
+    for existing in (output, output.with_name(output.name + ".part")):
+        if existing.exists() and not overwrite:
+            raise MachineFileError(f"{existing}: exists already; --overwrite replaces it")
+    from simulator.recorder import record as record_stream  # noqa: PLC0415  # keeps --help quick
 
-        with _stop_on_signal() as stop, _progress(loaded.duration_s, "") as on_block:
-            stream = _stream(loaded, rig, block_s, start_ns, run)
-            summary = record_stream(
-                rig, stream, output, encoding=encoding, overwrite=overwrite, stop=stop, on_block=on_block
-            )
-        typer.echo(f"recorded {summary.blocks} blocks, {summary.data_s:.1f} s of data, in {output}")
+    with _stop_on_signal() as stop, _progress(loaded.duration_s, "") as on_block:
+        stream = _stream(loaded, rig, block_s, start_ns, run)
+        summary = record_stream(
+            rig, stream, output, encoding=encoding, overwrite=overwrite, stop=stop, on_block=on_block
+        )
+    typer.echo(f"recorded {summary.blocks} blocks, {summary.data_s:.1f} s of data, in {output}")
 
 
 def _load(
@@ -246,16 +244,6 @@ def _time_ns(text: str) -> int:
         moment = moment.replace(tzinfo=UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     return ((since.days * 86400 + since.seconds) * 10**6 + since.microseconds) * 1000
-
-
-@contextmanager
-def _exit_codes() -> Iterator[None]:
-    """Exit 2 for a file or argument that cannot be used, 1 for what goes wrong later, each with one message."""
-    try:
-        yield
-    except RotorwatchError as error:
-        typer.echo(str(error), err=True)
-        raise typer.Exit(2 if isinstance(error, MachineFileError) else 1) from error
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import HistoryOption, exit_codes
+from service.commands.running import HistoryOption
 
 if TYPE_CHECKING:  # these import sqlalchemy, which --help must not wait for
     from service.history.records import AuditEntry, TokenRecord
@@ -55,24 +55,23 @@ def create(
 
     [cyan]rotorwatch token create "control room" --scope read --scope operate --days 90 --config plant.toml[/cyan]
     """
-    with exit_codes():
-        from service.access.scopes import Scope  # noqa: PLC0415  # keeps --help quick
-        from service.access.tokens import new_token  # noqa: PLC0415
+    from service.access.scopes import Scope  # noqa: PLC0415  # keeps --help quick
+    from service.access.tokens import new_token  # noqa: PLC0415
 
-        unknown = set(scope or ()) - set(Scope)
-        if unknown:
-            raise MachineFileError(f"--scope is {', '.join(sorted(unknown))}, expected {', '.join(Scope)}")
-        now_ns = time.time_ns()
-        record, text = new_token(name, [Scope(one) for one in scope or ()], now_ns=now_ns, days=days)
-        with _opened(config) as store:
-            if any(one.name == name and _state(one, now_ns) == "valid" for one in store.tokens.all()):
-                raise MachineFileError(f"a token of {name!r} is valid already: take another name, or revoke it first")
-            _write(store, "create-token", f"{record.token_id}, {name}, {' '.join(record.scopes)}")
-            store.tokens.add(record)
-        until = "until it is revoked" if record.expires_ns is None else f"until {_utc(record.expires_ns)}"
-        typer.echo(f"token {record.token_id} of {name} ({', '.join(record.scopes)}), valid {until}", err=True)
-        typer.echo("it is shown this once; send it as header Authorization: Bearer TOKEN", err=True)
-        typer.echo(text)
+    unknown = set(scope or ()) - set(Scope)
+    if unknown:
+        raise MachineFileError(f"--scope is {', '.join(sorted(unknown))}, expected {', '.join(Scope)}")
+    now_ns = time.time_ns()
+    record, text = new_token(name, [Scope(one) for one in scope or ()], now_ns=now_ns, days=days)
+    with _opened(config) as store:
+        if any(one.name == name and _state(one, now_ns) == "valid" for one in store.tokens.all()):
+            raise MachineFileError(f"a token of {name!r} is valid already: take another name, or revoke it first")
+        _write(store, "create-token", f"{record.token_id}, {name}, {' '.join(record.scopes)}")
+        store.tokens.add(record)
+    until = "until it is revoked" if record.expires_ns is None else f"until {_utc(record.expires_ns)}"
+    typer.echo(f"token {record.token_id} of {name} ({', '.join(record.scopes)}), valid {until}", err=True)
+    typer.echo("it is shown this once; send it as header Authorization: Bearer TOKEN", err=True)
+    typer.echo(text)
 
 
 def creation_hint(config: Path | None, history: "HistorySettings") -> str:
@@ -105,26 +104,25 @@ def list_(config: HistoryOption = None) -> None:
 
     [cyan]rotorwatch token list --config plant.toml[/cyan]
     """
-    with exit_codes():
-        from rich.console import Console  # noqa: PLC0415  # keeps --help quick
-        from rich.table import Column, Table  # noqa: PLC0415
-        from rich.text import Text  # noqa: PLC0415
+    from rich.console import Console  # noqa: PLC0415  # keeps --help quick
+    from rich.table import Column, Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
 
-        with _opened(config) as store:
-            records = store.tokens.all()
-        now_ns = time.time_ns()
-        table = Table(Column("token", no_wrap=True), "name", "scopes", "created", "expires", "state")
-        for record in sorted(records, key=lambda one: one.created_ns):
-            state = _state(record, now_ns)
-            table.add_row(
-                record.token_id,
-                Text(record.name),
-                ", ".join(record.scopes),
-                _utc(record.created_ns),
-                "-" if record.expires_ns is None else _utc(record.expires_ns),
-                Text(state, style="green" if state == "valid" else "red"),
-            )
-        Console(soft_wrap=True).print(table)
+    with _opened(config) as store:
+        records = store.tokens.all()
+    now_ns = time.time_ns()
+    table = Table(Column("token", no_wrap=True), "name", "scopes", "created", "expires", "state")
+    for record in sorted(records, key=lambda one: one.created_ns):
+        state = _state(record, now_ns)
+        table.add_row(
+            record.token_id,
+            Text(record.name),
+            ", ".join(record.scopes),
+            _utc(record.created_ns),
+            "-" if record.expires_ns is None else _utc(record.expires_ns),
+            Text(state, style="green" if state == "valid" else "red"),
+        )
+    Console(soft_wrap=True).print(table)
 
 
 def revoke(
@@ -137,22 +135,20 @@ def revoke(
 
     [cyan]rotorwatch token revoke 3fK09aZqT1xB[/cyan]
     """
-    with exit_codes():
-        from service.access.tokens import masked  # noqa: PLC0415  # keeps --help quick
+    from service.access.tokens import masked  # noqa: PLC0415  # keeps --help quick
 
-        with _opened(config) as store:
-            record = store.tokens.find(token)
-            if record is None:
-                raise MachineFileError(
-                    f"there is no token {masked(token)!r}; expected the 12 characters after rw_, see: rotorwatch token "
-                    "list"
-                )
-            if record.revoked_ns is None:
-                _write(store, "revoke-token", f"{record.token_id}, {record.name}")
-                store.tokens.revoke(token, time.time_ns())
-                typer.echo(f"token {record.token_id} of {record.name} is revoked")
-            else:
-                typer.echo(f"token {record.token_id} of {record.name} was revoked at {_utc(record.revoked_ns)}")
+    with _opened(config) as store:
+        record = store.tokens.find(token)
+        if record is None:
+            raise MachineFileError(
+                f"there is no token {masked(token)!r}; expected the 12 characters after rw_, see: rotorwatch token list"
+            )
+        if record.revoked_ns is None:
+            _write(store, "revoke-token", f"{record.token_id}, {record.name}")
+            store.tokens.revoke(token, time.time_ns())
+            typer.echo(f"token {record.token_id} of {record.name} is revoked")
+        else:
+            typer.echo(f"token {record.token_id} of {record.name} was revoked at {_utc(record.revoked_ns)}")
 
 
 def audit(
@@ -173,13 +169,12 @@ def audit(
 
     [cyan]rotorwatch audit --machine plant/pump-7 --limit 20[/cyan]
     """
-    with exit_codes():
-        with _opened(config) as store:
-            entries = list(_with_outcomes(store, machine, actor, limit))
-        who = max((len(entry.actor) for entry in entries), default=0)
-        origin = max((len(entry.address) for entry in entries), default=0)
-        for entry in entries:
-            typer.echo(_audit_line(entry, who, origin))
+    with _opened(config) as store:
+        entries = list(_with_outcomes(store, machine, actor, limit))
+    who = max((len(entry.actor) for entry in entries), default=0)
+    origin = max((len(entry.address) for entry in entries), default=0)
+    for entry in entries:
+        typer.echo(_audit_line(entry, who, origin))
 
 
 def _with_outcomes(store: "Store", machine: str | None, actor: str | None, limit: int) -> "Iterator[AuditEntry]":

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import HistoryOption, exit_codes
+from service.commands.running import HistoryOption
 
 if TYPE_CHECKING:  # imports sqlalchemy, which --help must not wait for
     from service.history.file import HistoryFile
@@ -28,16 +28,15 @@ def check(config: HistoryOption = None) -> None:
 
     [cyan]rotorwatch history check --config plant.toml[/cyan]
     """
-    with exit_codes():
-        from service.history.file import faults  # noqa: PLC0415  # keeps --help quick
+    from service.history.file import faults  # noqa: PLC0415  # keeps --help quick
 
-        file = _chosen(config).path
-        found = faults(file)
-        for fault in found:
-            typer.echo(f"{file}: {fault}", err=True)
-        if found:
-            raise typer.Exit(1)
-        typer.echo(f"{file}: ok")
+    file = _chosen(config).path
+    found = faults(file)
+    for fault in found:
+        typer.echo(f"{file}: {fault}", err=True)
+    if found:
+        raise typer.Exit(1)
+    typer.echo(f"{file}: ok")
 
 
 def backup(
@@ -49,14 +48,11 @@ def backup(
 
     [cyan]rotorwatch history backup /backup/history-monday.sqlite --config plant.toml[/cyan]
     """
-    with exit_codes():
-        from service.history.file import back_up  # noqa: PLC0415  # keeps --help quick
+    from service.history.file import back_up  # noqa: PLC0415  # keeps --help quick
 
-        file = _chosen(config).path
-        back_up(file, copy)
-        typer.echo(
-            f"{file} is copied to {copy}; it holds hashes of the access tokens: keep it where others cannot read it"
-        )
+    file = _chosen(config).path
+    back_up(file, copy)
+    typer.echo(f"{file} is copied to {copy}; it holds hashes of the access tokens: keep it where others cannot read it")
 
 
 def restore(
@@ -69,12 +65,11 @@ def restore(
 
     [cyan]rotorwatch history restore /backup/history-monday.sqlite --config plant.toml[/cyan]
     """
-    with exit_codes():
-        from service.history.file import restore as put_back  # noqa: PLC0415  # keeps --help quick
+    from service.history.file import restore as put_back  # noqa: PLC0415  # keeps --help quick
 
-        file = _chosen(config)
-        kept = put_back(file, backup_file)
-        typer.echo(f"{file.path} is that of {backup_file} now" + (f"; the former is kept as {kept}" if kept else ""))
+    file = _chosen(config)
+    kept = put_back(file, backup_file)
+    typer.echo(f"{file.path} is that of {backup_file} now" + (f"; the former is kept as {kept}" if kept else ""))
 
 
 def _chosen(config: Path | None) -> "HistoryFile":

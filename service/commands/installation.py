@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import ENDPOINT, ConnectOption, ListenOption, exit_codes, prepare_numerics
+from service.commands.running import ENDPOINT, ConnectOption, ListenOption, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -71,40 +71,39 @@ def init(
     [cyan]rotorwatch doctor --machine fan.toml[/cyan]
     [cyan]rotorwatch run --config rotorwatch.toml[/cyan]
     """
-    with exit_codes():
-        site = site or _asked("--site", "Site (a group of machines)")
-        name = name or _asked("--name", "Name of the machine")
-        rate = rate_hz or float(_asked("--rate-hz", "Samples per second and channel"))
-        lines = sensor or _asked_sensors()
-        from models.machine import MachineFile  # noqa: PLC0415  # keeps --help quick
-        from models.mistakes import checked  # noqa: PLC0415
+    site = site or _asked("--site", "Site (a group of machines)")
+    name = name or _asked("--name", "Name of the machine")
+    rate = rate_hz or float(_asked("--rate-hz", "Samples per second and channel"))
+    lines = sensor or _asked_sensors()
+    from models.machine import MachineFile  # noqa: PLC0415  # keeps --help quick
+    from models.mistakes import checked  # noqa: PLC0415
 
-        fields: dict[str, Any] = {
-            "site": site,
-            "name": name,
-            "rate_hz": rate,
-            "operation": None if speed_rpm is None else {"speed_rpm": speed_rpm},
-            "schedule": None if snapshots is None else _schedule(snapshots),
-            "levels": {"zones": zones or []},
-            "sensors": [_sensor(line) for line in lines],
-        }
-        machine_path, settings_path = folder / f"{name}.toml", folder / "rotorwatch.toml"
-        machine = checked(MachineFile, {key: value for key, value in fields.items() if value is not None}, machine_path)
-        for path in (machine_path, settings_path):
-            if path.exists() and not overwrite:
-                raise MachineFileError(f"{path}: exists already; --overwrite replaces it")
-        folder.mkdir(parents=True, exist_ok=True)
-        machine_path.write_text(_machine_text(machine, speed_rpm), encoding="utf-8")
-        settings_path.write_text(
-            f'[link]\nlisten = ["{ENDPOINT}"]\n\n[recording]\ndirectory = "recordings"\n\n'
-            f'[history]\nurl = "sqlite:///history.sqlite"\n\n[[machines]]\nfile = "{machine_path.name}"\n',
-            encoding="utf-8",
-        )
-        typer.echo(f"{machine_path}: {machine.site}/{machine.name}, {len(machine.sensors)} channels at {rate:g} Hz")
-        typer.echo(f"{settings_path}: listens on {ENDPOINT}, records into {folder / 'recordings'}")
-        typer.echo(f"samples are expected under {machine.keys.stream}; the wire format is in docs/wire.md")
-        typer.echo(f"see what arrives: rotorwatch doctor --machine {machine_path}")
-        typer.echo(f"monitor it:       rotorwatch run --config {settings_path}")
+    fields: dict[str, Any] = {
+        "site": site,
+        "name": name,
+        "rate_hz": rate,
+        "operation": None if speed_rpm is None else {"speed_rpm": speed_rpm},
+        "schedule": None if snapshots is None else _schedule(snapshots),
+        "levels": {"zones": zones or []},
+        "sensors": [_sensor(line) for line in lines],
+    }
+    machine_path, settings_path = folder / f"{name}.toml", folder / "rotorwatch.toml"
+    machine = checked(MachineFile, {key: value for key, value in fields.items() if value is not None}, machine_path)
+    for path in (machine_path, settings_path):
+        if path.exists() and not overwrite:
+            raise MachineFileError(f"{path}: exists already; --overwrite replaces it")
+    folder.mkdir(parents=True, exist_ok=True)
+    machine_path.write_text(_machine_text(machine, speed_rpm), encoding="utf-8")
+    settings_path.write_text(
+        f'[link]\nlisten = ["{ENDPOINT}"]\n\n[recording]\ndirectory = "recordings"\n\n'
+        f'[history]\nurl = "sqlite:///history.sqlite"\n\n[[machines]]\nfile = "{machine_path.name}"\n',
+        encoding="utf-8",
+    )
+    typer.echo(f"{machine_path}: {machine.site}/{machine.name}, {len(machine.sensors)} channels at {rate:g} Hz")
+    typer.echo(f"{settings_path}: listens on {ENDPOINT}, records into {folder / 'recordings'}")
+    typer.echo(f"samples are expected under {machine.keys.stream}; the wire format is in docs/wire.md")
+    typer.echo(f"see what arrives: rotorwatch doctor --machine {machine_path}")
+    typer.echo(f"monitor it:       rotorwatch run --config {settings_path}")
 
 
 def _asked(option: str, text: str) -> str:
@@ -183,32 +182,31 @@ def doctor(
     Beside a monitor:
     [cyan]rotorwatch doctor --machine fan.toml --connect tcp/127.0.0.1:7447[/cyan]
     """
-    with exit_codes():
-        prepare_numerics()
-        from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
-        from models.signals.link import LinkSettings  # noqa: PLC0415
-        from models.signals.recording import RecordedMessage  # noqa: PLC0415
-        from service.analysis.arrival import examined  # noqa: PLC0415
-        from service.stream.transport import Link, MachineTap  # noqa: PLC0415
+    prepare_numerics()
+    from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
+    from models.signals.link import LinkSettings  # noqa: PLC0415
+    from models.signals.recording import RecordedMessage  # noqa: PLC0415
+    from service.analysis.arrival import examined  # noqa: PLC0415
+    from service.stream.transport import Link, MachineTap  # noqa: PLC0415
 
-        known = load_machine_file(machine)
-        ends = LinkSettings(mode="client", connect=tuple(connect)) if connect else None
-        link = Link(ends or LinkSettings(listen=tuple(listen or (ENDPOINT,))))
-        heard: list[RecordedMessage] = []
-        try:
-            tap = MachineTap(link, known.keys, heard.append)
-            schedule = known.schedule
-            seconds = seconds or (10.0 if schedule is None else 10.0 + schedule.every_s + schedule.on_s)
-            typer.echo(f"listening for {seconds:g} s to {known.keys.root} ...")
-            sys.stdout.flush()
-            time.sleep(seconds)
-            tap.close()
-        finally:
-            link.close()
-        found = examined(known, heard)
-        for line in found.lines:
-            typer.echo(line)
-        for trouble in found.troubles:
-            typer.echo(f"  - {trouble}")
+    known = load_machine_file(machine)
+    ends = LinkSettings(mode="client", connect=tuple(connect)) if connect else None
+    link = Link(ends or LinkSettings(listen=tuple(listen or (ENDPOINT,))))
+    heard: list[RecordedMessage] = []
+    try:
+        tap = MachineTap(link, known.keys, heard.append)
+        schedule = known.schedule
+        seconds = seconds or (10.0 if schedule is None else 10.0 + schedule.every_s + schedule.on_s)
+        typer.echo(f"listening for {seconds:g} s to {known.keys.root} ...")
+        sys.stdout.flush()
+        time.sleep(seconds)
+        tap.close()
+    finally:
+        link.close()
+    found = examined(known, heard)
+    for line in found.lines:
+        typer.echo(line)
+    for trouble in found.troubles:
+        typer.echo(f"  - {trouble}")
     if found.troubles:
         raise typer.Exit(1)

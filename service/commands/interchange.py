@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.commands.running import exit_codes, prepare_numerics
+from service.commands.running import prepare_numerics
 
 _LISTED = 5
 _TIMES = ["%Y-%m-%dT%H:%M:%S", "%Y-%m-%dT%H:%M:%S.%f", "%Y-%m-%dT%H:%M:%SZ", "%Y-%m-%dT%H:%M:%S.%fZ", "%Y-%m-%d"]
@@ -43,17 +43,16 @@ def import_(
 
     [cyan]rotorwatch import run7.csv --mapping run7.toml --machine pump-7.toml --out run7.mcap[/cyan]
     """
-    with exit_codes():
-        prepare_numerics()
-        from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
-        from service.interchange.importing import import_file  # noqa: PLC0415
-        from service.interchange.mapping import load_mapping  # noqa: PLC0415
-        from service.interchange.summary import summary_lines  # noqa: PLC0415
+    prepare_numerics()
+    from models.machine import load_machine_file  # noqa: PLC0415  # keeps --help quick
+    from service.interchange.importing import import_file  # noqa: PLC0415
+    from service.interchange.mapping import load_mapping  # noqa: PLC0415
+    from service.interchange.summary import summary_lines  # noqa: PLC0415
 
-        described = load_machine_file(machine)
-        done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)
-        for line in summary_lines(done):
-            typer.echo(line)
+    described = load_machine_file(machine)
+    done = import_file(source, load_mapping(mapping, described), described, out, overwrite=overwrite)
+    for line in summary_lines(done):
+        typer.echo(line)
 
 
 def export(
@@ -89,18 +88,17 @@ def export(
     [cyan]rotorwatch export run7.mcap --to csv --out minute.csv --si --from 2026-01-31T12:00:00 --to-time
     2026-01-31T12:01:00[/cyan]
     """
-    with exit_codes():
-        prepare_numerics()
-        from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
-        from service.interchange.exporting import export as write  # noqa: PLC0415
+    prepare_numerics()
+    from service.interchange.exported import Selection  # noqa: PLC0415  # keeps --help quick
+    from service.interchange.exporting import export as write  # noqa: PLC0415
 
-        selection = Selection(tuple(recordings), machine, _nanoseconds(from_), _nanoseconds(to_time), si)
-        table = write(selection, what, to, out, overwrite=overwrite)
-        typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
-        for text in table.skipped[:_LISTED]:
-            typer.echo(f"left out: {text}", err=True)
-        if len(table.skipped) > _LISTED:
-            typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
+    selection = Selection(tuple(recordings), machine, _nanoseconds(from_), _nanoseconds(to_time), si)
+    table = write(selection, what, to, out, overwrite=overwrite)
+    typer.echo(f"{out}: {table.rows} rows, {len(table.schema)} columns")
+    for text in table.skipped[:_LISTED]:
+        typer.echo(f"left out: {text}", err=True)
+    if len(table.skipped) > _LISTED:
+        typer.echo(f"left out: {len(table.skipped) - _LISTED} more", err=True)
 
 
 def _nanoseconds(time: datetime | None) -> int | None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import Commands, FromOption, ToOption, exit_codes, prepare_numerics
+from service.commands.running import Commands, FromOption, ToOption, prepare_numerics
 
 if TYPE_CHECKING:
     from service.analysis.figures.spectrum import Lines
@@ -161,11 +161,10 @@ def _kind(paint: Callable[..., "Paint"]) -> None:
     shared = signature(_Picture).parameters
 
     def command(**given: Any) -> None:
-        with exit_codes():
-            prepare_numerics()
-            picture = _Picture(**{name: given.pop(name) for name in shared})
-            picture.check()
-            picture.draw(paint(picture, **given))
+        prepare_numerics()
+        picture = _Picture(**{name: given.pop(name) for name in shared})
+        picture.check()
+        picture.draw(paint(picture, **given))
 
     (files, out, *others), (_, *own) = shared.values(), signature(paint).parameters.values()
     options = [one.replace(kind=Parameter.KEYWORD_ONLY) for one in (files, out, *own, *others)]

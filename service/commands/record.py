@@ -13,7 +13,7 @@ import typer
 
 from models.errors import MachineFileError, RecordingError
 from service.commands.replay import link_of
-from service.commands.running import ConnectOption, ListenOption, exit_codes, prepare_numerics
+from service.commands.running import ConnectOption, ListenOption, prepare_numerics
 
 if TYPE_CHECKING:  # these import numpy, which --help must not wait for
     from models.machine import MachineFile
@@ -72,7 +72,7 @@ def record(
     Two machines, through a router:
     [cyan]rotorwatch record --machine pump-7.toml --machine fan-2.toml --out /data --connect tcp/10.0.0.9:7447[/cyan]
     """
-    with exit_codes(), ExitStack() as undo:
+    with ExitStack() as undo:
         prepare_numerics()
         changes = {"rotate_s": rotate_s, "rotate_mb": rotate_mb, "keep_gb": keep_gb}
         machines, settings, history = _settings(
@@ -135,9 +135,8 @@ def recover(
 
     [cyan]rotorwatch recover /data/recordings/demo/lab/20261121T142530Z.mcap.part[/cyan]
     """
-    with exit_codes():
-        if out is not None and len(files) > 1:
-            raise MachineFileError(f"--out names one file, and there are {len(files)} to recover")
+    if out is not None and len(files) > 1:
+        raise MachineFileError(f"--out names one file, and there are {len(files)} to recover")
     failed = False
     for file in files:
         try:

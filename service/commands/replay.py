@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from models.errors import MachineFileError, RecordingError, RotorwatchError
-from service.commands.running import ENDPOINT, FromOption, ToOption, exit_codes, prepare_numerics
+from service.commands.running import ENDPOINT, FromOption, ToOption, prepare_numerics
 
 if TYPE_CHECKING:  # these import pydantic, numpy and pyarrow, which --help must not wait for
     from models.signals.keys import MachineKeys
@@ -129,45 +129,44 @@ def replay(
     [cyan]rotorwatch run --namespace replay/monday --listen tcp/127.0.0.1:7450 --http-port 8081[/cyan]
     [cyan]rotorwatch replay monday.mcap --pace 10 --connect tcp/127.0.0.1:7450[/cyan]
     """
-    with exit_codes():
-        if nice:
-            os.nice(nice)
-        prepare_numerics()
-        from service.recordings.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
-        from service.recordings.replay.control import Control  # noqa: PLC0415
-        from service.recordings.replay.source import RecordingSource  # noqa: PLC0415
+    if nice:
+        os.nice(nice)
+    prepare_numerics()
+    from service.recordings.replay.console import orders, show  # noqa: PLC0415  # keeps --help quick
+    from service.recordings.replay.control import Control  # noqa: PLC0415
+    from service.recordings.replay.source import RecordingSource  # noqa: PLC0415
 
-        try:
-            source = RecordingSource(files)
-        except RecordingError as error:
-            raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
-        machines = source.machines if key is None else (source.machine(key),)
-        from_ns, to_ns = source.between(from_, to, *machines)
-        _check_options(offline, {"--machine": machine, "--out": out, "--overwrite": overwrite},
-                       {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything})  # fmt: skip
-        wishes = Control()
-        with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
-            if offline:
-                request = _Offline(source.machine(key), machine, from_ns, to_ns, out, overwrite, progress)
-                _evaluate(source, request, wishes)
-                return
-            from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
+    try:
+        source = RecordingSource(files)
+    except RecordingError as error:
+        raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
+    machines = source.machines if key is None else (source.machine(key),)
+    from_ns, to_ns = source.between(from_, to, *machines)
+    _check_options(offline, {"--machine": machine, "--out": out, "--overwrite": overwrite},
+                   {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything})  # fmt: skip
+    wishes = Control()
+    with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
+        if offline:
+            request = _Offline(source.machine(key), machine, from_ns, to_ns, out, overwrite, progress)
+            _evaluate(source, request, wishes)
+            return
+        from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
 
-            plan = NetworkPlan(
-                link=link_of(connect, listen),
-                machines=machines,
-                everything=everything,
-                prefix=_prefix(prefix, files[0]),
-                pace=_pace(pace),
-                passes=_passes(loop, prefix),
-                from_ns=from_ns,
-                to_ns=to_ns,
-                wait_for_subscriber_s=wait_s,
-            )
-            _announce(plan)
-            with show(progress) as bar:
-                count = replay_to_network(source, plan, wishes, bar)
-            typer.echo(f"{count} messages replayed", err=True)
+        plan = NetworkPlan(
+            link=link_of(connect, listen),
+            machines=machines,
+            everything=everything,
+            prefix=_prefix(prefix, files[0]),
+            pace=_pace(pace),
+            passes=_passes(loop, prefix),
+            from_ns=from_ns,
+            to_ns=to_ns,
+            wait_for_subscriber_s=wait_s,
+        )
+        _announce(plan)
+        with show(progress) as bar:
+            count = replay_to_network(source, plan, wishes, bar)
+        typer.echo(f"{count} messages replayed", err=True)
 
 
 @dataclass(frozen=True, slots=True)

@@ -67,12 +67,13 @@ VersionOption = Annotated[
 
 
 class Commands(TyperGroup):
-    """The commands of a program; an argument that is refused is told like a field of a file."""
+    """The commands of a program, with their exit codes; a refused argument is told like a field of a file."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command of the command line."""
         try:
-            return super().invoke(ctx)
+            with exit_codes():
+                return super().invoke(ctx)
         except typer.BadParameter as error:
             from models.mistakes import argument_text  # noqa: PLC0415  # pydantic, which --help must not wait for
 

@@ -12,7 +12,7 @@ from rich.table import Column, Table
 
 from models.errors import MachineFileError, RotorwatchError
 from service.commands.replay import NamespaceOption, in_namespace
-from service.commands.running import ENDPOINT, ConnectOption, LinkOption, exit_codes
+from service.commands.running import ENDPOINT, ConnectOption, LinkOption
 
 if TYPE_CHECKING:  # these import numpy and scipy, which --help must not wait for
     from rotorwatch.records.health import Health
@@ -64,24 +64,23 @@ def watch(
     For another program:
     [cyan]rotorwatch watch --json | jq .message.data.text[/cyan]
     """
-    with exit_codes():
-        if machine.count("/") != 1:
-            raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
-        from models.signals.link import LinkSettings, load_link  # noqa: PLC0415  # keeps --help quick
-        from service.stream.transport import follow  # noqa: PLC0415
-        from service.terminal.stopping import stop_request  # noqa: PLC0415
+    if machine.count("/") != 1:
+        raise MachineFileError(f"--machine is {machine!r}, expected SITE/MACHINE such as demo/lab or */lab")
+    from models.signals.link import LinkSettings, load_link  # noqa: PLC0415  # keeps --help quick
+    from service.stream.transport import follow  # noqa: PLC0415
+    from service.terminal.stopping import stop_request  # noqa: PLC0415
 
-        topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
-        base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
-        ends = {"connect": tuple(connect)} if connect else {}
-        settings = in_namespace(base.model_copy(update=ends), namespace)
-        show = _JsonLines() if as_json else _Lines()
-        with stop_request() as stop, follow(settings, machine, topics, show) as connected:
-            there = True
-            while not stop.wait(0.5):
-                if connected() != there:
-                    there = not there
-                    typer.echo("connected again" if there else "connection lost, trying again", err=True)
+    topics = ("alarm_state", "alarm_event", "health", *(("report",) if windows else ()))
+    base = LinkSettings(mode="client", connect=(ENDPOINT,)) if link is None else load_link(link)
+    ends = {"connect": tuple(connect)} if connect else {}
+    settings = in_namespace(base.model_copy(update=ends), namespace)
+    show = _JsonLines() if as_json else _Lines()
+    with stop_request() as stop, follow(settings, machine, topics, show) as connected:
+        there = True
+        while not stop.wait(0.5):
+            if connected() != there:
+                there = not there
+                typer.echo("connected again" if there else "connection lost, trying again", err=True)
 
 
 def status(
@@ -114,50 +113,47 @@ def status(
 
     [cyan]rotorwatch status --json | jq -r '.machines[] | .machine + " " + .state'[/cyan]
     """
-    with exit_codes():
-        if not url.startswith(("http://", "https://")):
-            raise MachineFileError(
-                f"--url is {url!r}, expected http:// or https:// before it; did you mean http://{url}?"
-            )
-        healths, code, why = [], _NO_ANSWER, ""
-        try:
-            healths = _fetch_healths(url.rstrip("/"), token, ca)
-            code = max((_exit_code(health) for health in healths), key=(0, _NO_DATA, _ALARM).index, default=0)
-        except MachineFileError:
-            raise
-        except RotorwatchError as error:
-            why = str(error)
-        if as_json:
-            machines = [health.model_dump(mode="json") for health in healths]
-            answer = {"url": url, "summary": _SUMMARY[code], "reason": why, "machines": machines}
-            typer.echo(json.dumps(answer, ensure_ascii=False))
-        if code == _NO_ANSWER:
-            typer.echo(why, err=True)
-        if as_json or code == _NO_ANSWER:
-            raise typer.Exit(code)
-        columns = ("state", "window", "raised alarms", "data age", "refused", "gaps")
-        table = Table(Column("machine", overflow="fold"), *(Column(name, no_wrap=True) for name in columns))
-        remarks: list[str] = []
-        for health in healths:
-            place = f"{health.site}/{health.machine}"
-            age_s = health.stream.data_age_s
-            table.add_row(
-                place,
-                f"[{_STYLES.get(health.state, 'default')}]{health.state}[/]",
-                f"{health.filled:.0%}",
-                "\n".join(f"{alarm.name} {alarm.severity}" for alarm in health.alarms if alarm.raised) or "-",
-                "-" if age_s is None else f"{age_s:.1f} s",
-                str(sum(health.quality.refused_blocks.values())),
-                str(health.quality.gaps),
-            )
-            remarks += [f"{place}: {health.reason}"] if health.reason else []
-            growth = None if health.report is None else health.report.level_growth
-            remarks += [] if growth is None else [f"{place}: {growth.text}"]
-            remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
-        Console(soft_wrap=True).print(table)
-        for remark in remarks:
-            typer.echo(remark)
+    if not url.startswith(("http://", "https://")):
+        raise MachineFileError(f"--url is {url!r}, expected http:// or https:// before it; did you mean http://{url}?")
+    healths, code, why = [], _NO_ANSWER, ""
+    try:
+        healths = _fetch_healths(url.rstrip("/"), token, ca)
+        code = max((_exit_code(health) for health in healths), key=(0, _NO_DATA, _ALARM).index, default=0)
+    except MachineFileError:
+        raise
+    except RotorwatchError as error:
+        why = str(error)
+    if as_json:
+        machines = [health.model_dump(mode="json") for health in healths]
+        answer = {"url": url, "summary": _SUMMARY[code], "reason": why, "machines": machines}
+        typer.echo(json.dumps(answer, ensure_ascii=False))
+    if code == _NO_ANSWER:
+        typer.echo(why, err=True)
+    if as_json or code == _NO_ANSWER:
         raise typer.Exit(code)
+    columns = ("state", "window", "raised alarms", "data age", "refused", "gaps")
+    table = Table(Column("machine", overflow="fold"), *(Column(name, no_wrap=True) for name in columns))
+    remarks: list[str] = []
+    for health in healths:
+        place = f"{health.site}/{health.machine}"
+        age_s = health.stream.data_age_s
+        table.add_row(
+            place,
+            f"[{_STYLES.get(health.state, 'default')}]{health.state}[/]",
+            f"{health.filled:.0%}",
+            "\n".join(f"{alarm.name} {alarm.severity}" for alarm in health.alarms if alarm.raised) or "-",
+            "-" if age_s is None else f"{age_s:.1f} s",
+            str(sum(health.quality.refused_blocks.values())),
+            str(health.quality.gaps),
+        )
+        remarks += [f"{place}: {health.reason}"] if health.reason else []
+        growth = None if health.report is None else health.report.level_growth
+        remarks += [] if growth is None else [f"{place}: {growth.text}"]
+        remarks += [f"{place}: {alarm.name} is {alarm.state}" for alarm in health.alarms if alarm.state in _SILENT]
+    Console(soft_wrap=True).print(table)
+    for remark in remarks:
+        typer.echo(remark)
+    raise typer.Exit(code)
 
 
 def _exit_code(health: "Health") -> int:

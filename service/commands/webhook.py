@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from models.errors import MachineFileError
-from service.commands.running import exit_codes
 
 
 def register(app: typer.Typer) -> None:
@@ -39,14 +38,13 @@ def test(
 
     [cyan]rotorwatch webhook test pager --config plant.toml[/cyan]
     """
-    with exit_codes():
-        from service.delivery.webhooks.webhooks import send_test  # noqa: PLC0415
-        from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+    from service.delivery.webhooks.webhooks import send_test  # noqa: PLC0415
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
 
-        webhooks = load_settings(config).webhooks
-        settings = next((webhook for webhook in webhooks if webhook.name == name), None)
-        if settings is None:
-            there = ", ".join(webhook.name for webhook in webhooks) or "none"
-            raise MachineFileError(f"{config}: no webhook {name}; there are: {there}")
-        took_s = send_test(settings)
-        typer.echo(f"{name}: {settings.target} took the test event, in {took_s:.2f} s")
+    webhooks = load_settings(config).webhooks
+    settings = next((webhook for webhook in webhooks if webhook.name == name), None)
+    if settings is None:
+        there = ", ".join(webhook.name for webhook in webhooks) or "none"
+        raise MachineFileError(f"{config}: no webhook {name}; there are: {there}")
+    took_s = send_test(settings)
+    typer.echo(f"{name}: {settings.target} took the test event, in {took_s:.2f} s")

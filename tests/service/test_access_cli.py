@@ -12,6 +12,7 @@ from typer.testing import CliRunner, Result
 
 from service.access.scopes import Scope
 from service.commands import access as access_commands
+from service.commands.running import Commands
 from service.settings.service import HistorySettings
 from tests.service.guarded import Guarded, guarded
 from tests.service.live import ROOT, endpoint, program
@@ -21,7 +22,7 @@ from tests.service.preloaded import ran
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch) -> typer.Typer:
     monkeypatch.setenv("COLUMNS", "300")
-    app = typer.Typer()
+    app = typer.Typer(cls=Commands)
     access_commands.register(app)
     return app
 

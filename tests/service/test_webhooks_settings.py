@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from models.errors import MachineFileError
 from service.commands import webhook as webhook_commands
+from service.commands.running import Commands
 from service.delivery.webhooks.answer import Answer, Meaning, answer_of, no_answer, pause_s
 from service.delivery.webhooks.receiver import Receiver
 from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
@@ -161,7 +162,7 @@ def test_a_monitor_does_not_start_without_its_secrets(tmp_path: Path) -> None:
 
 @pytest.fixture
 def command() -> typer.Typer:
-    app = typer.Typer()
+    app = typer.Typer(cls=Commands)
     webhook_commands.register(app)
     return app
 
