@@ -72,7 +72,7 @@ class RecordingWriter:
     """Writes a recording; a context manager.
 
     Leaving the context without an exception gives the file its name. With an exception the file is completed but
-    stays ``NAME.part``.
+    stays ``NAME.part``. Every method raises `RecordingError` if the file cannot be written.
 
     Parameters
     ----------
@@ -128,13 +128,7 @@ class RecordingWriter:
         return len(self._channels)
 
     def write(self, message: RecordedMessage) -> None:
-        """Append a message.
-
-        Raises
-        ------
-        RecordingError
-            If the file cannot be written.
-        """
+        """Append a message."""
         framing = _PREFIXED if message.attachment else _PLAIN
         data = message.payload
         if message.attachment:
@@ -149,25 +143,13 @@ class RecordingWriter:
                 self._hand_over()
 
     def flush(self) -> None:
-        """Complete the chunk in progress and hand it to the operating system.
-
-        Raises
-        ------
-        RecordingError
-            If the file cannot be written.
-        """
+        """Complete the chunk in progress and hand it to the operating system."""
         with writing(self.part):
             self._writer.flush()  # type: ignore[no-untyped-call]  # the library's stub
             self._hand_over()
 
     def sync(self) -> None:
-        """`flush`, and wait until the file is on the disk.
-
-        Raises
-        ------
-        RecordingError
-            If the file cannot be written.
-        """
+        """`flush`, and wait until the file is on the disk."""
         self.flush()
         with writing(self.part):
             os.fsync(self._file.fileno())

@@ -47,13 +47,7 @@ class _Arrays(Source):
 
 
 class NumpySource(_Arrays):
-    """A NumPy .npz file, read whole. Pickled objects are refused: they could run code.
-
-    Raises
-    ------
-    SourceError
-        If it is not one.
-    """
+    """A NumPy .npz file, read whole. Pickled objects are refused: they could run code."""
 
     kind = "NumPy .npz"
 
@@ -77,11 +71,6 @@ class MatlabSource(_Arrays):
     """A MATLAB .mat file: version 4 to 7 read whole, version 7.3 (HDF5) column by column.
 
     Fields of structs are named ``struct.field``.
-
-    Raises
-    ------
-    SourceError
-        If it is not one.
     """
 
     kind, package = "MATLAB", "h5py"
@@ -114,11 +103,6 @@ class WavSource(_Arrays):
     """A WAV file; its channels are named ``1``, ``2`` and so on. Mapped, not read, where its number format allows.
 
     Whole numbers come as fractions of full scale, so that `scale` in the mapping is the unit's value at full scale.
-
-    Raises
-    ------
-    SourceError
-        If it is not one.
     """
 
     kind = "WAV"

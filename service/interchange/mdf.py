@@ -17,11 +17,6 @@ class MdfSource(Source):
 
     A channel is named by its own name where that is unique, and always ``number of its group/name``. ``time`` is the
     time column of the first channel that is asked for together with it.
-
-    Raises
-    ------
-    SourceError
-        If it is not one.
     """
 
     kind, package, entry = "MF4", "asammdf", "channel"

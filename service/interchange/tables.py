@@ -48,11 +48,6 @@ class CsvSource(_Table):
         1970 have more digits than a float.
     datetimes : bool
         Whether it has ISO 8601 times instead of numbers.
-
-    Raises
-    ------
-    SourceError
-        If the first lines are no table.
     """
 
     kind = "CSV"
@@ -151,13 +146,7 @@ class CsvSource(_Table):
 
 
 class ParquetSource(_Table):
-    """A Parquet file, read row group by row group.
-
-    Raises
-    ------
-    SourceError
-        If it is not one.
-    """
+    """A Parquet file, read row group by row group."""
 
     kind = "Parquet"
 

@@ -10,13 +10,7 @@ from service.interchange.source import Reference, Source, SourceError, Timing, r
 
 
 class TdmsSource(Source):
-    """A TDMS file, read piece by piece. Channels are named ``group/channel``, or ``channel`` where that is unique.
-
-    Raises
-    ------
-    SourceError
-        If it is not one.
-    """
+    """A TDMS file, read piece by piece. Channels are named ``group/channel``, or ``channel`` where that is unique."""
 
     kind, package, entry = "TDMS", "npTDMS", "channel"
 

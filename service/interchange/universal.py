@@ -13,13 +13,7 @@ _EVEN = 1e-6
 
 
 class UniversalSource(Source):
-    """A UFF file, read whole. A data set is named by its first line where that is unique, and ``set 1``, ``set 2``, ...
-
-    Raises
-    ------
-    SourceError
-        If it is not one, or holds no time response.
-    """
+    """A UFF file, read whole. A data set is named by its first line where that is unique, and by number: ``set 1``."""
 
     kind, package, entry = "UFF", "pyuff", "data set"
 
