@@ -175,11 +175,6 @@ class FirstWindows:
         self._end_ns = 0
         self.reference: LevelReference | None = None
 
-    @property
-    def lacking(self) -> int:
-        """Windows that are still to come."""
-        return 0 if self.reference is not None else self._count - len(self._seen)
-
     def take(self, start_ns: int, end_ns: int, levels: WindowLevels) -> None:
         """Take note of a full window."""
         if self.reference is not None or start_ns < self._end_ns:

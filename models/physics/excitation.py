@@ -131,11 +131,6 @@ def low_pass_slopes(frequency_hz: FloatArray, cutoff_hz: float, order: float = 2
     return stopped, -stopped * np.log(np.maximum(ratio, 1e-12))
 
 
-def unit_spectrum(frequency_hz: FloatArray, cutoff_hz: float) -> FloatArray:
-    """Two-sided power spectral density of a unit-variance coloured force, 1/Hz; same shape as `frequency_hz`."""
-    return 4 * FILTER_DAMPING / (2 * math.pi * cutoff_hz) * low_pass(frequency_hz, cutoff_hz)
-
-
 def expanded_A(rotor: RotorParameters, speed_rad_s: float, sources: tuple[Source, ...]) -> FloatArray:
     """System matrix A* of rotor and filters (Eq. 12), shape (n, n): 12 rotor states, then each source's filter."""
     filters = [colouring_filter(source) for source in sources]

@@ -169,7 +169,6 @@ def test_the_first_windows_become_the_reference_and_survive_a_restart() -> None:
         first.take(number * 30, number * 30 + 60, window(overall=1e-3 * (1 + number), x1=1e-6j))
         again = FirstWindows(["DE-H"], 3)
         again.restore(first.checkpoint())
-        assert again.lacking == first.lacking
         first = again
     assert first.reference is not None
     level = first.reference.states[0].levels["DE-H"]["overall"]
