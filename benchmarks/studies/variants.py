@@ -130,8 +130,8 @@ class VariantEquation(Equation):
     def rows(self, view: StatisticsView, machine: Machine) -> EquationRows:
         """Rows of one view, one per lag and reference kept."""
         rows = Equation.rows(self, view, machine)
-        kept = np.arange(rows.target.size).reshape(-1, 4)[:, : self.references].ravel()
-        parts = (rows.inputs[kept], rows.target[kept], rows.signatures[kept])
+        kept = np.arange(rows.target.shape[-1]).reshape(-1, 4)[:, : self.references].ravel()
+        parts = (rows.inputs[..., kept, :], rows.target[..., kept], rows.signatures[..., kept, :])
         if self.unit is None:
             return EquationRows(*parts)
         return _LevelRows(*(part / self.unit for part in parts))
@@ -145,7 +145,7 @@ class _FixedSpeedEquation(SynchronousEquation):
         """Rows of one view."""
         rows = SynchronousEquation.rows(self, view, machine)
         speed2 = (view.speed_rad_s / machine.operation.speed_rad_s) ** 2
-        inputs = rows.inputs[:, (0, 3, 4)] / np.array([1.0, speed2, speed2])
+        inputs = rows.inputs[..., (0, 3, 4)] / np.array([1.0, speed2, speed2])
         return EquationRows(inputs, rows.target, rows.signatures)
 
 
@@ -154,7 +154,7 @@ class LinearRelation(Network):
     """A linear map in the network's place; `W2` and `b2` alone are used."""
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
-        """Output for each row of inputs, shape (n_rows,)."""
+        """Output for each row of inputs, shape (…, n_rows)."""
         return np.asarray(inputs / self.input_scale @ self.W2 + self.b2[0], dtype=np.float64)
 
 

@@ -16,6 +16,7 @@ Without a phase reference the angle begins anew in every hop, and each of its se
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -119,10 +120,11 @@ class Plan:
         -------
         ndarray, shape (n_samples, width)
         """
-        vibration = samples[:, self.columns].astype(np.float64) * self.scales
-        if self.angle_column is None:
-            return vibration
-        return np.column_stack([vibration, samples[:, self.angle_column].astype(np.float64)])
+        si = np.empty((samples.shape[0], self.width))
+        np.multiply(samples[:, self.columns], self.scales, out=si[:, : self.columns.size])
+        if self.angle_column is not None:
+            si[:, -1] = samples[:, self.angle_column]
+        return si
 
 
 def plan_for(machine: MachineFile, *, lagged: bool = True, levels: bool = False) -> Plan:
@@ -322,15 +324,24 @@ def _lagged_products(a: FloatArray, plan: Plan) -> FloatArray:
 def _segment_spectra(a: FloatArray, plan: Plan) -> ComplexArray:
     """Fourier coefficients of the half-overlapping segments that end within the hop."""
     half = plan.segment // 2
-    taper = np.hanning(plan.segment + 1)[:-1]
-    taper /= np.sqrt(plan.rate_hz * np.sum(taper**2))
+    taper = _hann(plan.segment, plan.rate_hz)
     first = plan.preamble + half - plan.segment
     pieces = np.lib.stride_tricks.sliding_window_view(a[:, first:], plan.segment, axis=1)[:, ::half]
     spectra = np.fft.rfft(pieces[:, : plan.hop // half] * taper)
     return np.ascontiguousarray(spectra[:, :, plan.bins[0] : plan.bins[-1] + 1].transpose(1, 2, 0))
 
 
+@lru_cache(maxsize=8)
+def _hann(size: int, rate_hz: float) -> FloatArray:
+    """Taper of segments, so that squared magnitudes of their transforms are densities per Hz."""
+    taper = np.hanning(size + 1)[:-1]
+    taper /= np.sqrt(rate_hz * np.sum(taper**2))
+    taper.flags.writeable = False
+    return taper
+
+
 SpeedSource = Literal["phase reference", "estimated", "unknown"]
+_DEPENDENT = 1e-15
 STEADY = 0.01  # range of the hops' speeds, relative, up to which one set of coefficients serves the window
 
 
@@ -369,8 +380,9 @@ def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
 
 
 def regression(zero_lag: FloatArray, n: int) -> FloatArray:
-    """β of x on the regressors, shape (n, n_regressors); of least norm where a stuck angle makes them dependent."""
-    return np.asarray(np.linalg.lstsq(zero_lag[n:, n:], zero_lag[n:, :n], rcond=None)[0].T, dtype=np.float64)
+    """β of x on the regressors, shape (…, n, n_regressors); of least norm where a stuck angle makes them dependent."""
+    between = np.linalg.pinv(zero_lag[..., n:, n:], rcond=_DEPENDENT, hermitian=True)
+    return np.asarray((between @ zero_lag[..., n:, :n]).swapaxes(-1, -2), dtype=np.float64)
 
 
 def hop_coefficients(plan: Plan, hops: tuple[HopMoments, ...], rotation: Rotation, mean: FloatArray) -> HopCoefficients:

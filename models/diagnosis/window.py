@@ -8,6 +8,7 @@ all of them were stored.
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -31,8 +32,10 @@ from models.errors import CheckpointError
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 
+_AT_ONCE = 32  # bins whose coefficients stay in a processor's cache
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True)
 class WindowStatistics:
     """Everything the diagnosis looks at, for one window."""
 
@@ -91,7 +94,7 @@ class WindowStatistics:
         """Rotation-synchronous vectors of each hop, from an angle that may be another one in each; None if unknown."""
         return self.hop_synchronous if self.relative_synchronous is None else self.relative_synchronous
 
-    @property
+    @cached_property
     def hop_waveform(self) -> Waveform:
         """The waveforms hop by hop, shape (n_hops, n)."""
         return stacked_waveform(self.waveforms)
@@ -145,9 +148,11 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:
-        hop_synchronous = np.stack([_synchronous(regression(product[0], n)) for product in products])
-    rest = np.ascontiguousarray(cleaned.transpose(1, 2, 0))
-    spectrum = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
+        hop_synchronous = _synchronous(regression(products[:, 0], n))
+    spectrum = np.empty((plan.bins.size, n, n), dtype=np.complex128)
+    for first in range(0, plan.bins.size, _AT_ONCE):
+        rest = np.ascontiguousarray(cleaned[:, first : first + _AT_ONCE].transpose(1, 2, 0))
+        spectrum[first : first + _AT_ONCE] = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(
         states=plan.mounted,
@@ -245,7 +250,7 @@ def _speeds(rotation: Rotation, hops: tuple[HopMoments, ...], plan: Plan) -> tup
 
 
 def _synchronous(beta: FloatArray) -> ComplexArray:
-    return np.asarray(beta[:, 1] - 1j * beta[:, 2], dtype=np.complex128)
+    return np.asarray(beta[..., 1] - 1j * beta[..., 2], dtype=np.complex128)
 
 
 class SlidingWindow:

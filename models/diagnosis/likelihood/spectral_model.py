@@ -91,8 +91,7 @@ class SpectralModel:
         self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
         # Over the root of frequency the polynomials resolve a low-pass at the lower and a hump at the upper end alike.
         x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
-        polynomials = [np.polynomial.legendre.Legendre.basis(j + 1)(x) for j in range(shapes)]
-        self._b = np.reshape(polynomials, (shapes, x.size)).T
+        self._b = np.polynomial.legendre.legvander(x, shapes)[:, 1:]
         self._w = 2 * np.pi * groups.nodes_hz
         # Neighbouring groups share nodes, and all are filled up to one number: half of them where damping is light.
         self._distinct_w, self._place = np.unique(self._w, return_inverse=True)
@@ -130,6 +129,16 @@ class SpectralModel:
         P[3, 3] += change[3]
         dynamic = -(w[:, None, None] ** 2) * self._M + 1j * w[:, None, None] * P + Q
         return np.asarray(np.linalg.inv(dynamic), dtype=np.complex128)
+
+    def dynamic_changes(self, structural: FloatArray, w: float) -> ComplexArray:
+        """Derivatives of -ω²M + jωP + Q by the logarithmic ratios of `STRUCTURAL`, shape (5, 6, 6)."""
+        changes = np.zeros((len(STRUCTURAL), 6, 6), dtype=np.complex128)
+        for number, dof in enumerate(_BEARING_DOFS):
+            changes[number, dof, dof] = (
+                self._bearing[number] * np.exp(structural[number]) * (1j * w if number % 2 else 1)
+            )
+        changes[4] = self._Q_shaft * np.exp(structural[4])
+        return changes
 
     def measured(self, response: ComplexArray, w: FloatArray) -> ComplexArray:
         """Measured motions, each frequency by itself, of all coordinates' responses; shape (n_frequencies, n, …)."""

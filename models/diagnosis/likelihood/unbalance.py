@@ -101,16 +101,11 @@ def estimate_unbalance(
     phase = np.exp(1j * machine.operation.unbalance_phase_rad)
     force = rotor.m2_kg * rotor.e_m * speed_rad_s**2 * phase * np.array([0, 1, 0, 0, -1j, 0])
 
-    def response(ratios: FloatArray) -> ComplexArray:
-        vectors = model.measured(model.receptance(ratios, speed_rad_s, w) @ force[:, None], w)
-        return np.asarray(vectors[0, :, 0], dtype=np.complex128)
-
     structural = point.theta[: len(STRUCTURAL)]
-    g = response(structural)
-    step = 1e-5
-    slopes = np.stack(
-        [response(structural + step * unit) - response(structural - step * unit) for unit in np.eye(len(STRUCTURAL))]
-    ) / (2 * step)
+    H = model.receptance(structural, speed_rad_s, w)[0]
+    moved = H @ force
+    slopes = -(model.dynamic_changes(structural, speed_rad_s) @ moved) @ H.T  # ∂H = -H ∂D H
+    g, *slopes = model.measured(np.vstack([moved, slopes]).T[np.newaxis], w)[0].T
     noise = 4 * _around_rotation(machine, model, point, speed_rad_s, duration_s) / duration_s
     q = (model.motions.combine(w) @ synchronous)[0]
     weighted = np.linalg.solve(noise, g)
@@ -122,8 +117,8 @@ def estimate_unbalance(
     values, variances, with_structural = np.empty(3), np.empty(3), np.empty((3, len(STRUCTURAL)))
     between = 0.0
     for design, at, expected in ((g2[:, None], [0], ratio.real), (np.stack([g2, turned2], axis=1), [1, 2], ratio)):
-        moved = slopes * expected
-        J = np.concatenate([moved.real, moved.imag], axis=1).T
+        shifts = np.stack(slopes) * expected
+        J = np.concatenate([shifts.real, shifts.imag], axis=1).T
         total = own + J @ covariance @ J.T
         weight = np.linalg.solve(total, design).T
         precision = weight @ design

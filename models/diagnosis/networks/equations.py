@@ -25,21 +25,21 @@ _ANGLES = np.arange(16) * (2 * np.pi / 16)
 
 @dataclass(frozen=True, slots=True)
 class StatisticsView:
-    """The statistics an equation looks at: of a whole window or of one hop in it."""
+    """The statistics an equation looks at: of a whole window, or of each hop in it along one axis more."""
 
     states: tuple[str, ...]  # measured states, naming rows and columns of the correlations
-    correlation: FloatArray  # (n_lags, n, n), stochastic part at the lags that the networks use
-    synchronous: ComplexArray | None  # (n,), rotation-synchronous vectors
+    correlation: FloatArray  # (…, n_lags, n, n), stochastic part at the lags that the networks use
+    synchronous: ComplexArray | None  # (…, n), rotation-synchronous vectors
     speed_rad_s: float  # speed Ω
 
 
 @dataclass(frozen=True, slots=True)
 class EquationRows:
-    """Training or evaluation rows of one equation: one per lag and reference."""
+    """Training or evaluation rows of one equation: one per lag and reference, with axes before them as in the view."""
 
-    inputs: FloatArray  # (n_rows, n_inputs)
-    target: FloatArray  # (n_rows,)
-    # (n_rows, n_parameters): what a relative change of one of the own parameters adds to the target
+    inputs: FloatArray  # (…, n_rows, n_inputs)
+    target: FloatArray  # (…, n_rows)
+    # (…, n_rows, n_parameters): what a relative change of one of the own parameters adds to the target
     signatures: FloatArray
 
     @property
@@ -107,10 +107,11 @@ class Equation:
         rates = [index[f"{name}_dot"] for name in _REFERENCES]
 
         def values(term: Term) -> FloatArray:
-            rows = view.correlation[:, rates if term.rate_reference else references, index[term.response]].ravel()
+            rows = view.correlation[..., rates if term.rate_reference else references, index[term.response]]
+            rows = rows.reshape(*rows.shape[:-2], -1)
             return rows * speed_ratio if term.times_speed else rows
 
-        inputs = np.stack([values(term) for term in self.inputs], axis=1)
+        inputs = np.stack([values(term) for term in self.inputs], axis=-1)
         coefficients = np.array([function(machine.rotor) for function in self.signatures.values()])
         return EquationRows(inputs, values(self.target), inputs @ coefficients.T)
 
@@ -148,12 +149,12 @@ class SynchronousEquation:
         """
         if view.synchronous is None:
             raise EstimationError(f"{machine.name}: equation 29 without a phase reference")
-        y1, y2, z1, z2 = (complex(view.synchronous[view.states.index(name)]) for name in _REFERENCES)
+        y1, y2, z1, z2 = (view.synchronous[..., view.states.index(name), np.newaxis] for name in _REFERENCES)
         speed2 = (view.speed_rad_s / machine.operation.speed_rad_s) ** 2
         turn = np.exp(1j * _ANGLES)
         R_nn = np.real(np.exp(1j * machine.operation.unbalance_phase_rad) * turn) / 2
 
-        def correlation(vector: complex) -> FloatArray:
+        def correlation(vector: ComplexArray) -> FloatArray:
             return np.asarray(np.real(vector * turn) / 2, dtype=np.float64)
 
         e = speed2 * machine.rotor.e_m * R_nn
@@ -161,10 +162,11 @@ class SynchronousEquation:
         for own, other, disc in ((y1, 1j * z1, y2), (1j * z1, y1, 1j * z2)):
             R = correlation(own)
             columns = (R, speed2 * R, speed2**2 * R, speed2 * correlation(other), e, speed2 * e, speed2**2 * e)
-            planes.append((np.stack(columns, axis=1), correlation(disc)))
-        inputs, target = (np.concatenate(parts) for parts in zip(*planes, strict=True))
+            planes.append((np.stack(np.broadcast_arrays(*columns), axis=-1), correlation(disc)))
+        inputs, target = (np.concatenate(parts, axis=R.ndim - 1) for parts in zip(*planes, strict=True))
         response = _disc_response_to_e(machine.rotor, view.speed_rad_s)
-        return EquationRows(inputs, target, np.tile(response * R_nn, 2)[:, None])
+        signatures = np.tile(response * R_nn, 2)[:, None]
+        return EquationRows(inputs, target, np.broadcast_to(signatures, (*target.shape, 1)))
 
 
 def _disc_response_to_e(rotor: RotorParameters, speed_rad_s: float) -> float:

@@ -36,7 +36,7 @@ class Network:
     b2: FloatArray  # (1,)
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
-        """Output for each row of inputs, shape (n_rows,)."""
+        """Output for each row of inputs, shape (…, n_rows)."""
         hidden = np.tanh(inputs / self.input_scale @ self.W1 + self.b1)
         return np.asarray(hidden @ self.W2 + self.b2[0], dtype=np.float64)
 
@@ -75,18 +75,10 @@ def window_view(window: WindowStatistics, machine: Machine) -> StatisticsView:
     return StatisticsView(window.states, window.correlation[lags], window.synchronous, speed)
 
 
-def hop_views(window: WindowStatistics, machine: Machine) -> list[StatisticsView]:
-    """Each hop of the window alone."""
-    lags, whole = _used_lags(window, machine), window_view(window, machine)
-    return [
-        StatisticsView(
-            window.states,
-            window.hop_correlation[hop][lags],
-            None if window.hop_synchronous is None else window.hop_synchronous[hop],
-            whole.speed_rad_s,
-        )
-        for hop in range(window.hop_correlation.shape[0])
-    ]
+def hop_view(window: WindowStatistics, machine: Machine) -> StatisticsView:
+    """Each hop of the window alone, along the first axis."""
+    lags, speed = _used_lags(window, machine), window_view(window, machine).speed_rad_s
+    return StatisticsView(window.states, window.hop_correlation[:, lags], window.hop_synchronous, speed)
 
 
 def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: Machine) -> EquationReading:
@@ -106,11 +98,7 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     residual = _residual(trained.network, rows, norm)
     projection = np.linalg.pinv(rows.signatures / norm)
     change = projection @ residual
-    hop_rows = [equation.rows(view, machine) for view in hop_views(window, machine)]
-    n_hops = len(hop_rows)
-    inputs = np.concatenate([hop.inputs for hop in hop_rows]) / norm
-    targets = np.concatenate([hop.target for hop in hop_rows]) / norm
-    hops = (targets - trained.network(inputs)).reshape(n_hops, -1) @ projection.T
+    hops = _residual(trained.network, equation.rows(hop_view(window, machine), machine), norm) @ projection.T
     error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
     healthy = trained.healthy
     if healthy is not None:
