@@ -214,8 +214,7 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     unit = np.where(peak > 0, peak, 1.0)
     every = np.zeros((_REGRESSORS + n, n_samples), np.float32)  # with room for what the orders are fitted with
     x = every[_REGRESSORS:]
-    np.subtract(rows, mean[:, None], out=x, casting="same_kind")
-    x *= (1 / unit[:, None]).astype(np.float32)
+    np.multiply(rows - mean[:, None], 1 / unit[:, None], out=x, casting="same_kind")
     square = x * x
     sums = np.full((len(_SUMS), n), np.nan)
     sums[0] = mean
@@ -236,11 +235,12 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     bands = (scale * unit**2)[:, None] * np.add.reduceat(parts[:, : 2 * edges[-1]], 2 * edges[:-1], axis=1)
     radius = []
     for (y, z), skew in zip(plan.pairs, plan.skew, strict=True):
-        first, second = float(unit[y]), float(unit[z])
+        larger = float(max(unit[y], unit[z]))
+        first, second = float(unit[y] / larger), float(unit[z] / larger)
         distance = first**2 * square[y] + second**2 * square[z]
         if skew:
             distance -= 2 * skew * first * second * x[y] * x[z]
-        radius.append(np.sqrt(float(distance.max()) / (1 - skew**2)))
+        radius.append(larger * np.sqrt(float(distance.max()) / (1 - skew**2)))
     orders = unit * _orders(every, angle_rad)
     return HopLevels(n_samples, sums, orders, np.array(radius), np.ascontiguousarray(bands.T))
 

@@ -181,3 +181,18 @@ def test_the_largest_radius_is_the_same_for_probes_at_any_angle(angles: tuple[fl
 def test_probes_that_look_the_same_way_have_no_radius() -> None:
     probes = [channel("displacement", way, "DE", at) for way, at in (("X", 0), ("Y", 15))]
     assert level_plan(probes, 2000.0, (10.0, 1000.0)).pairs == ()
+
+
+@pytest.mark.parametrize("size", [1e-60, 1e-9, 1e60])
+def test_whatever_the_size_of_a_vibration_its_levels_have_all_their_digits(size: float) -> None:
+    t = times(5.0, 2000.0)
+    theta = 2 * np.pi * 20 * t
+    seen = np.column_stack([3 * np.cos(theta), 2 * np.sin(theta + 0.4)])
+    probes = [channel("displacement", way, "disc") for way in "yz"]
+    sizes = level_plan(probes, 2000.0, (10.0, 1000.0))
+    one, scaled = (hop_levels(sizes, scale * seen, theta) for scale in (1.0, size))
+    assert scaled.orders[1] == pytest.approx(size * one.orders[1], rel=1e-6)
+    assert scaled.radius == pytest.approx(size * one.radius, rel=1e-6)
+    assert scaled.sums[1:5] == pytest.approx(size ** np.array([[2], [1], [1], [4]]) * one.sums[1:5], rel=1e-6)
+    with np.errstate(over="ignore"):  # nobody's vibration, but somebody's stream
+        assert hop_levels(sizes, 1e200 * seen, theta).radius == pytest.approx(1e200 * one.radius, rel=1e-6)
