@@ -13,11 +13,13 @@ import numpy as np
 from scipy.special import ndtri
 
 from benchmarks.studies import results as r
+from benchmarks.studies import told as t
 from benchmarks.studies.bound import cramer_rao
 from benchmarks.studies.evaluate import true_condition
 from benchmarks.studies.opinions import LAYOUTS, SEVERAL
 from benchmarks.studies.results import Chart, Estimate, Goal, Record, Table, Value
 from benchmarks.studies.study import Cell, Options, Study
+from models.commissioning.commissioned import KnowledgeLevel
 from models.diagnosis.likelihood.fit import LengthFits
 from models.diagnosis.moments import plan_for
 from models.diagnosis.verdict.calibration import MONTH_S, month_thresholds
@@ -123,6 +125,8 @@ def _rates(machine: Machine) -> dict[str, float]:
 
 
 def _measure(_: None, cell: Cell, number: int) -> list[dict[str, Value]]:
+    if isinstance(cell.given, t.Told):
+        return t.told(cell.given, number)
     case: _Case = cell.given
     machine, plan = case.machine, plan_for(case.machine)
     scenario, step_s, bound = case.trial(number)
@@ -176,7 +180,7 @@ def _rounded(value: float | None) -> float | None:
 
 def _judged(records: Sequence[Record]) -> Iterator[Record]:
     """With the delay over the bound's time; infinite where it was not found while it was watched."""
-    for row in records:
+    for row in (row for row in records if "detected_s" in row):
         valid = row | {"found": np.inf if row["detected_s"] is None else row["detected_s"]}  # type: ignore[operator]
         valid["named"] = np.inf if row["named_s"] is None else row["named_s"]
         for name, bound in (("ratio", "bound_s"), ("fixed ratio", "bound_fixed_s")):
@@ -225,6 +229,7 @@ def _tables(own_s: float) -> tuple[Table, ...]:
             lambda records: _judged(r.where(records, hop_s=own_s, layout=SEVERAL)),
             f"Streams with independent sources, hop of {own_s:g} s:",
         ),
+        *t.TABLES,
     )
 
 
@@ -236,6 +241,7 @@ def _goals(own_s: float, records: Sequence[Record]) -> Iterator[Goal]:
         yield r.within(f"found within twice the bound's time, {declared}", within_twice, 0.95, 1.0)
     yield r.within("a wrong name on the way", r.each(streams, ("layout",), r.share("wrong")), 0.0, 0.01)
     yield r.within("an alarm before the step", r.each(streams, ("layout",), r.share("early")), 0.0, 0.01)
+    yield from t.goals(records)
 
 
 def _charts(records: Sequence[Record]) -> Iterator[Chart]:
@@ -279,6 +285,10 @@ def delay(options: Options) -> Study:
             }
             case = _Case(one, options.seed, _STREAM + 10 * layout + at, layout, name, change)
             cells.append(Cell(keys, trials, case))
+    for level in (KnowledgeLevel.FULL, KnowledgeLevel.NONE):
+        keys = {"layout": "either", "changed": "one or two", "hop_s": own, "short_s": "", "level": level.value}
+        trials = 1 if options.small else round(2.5 * options.windows)
+        cells.append(Cell(keys, trials, t.Told((options.machines or ("lab",))[0], level, options.seed)))
     return Study(
         name="delay",
         cells=tuple(cells),

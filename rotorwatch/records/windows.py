@@ -102,8 +102,15 @@ class Finding(Record):
     name: ParameterName
     text: ParameterText
     since_ns: int = Field(
-        description="start of the stretch of data that found it first: the date of the change, as far as it is known",
+        description="when it changed, as far as it is known; without `between_ns` the start of the stretch of data "
+        "that found it first",
         examples=[EXAMPLE_NS - 20_000_000_000],
+    )
+    between_ns: tuple[int, int] | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="95 % limits of that moment; left out where the windows do not show it",
+        examples=[(EXAMPLE_NS - 22_500_000_000, EXAMPLE_NS - 17_500_000_000)],
     )
     found_ns: int = Field(description="end of that stretch", examples=[EXAMPLE_NS - 10_000_000_000])
     stretch_s: float = Field(description="length of that stretch", examples=[10.0])
@@ -150,8 +157,9 @@ class Verdict(Record):
         description="no change within the window: `parameters` hold for one state of the machine", examples=[False]
     )
     current: tuple[Parameter, ...] = Field(
-        description="readings of the data since the last change, at most one window, changed parameters with the "
-        "others held at nominal; empty while there is too little"
+        description="readings of the machine since the last change, from at most one window and those before it; of "
+        "changed parameters over all that may have changed beside them, and over when. Without those of which there "
+        "is too little data yet"
     )
 
 

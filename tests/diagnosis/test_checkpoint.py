@@ -15,7 +15,7 @@ from models.commissioning.commissioned import install
 from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.moments import plan_for
-from models.diagnosis.verdict.sequential import SequentialState, finding, hop_arrays
+from models.diagnosis.verdict.remembered import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError
@@ -279,7 +279,8 @@ def stretches(draw: st.DrawFn) -> Stretch:
     )
 
 
-findings = st.builds(finding, st.sampled_from(PARAMETERS), times, times, numbers)
+limits = st.tuples(times, times).map(lambda both: (min(both), max(both)))
+findings = st.builds(finding, st.sampled_from(PARAMETERS), times, times, numbers, st.none() | limits)
 states = st.builds(
     SequentialState,
     st.dictionaries(
@@ -291,6 +292,7 @@ states = st.builds(
     st.none() | times,
     st.tuples(*[numbers] * len(PARAMETERS)),
     st.lists(findings, max_size=3).map(tuple),
+    st.none() | times,
 )
 
 
@@ -299,10 +301,13 @@ states = st.builds(
 def test_the_state_of_the_sequential_test_is_restored_exactly(state: SequentialState) -> None:
     hops = [from_bytes(to_bytes(hop_arrays(came))) for _, came in sorted(state.hops().items())]
     again = SequentialState.restored(from_bytes(to_bytes(state.checkpoint())), hops)
-    assert again.change_ns == state.change_ns
+    assert (again.change_ns, again.dated_ns) == (state.change_ns, state.dated_ns)
     assert repr(again.before) == repr(state.before)
     assert repr(again.findings) == repr(state.findings)
     assert again.sums.keys() == state.sums.keys()
+    older = {name: array for name, array in state.checkpoint().items() if name not in {"dated_ns", "between_ns"}}
+    without = SequentialState.restored(older, hops)  # as an earlier version stored it
+    assert (without.dated_ns, {one.between_ns for one in without.findings} - {None}) == (None, set())
     for windows, ring in state.sums.items():
         for one, other in zip(again.sums[windows], ring, strict=True):
             assert (one.start_ns, one.end_ns, repr(one.misfit_z)) == (

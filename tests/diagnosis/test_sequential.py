@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats.qmc import MultivariateNormalQMC
 
+from models.diagnosis.readings import Z95
+from models.diagnosis.verdict.astride import read_changes
 from models.diagnosis.verdict.calibration import (
     MONTH_S,
     crossing_rate,
@@ -16,7 +18,8 @@ from models.diagnosis.verdict.calibration import (
     window_thresholds,
 )
 from models.diagnosis.verdict.isolation import isolate
-from models.diagnosis.verdict.sequential import SequentialSettings, SequentialState, SequentialTest, hop_arrays
+from models.diagnosis.verdict.remembered import SequentialState, hop_arrays
+from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
@@ -193,6 +196,50 @@ def test_readings_are_those_of_the_new_machine_while_the_window_straddles() -> N
     (k_by,) = (reading for reading in last.current if reading.name == "k_by")
     assert k_by.relative_change == pytest.approx(-0.25, abs=0.03)
     assert not last.settled
+
+
+def test_a_window_astride_a_change_says_how_much_it_does_not_know() -> None:
+    """Windows alone, as without parameters: size and date of what is quoted first hold the truth."""
+    settings, rng = SequentialSettings(hop_s=5.0, window_hops=12, short_hops=()), np.random.default_rng(SEED + 21)
+    sizes, dates = [], []
+    for trial in range(40):
+        name, change = ("k_by", "c_by", "e")[trial % 3], float(rng.choice([-0.25, -0.15, 0.15, 0.3, 0.5]))
+        test, hops, share = SequentialTest(settings), gaussian(SEED + 30 + trial, settings), float(rng.uniform())
+        mixed = true(**{name: change}) * share
+        for number in range(60):
+            looks = hops.looks(true() if number < 40 else mixed if number == 40 else true(**{name: change}))
+            if not looks:
+                continue
+            verdict = test.update(looks)
+            found = {one.name: one.between_ns for one in verdict.changed}
+            quoted = [one.interval_95 for one in verdict.current if one.name == name and name in found]
+            if quoted:
+                (low, high), (after, before) = quoted[0] or (0.0, 0.0), found[name] or (0, 0)
+                sizes.append(low <= change <= high)
+                dates.append(after <= (41 - share) * 5e9 <= before < after + 60e9)
+                break
+    assert len(sizes) == 40
+    assert sum(sizes) >= 34  # 95 % of 40 are fewer once in 80
+    assert sum(dates) >= 34
+
+
+def test_what_is_too_small_to_be_named_is_not_held_at_nothing() -> None:
+    """Of two parameters that hang together one changed much and the other by too little: the first still reads true."""
+    rng, cov = np.random.default_rng(SEED + 23), np.diag(np.full(6, 1e-4))
+    cov[0, 1] = cov[1, 0] = 0.8e-4
+    held = nominal = alone = 0
+    for _ in range(200):
+        values = rng.multivariate_normal(true(k_by=-0.3) + 0.045 * np.eye(6)[1], cov)
+        look = stretch_of(window(values, cov), 0, 60 * 10**9)
+        named = [PARAMETERS.index(name) for name in isolate(look, SETTINGS.thresholds(12)).changed]
+        alone += named == [0]
+        found = read_changes([look], named, 5 * 10**9, 0)
+        held += bool(abs(found.values[0] - np.log(0.7)) <= Z95 * found.errors[0])
+        (restricted,) = [one for one in isolate(look, SETTINGS.thresholds(12)).readings if one.name == "k_by"]
+        low, high = restricted.interval_95 or (0.0, 0.0)
+        nominal += low <= -0.3 <= high
+    assert alone > 150
+    assert held >= 140 > 40 > nominal  # how sure one is that the other changed differs from window to window
 
 
 def test_what_is_outside_the_model_is_said_of_clean_data() -> None:

@@ -15,18 +15,18 @@ All times are those of the data.
 """
 
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 import numpy as np
 from scipy.special import ndtr
 
-from models.checkpoint import checked
+from models.diagnosis.verdict.astride import read_changes
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
-from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of, restricted
+from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of
+from models.diagnosis.verdict.remembered import SequentialState, finding
 from models.diagnosis.verdict.stretch import Stretch, added
-from models.errors import CheckpointError
 from models.machine import MachineFile
 from models.physics.rotor import PARAMETER_TEXT, PARAMETERS
 from models.signals.block import FloatArray
@@ -37,10 +37,12 @@ from rotorwatch.records.windows import Candidate, Finding, Parameter, Verdict
 # by more than 1.04.
 _SHORT_HOPS = (2, 4, 7)
 _DOUBLINGS = 6
-_LOWER = np.tril_indices(len(PARAMETERS))  # elements of an information matrix that are remembered: it is symmetric
 # Probability that stretches of an unchanged machine contradict each other at one hop. It costs only older data.
 _CONTRADICTION_RATE = 1e-7
 _PROBABLE = 0.05  # least probability of a parameter that is told as one that may have changed
+# Standard errors that a reading astride its change must be from zero; with fewer it is a guess of when rather than of
+# how much, and leans to what is too large.
+_CLEAR = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,105 +91,6 @@ class SequentialSettings:
         return month_thresholds(
             self.false_alarms_per_month, self.hop_s, hops, len(PARAMETERS), n_stretches=len(self.lengths)
         )
-
-
-@dataclass(slots=True)
-class SequentialState:
-    """All that the test remembers."""
-
-    # Latest stretches of one window (key 1) and of the sums of 2, 4, … windows that longer sums may be made of, oldest
-    # first.
-    sums: dict[int, list[Stretch]] = field(default_factory=dict)
-    change_ns: int | None = None  # data before this belongs to another condition of the machine
-    # Values of `PARAMETERS` in that condition, in the scale of their errors.
-    before: tuple[float, ...] = (0.0,) * len(PARAMETERS)
-    findings: tuple[Finding, ...] = ()  # what has been found and still holds
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Everything but the sums, which are in `hops`, as named arrays."""
-        rows = [(PARAMETERS.index(one.name), one.since_ns, one.found_ns) for one in self.findings]
-        oldest = [(windows, ring[0].end_ns) for windows, ring in self.sums.items() if ring]
-        return {
-            "change_ns": np.array([] if self.change_ns is None else [self.change_ns], dtype=np.int64),
-            "before": np.array(self.before, dtype=np.float64),
-            "findings": np.array(rows, dtype=np.int64).reshape(-1, 3),
-            "finding_stretch_s": np.array([one.stretch_s for one in self.findings], dtype=np.float64),
-            "oldest": np.array(oldest, dtype=np.int64).reshape(-1, 2),
-        }
-
-    def hops(self) -> dict[int, list[tuple[int, Stretch]]]:
-        """What each hop has added to `sums`, by its end: windows and stretch. A hop that is past does not change."""
-        found: dict[int, list[tuple[int, Stretch]]] = {}
-        for windows, ring in self.sums.items():
-            for one in ring:
-                found.setdefault(one.end_ns, []).append((windows, one))
-        return found
-
-    @classmethod
-    def restored(
-        cls, arrays: Mapping[str, np.ndarray], hops: Iterable[Mapping[str, np.ndarray]] = ()
-    ) -> "SequentialState":
-        """State from what `checkpoint` gave, and the `hops`, oldest first, as `hop_arrays` has them.
-
-        Raises
-        ------
-        CheckpointError
-            If an array is missing or of another form.
-        """
-        state = cls(before=tuple(checked(arrays, "before", np.float64, (len(PARAMETERS),)).tolist()))
-        change_ns = checked(arrays, "change_ns", np.int64, (None,))
-        state.change_ns = int(change_ns[0]) if change_ns.size else None
-        findings = checked(arrays, "findings", np.int64, (None, 3))
-        lengths = checked(arrays, "finding_stretch_s", np.float64, (len(findings),))
-        if np.any((findings[:, 0] < 0) | (findings[:, 0] >= len(PARAMETERS))):
-            raise CheckpointError(f"findings are of parameters {findings[:, 0].tolist()}, there are {len(PARAMETERS)}")
-        state.findings = tuple(
-            finding(PARAMETERS[number], since, found, length)
-            for (number, since, found), length in zip(findings.tolist(), lengths.tolist(), strict=True)
-        )
-        oldest: dict[int, int] = dict(checked(arrays, "oldest", np.int64, (None, 2)).tolist())
-        state.sums = {windows: [] for windows in oldest}
-        for hop in hops:
-            for windows, one in _restored_hop(hop):
-                if windows in oldest and one.end_ns >= oldest[windows]:
-                    state.sums[windows].append(one)
-        for windows, end_ns in oldest.items():
-            if not state.sums[windows] or state.sums[windows][0].end_ns != end_ns:
-                raise CheckpointError(f"the sum of {windows} windows up to end_ns {end_ns} is missing")
-        return state
-
-
-def hop_arrays(came: Sequence[tuple[int, Stretch]]) -> dict[str, np.ndarray]:
-    """One of `SequentialState.hops` as named arrays."""
-    n, stretches = len(PARAMETERS), [one for _, one in came]
-    shared = [one.common for one in stretches if one.common is not None]
-    return {
-        "times": np.array([(windows, one.start_ns, one.end_ns) for windows, one in came], dtype=np.int64),
-        "has": np.array([(one.misfit_z is not None, one.common is not None) for one in stretches]),
-        "vector": np.array([one.vector for one in stretches]),
-        "information": np.array([one.information[_LOWER] for one in stretches]),
-        "misfit_z": np.array([one.misfit_z for one in stretches if one.misfit_z is not None], dtype=np.float64),
-        "common": np.array(shared, dtype=np.float64).reshape(-1, n, n),
-    }
-
-
-def _restored_hop(arrays: Mapping[str, np.ndarray]) -> list[tuple[int, Stretch]]:
-    n = len(PARAMETERS)
-    times = checked(arrays, "times", np.int64, (None, 3))
-    has = checked(arrays, "has", np.bool_, (len(times), 2))
-    vectors = checked(arrays, "vector", np.float64, (len(times), n))
-    lower = checked(arrays, "information", np.float64, (len(times), _LOWER[0].size))
-    information = np.zeros((len(times), n, n))
-    information[:, _LOWER[0], _LOWER[1]] = information[:, _LOWER[1], _LOWER[0]] = lower
-    n_misfits, n_shared = np.count_nonzero(has, axis=0).tolist()
-    misfits = iter(checked(arrays, "misfit_z", np.float64, (n_misfits,)).tolist())
-    shared = iter(checked(arrays, "common", np.float64, (n_shared, n, n)))
-    found = []
-    for at, (windows, start_ns, end_ns) in enumerate(times.tolist()):
-        has_misfit, has_common = has[at]
-        misfit_z, common = next(misfits) if has_misfit else None, next(shared) if has_common else None
-        found.append((windows, Stretch(start_ns, end_ns, vectors[at], information[at], misfit_z, common)))
-    return found
 
 
 class SequentialTest:
@@ -294,7 +197,7 @@ class SequentialTest:
             outside_model=isolation.outside,
             outside_confidence=isolation.outside_confidence,
             decided_s=decided.duration_s,
-            settled=window_hops in clean,
+            settled=window_hops in clean and self._changed_by_ns() <= clean[window_hops].start_ns + self._slack_ns,
             current=current,
         )
 
@@ -344,6 +247,7 @@ class SequentialTest:
                 if _worst(part, whole) > self._contradiction or (explained and longer.unexplained):
                     inside = hops < self.settings.window_hops
                     self.state.change_ns = short.end_ns if inside else short.start_ns
+                    self.state.dated_ns = short.end_ns
                     if not longer.unexplained:
                         self.state.before = tuple(whole[0].tolist())
                     return
@@ -412,19 +316,42 @@ class SequentialTest:
         return bool(abs(values[at] - self.state.before[at]) < self._contradiction * np.sqrt(variances[at]))
 
     def _current(self, look: Stretch, changed: tuple[str, ...]) -> tuple[Parameter, ...]:
-        """Free readings of a stretch; the changed parameters with the unchanged ones held at nominal."""
-        sharp = {reading.name: reading for reading in restricted(look, changed, self._by)}
+        """Free readings of a stretch; those of the changed parameters over all that may be so beside them."""
         values, covariance = look.estimate()
         errors = np.sqrt(np.diag(covariance)).tolist()
-        return tuple(
-            sharp.get(name) or reading_of(look, name, self._by, value, error)
-            for name, value, error in zip(look.names, values.tolist(), errors, strict=True)
-        )
+        read = {name: (value, error) for name, value, error in zip(look.names, values.tolist(), errors, strict=True)}
+        named = [i for i in look.known if PARAMETERS[i] in changed]
+        by_ns, hop_ns = self._changed_by_ns(), round(self.settings.hop_s * 1e9)
+        windows = [one for one in self.state.sums[1] if one.known == look.known]
+        astride = bool(windows) and windows[-1].end_ns == look.end_ns and windows[-1].start_ns < by_ns - self._slack_ns
+        if named and astride:
+            found = read_changes(windows, named, hop_ns, by_ns)
+            self._date(changed, found.since_ns)
+        inside = astride and look.start_ns == windows[-1].start_ns
+        if named and not inside:
+            found = read_changes([look], named, hop_ns, look.start_ns)
+        for at, i in enumerate(named):
+            value, error = float(found.values[at]), float(found.errors[at])
+            if inside and abs(value) < _CLEAR * error:
+                del read[PARAMETERS[i]]
+            else:
+                read[PARAMETERS[i]] = value, error
+        return tuple(reading_of(look, name, self._by, value, error) for name, (value, error) in read.items())
 
+    def _changed_by_ns(self) -> int:
+        """When everything found had come: at the latest what is dated, or the end of what found it later."""
+        dated = self.state.dated_ns or 0
+        later = [one.found_ns for one in self.state.findings if one.found_ns - one.stretch_s * 1e9 > dated]
+        return max(dated, *later, 0)
 
-def finding(name: str, since_ns: int, found_ns: int, stretch_s: float) -> Finding:
-    """A parameter that changed, and the stretch that found it first; see `Finding`."""
-    return Finding(name=name, text=PARAMETER_TEXT[name], since_ns=since_ns, found_ns=found_ns, stretch_s=stretch_s)
+    def _date(self, changed: tuple[str, ...], since_ns: tuple[int, int, int] | None) -> None:
+        """Say when the changed parameters did so; one that was found before that moment changed earlier."""
+        if since_ns is not None:
+            dates = {"since_ns": since_ns[0], "between_ns": since_ns[1:]}
+            self.state.findings = tuple(
+                one.model_copy(update=dates) if one.name in changed and one.found_ns >= since_ns[0] else one
+                for one in self.state.findings
+            )
 
 
 def _candidates(isolation: Isolation) -> tuple[Candidate, ...]:

@@ -166,7 +166,7 @@ def _table(report: Report, raised: dict[str, Severity]) -> str:
             f'{others}<td class="number">{least}<td>{alarm}</tr>'
         )
     beside = "; the others read the whole window beside it" if report.opinions else ""
-    since = "" if verdict.settled else " While the window straddles a change, only the data since then are read."
+    since = "" if verdict.settled else " While the window straddles a change, what is read is the machine since then."
     return (
         f"<table><tr><th>parameter<th>relative change<th>95 % interval{heads}<th>noticed from<th>alarm</tr>{rows}"
         f'</table><p class="note">Decided on the {by}{beside}.{since} '
@@ -175,7 +175,8 @@ def _table(report: Report, raised: dict[str, Severity]) -> str:
 
 
 def _reading(parameter: Parameter, verdict: Verdict) -> str:
-    if not verdict.settled and not verdict.current:
+    read = {one.name for one in verdict.current}
+    if not verdict.settled and parameter.relative_change is not None and parameter.name not in read:
         return "<td colspan=2>too little data since the change"
     if parameter.relative_change is None or parameter.interval_95 is None:
         return f"<td colspan=2>not evaluable: {html.escape(parameter.reason)}"

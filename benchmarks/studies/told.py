@@ -1,0 +1,205 @@
+"""What alarms quote of a step while the monitor watches it, beside the truth: how large it is, and when it came."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from benchmarks.studies import results as r
+from benchmarks.studies.results import Goal, Record, Table, Value
+from benchmarks.studies.watched import commissioned
+from models.commissioning.commissioned import Installed, KnowledgeLevel
+from models.diagnosis.readings import Z95
+from models.machine import ConditionRange, Machine, MachineFile, load_machine
+from models.physics.rotor import PARAMETERS
+from models.signals.block import SampleBlock
+from rotorwatch.records.alarms import EventKind
+from rotorwatch.records.windows import Finding, Verdict
+from service.monitor.alarms.alarm import Alarm
+from service.monitor.monitor import MachineMonitor
+from simulator.scenario import Event
+from simulator.stream import blocks
+from simulator.training.draws import Draw, Layout, Purpose, draw_condition
+
+_NAMES = ("k_by", "c_by", "k_bz", "c_bz", "e")
+_TWO = 1 / 3  # of the streams have two changes
+_LEAST = {"k": 0.03, "c": 0.1, "e": 0.1}  # smallest changes; twice that where the parameters are not known
+_LOSS, _GAIN = 0.25, 0.5
+_CONDITIONS, _STREAMS = 3, 10  # healthy conditions of a commissioning, and streams that are watched with it
+_HEALTHY_WINDOWS, _WATCHED_WINDOWS, _STREAM, _BLOCK_S = 4.1, 2.1, 91, 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A machine of one level of knowledge and the seed of its streams."""
+
+    name: str
+    level: KnowledgeLevel
+    seed: int
+
+    @property
+    def machine(self) -> Machine:
+        """With all of its parameters."""
+        return load_machine(self.name)
+
+    def changes(self, number: int) -> tuple[dict[str, float], float]:
+        """What changes in a stream, and when, s."""
+        rng, window = np.random.default_rng([self.seed, number, 77]), self.machine.window
+        names = rng.choice(_NAMES, 1 if rng.random() > _TWO else 2, replace=False).tolist()
+        found = {}
+        for name in names:
+            most = _GAIN if (up := rng.random() < 0.5) else _LOSS
+            least = _LEAST[name[0]] * (1 if self.level is KnowledgeLevel.FULL else 2)
+            size = float(np.exp(rng.uniform(np.log(least), np.log(most))))
+            found[name] = size if up else -size
+        return found, 2 * window.length_s + window.hop_s * float(rng.uniform(1, 4))
+
+    def stream(self, number: int, changes: dict[str, float], step_s: float) -> Iterator[SampleBlock]:
+        """The machine in a condition of its own, or in one of the commissioned ones."""
+        if self.level is KnowledgeLevel.FULL:
+            drawn, condition = self.machine, number
+            draw = Draw(drawn, self.seed, Purpose.EVALUATION, _STREAM, layout=Layout(number % 2))
+        else:
+            drawn, draw = _condition(self, number // _STREAMS, number % _CONDITIONS)
+            condition = 2 + number
+        steps = [Event(at_s=step_s, parameter=name, relative_change=size) for name, size in changes.items()]
+        duration_s = step_s + _WATCHED_WINDOWS * self.machine.window.length_s
+        scenario = draw_condition(draw, condition).overridden(duration_s=duration_s, faults=steps)
+        return (block for block, _ in blocks(scenario, drawn, _BLOCK_S))
+
+
+def _condition(case: Told, commissioning: int, at: int) -> tuple[Machine, Draw]:
+    rng = np.random.default_rng([case.seed, commissioning, 78, at])
+    cutoff_hz = float(np.exp(rng.uniform(np.log(40.0), np.log(160.0))))
+    limits = ConditionRange(
+        cutoff_hz=(cutoff_hz, cutoff_hz), stochastic_to_1x=(1.35, 1.65), noise_relative=(0.02, 0.02)
+    )
+    operation = case.machine.operation.model_copy(update={"speed_tolerance": 0.01})
+    drawn = case.machine.model_copy(update={"condition": limits, "operation": operation})
+    own = int(rng.integers(2**62))
+    return drawn, Draw(drawn, own, Purpose.EVALUATION, layout=Layout(at % 2), fixed_condition=True)
+
+
+@lru_cache(maxsize=2)
+def _installed(case: Told, commissioning: int) -> Installed | str:
+    if case.level is KnowledgeLevel.FULL:
+        return Installed(case.machine, None, None)
+    content = case.machine.model_dump(mode="json", exclude={"rotor", "operation", "condition"})
+    streams = []
+    for at in range(_CONDITIONS):
+        drawn, draw = _condition(case, commissioning, at)
+        healthy = draw_condition(draw, 1).overridden(duration_s=_HEALTHY_WINDOWS * case.machine.window.length_s)
+        streams.append([block for block, _ in blocks(healthy, drawn, _BLOCK_S)])
+    return commissioned(MachineFile.model_validate(content), *streams)
+
+
+def told(case: Told, number: int) -> list[dict[str, Value]]:
+    """One record for each changed parameter, each wrong name, and each parameter that is read before the step."""
+    installed = _installed(case, 0 if case.level is KnowledgeLevel.FULL else number // _STREAMS)
+    if isinstance(installed, str):
+        return [{"refused": installed}]
+    changes, step_s = case.changes(number)
+    monitor = MachineMonitor(installed)
+    step_ns, rest = 0, list[dict[str, Value]]()
+    found: dict[str, dict[str, Value]] = {name: {"parameter": name, "true": size} for name, size in changes.items()}
+    for block in case.stream(number, changes, step_s):
+        step_ns = step_ns or block.start_ns + round(step_s * 1e9)
+        report = monitor.step(block)
+        if report.fault is not None:
+            raise report.fault
+        for window in report.windows:
+            delay_s = (window.end_ns - step_ns) / 1e9
+            verdict = window.verdict
+            if delay_s <= 0:
+                rest = _at_rest(verdict)
+            dated = {one.name: one for one in verdict.changed} if verdict is not None else {}
+            for alarm in (event.alarm for event in report.events if event.kind is EventKind.RAISED):
+                row = found.setdefault(alarm.name, {"parameter": alarm.name, "true": 0.0})
+                if alarm.name in PARAMETERS and "first z" not in row:
+                    row |= _quoted("first", alarm, row) | _dated(dated.get(alarm.name), step_ns)
+                    row |= {"delay_s": delay_s, "wrong": alarm.name not in changes or delay_s <= 0}
+            for alarm in monitor.health().alarms:
+                if alarm.present and "first z" in found.get(alarm.name, {}) and delay_s > 0:
+                    _standing(alarm, found[alarm.name], delay_s / case.machine.window.length_s)
+    for row in found.values():
+        row["named"] = "first z" in row if row["true"] else None
+    return [*(row for row in found.values() if row["parameter"] in PARAMETERS), *rest]
+
+
+def _at_rest(verdict: Verdict | None) -> list[dict[str, Value]]:
+    readings = () if verdict is None else verdict.current
+    return [
+        {"parameter": one.name, "true": 0.0, "at rest": abs(one.z) <= Z95, "at rest z": one.z}
+        for one in readings
+        if one.z is not None
+    ]
+
+
+def _standing(alarm: Alarm, row: dict[str, Value], windows: float) -> None:
+    """Add what an alarm quotes at a hop, so many windows after the step; the first of a full one stay."""
+    row["hops"] = int(row.get("hops") or 0) + 1
+    row["hops covered"] = int(row.get("hops covered") or 0) + bool(_quoted("now", alarm, row)["now"])
+    for tag, after in (("window", 1), ("settled", 2)):
+        if windows >= after and tag not in row:
+            row |= _quoted(tag, alarm, row)
+
+
+def _quoted(tag: str, alarm: Alarm, row: dict[str, Value]) -> dict[str, Value]:
+    """Whether the interval of an alarm holds the truth, and how many of its errors it is off."""
+    z = ((alarm.change or 0.0) - float(row["true"] or 0.0)) / (alarm.standard_error or np.nan)
+    return {tag: bool(abs(z) <= Z95), f"{tag} z": float(f"{z:.5g}")}
+
+
+def _dated(one: Finding | None, step_ns: int) -> dict[str, Value]:
+    if one is None:
+        return {}
+    holds = None if one.between_ns is None else one.between_ns[0] <= step_ns <= one.between_ns[1]
+    return {"since_s": (one.since_ns - step_ns) / 1e9, "since": holds}
+
+
+def _rms(column: str) -> Callable[[Sequence[Record]], float | None]:
+    def of(rows: Sequence[Record]) -> float | None:
+        values = r.floats(row.get(column) for row in rows)
+        return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+    return of
+
+
+def _off(rows: Sequence[Record]) -> float | None:
+    values = np.abs(r.floats(row.get("since_s") for row in rows))
+    return float(np.quantile(values, 0.95)) if values.size else None
+
+
+def _alarms(records: Sequence[Record]) -> list[Record]:
+    return [row for row in records if "true" in row]
+
+
+_COLUMNS = {
+    "changes by name": r.share("named"),
+    "first: covers": r.share("first"),
+    "first: z rms": _rms("first z"),
+    "after a window": r.share("window"),
+    "settled": r.share("settled"),
+    "settled: z rms": _rms("settled z"),
+    "wrong names": r.share("wrong"),
+    "limits of `since` hold": r.share("since"),
+    "`since` off, 95 %, s": _off,
+}
+TABLES = (
+    Table("delay-alarms", ("level",), _COLUMNS, _alarms, "What alarms quote, lab watched by the whole monitor:"),
+    Table(
+        "delay-alarms-parameters",
+        ("level", "parameter"),
+        _COLUMNS | {"delay, median s": r.middle("delay_s"), "unchanged: covers": r.share("at rest")},
+        _alarms,
+    ),
+)
+
+
+def goals(records: Sequence[Record]) -> Iterator[Goal]:
+    """What is wanted of the quotations."""
+    rows = _alarms(records)
+    for what, column in (("first raised", "first"), ("after a window", "window"), ("settled", "settled")):
+        yield r.within(f"alarms cover, {what}", r.each(rows, ("level",), r.share(column)), 0.93, 1.0)
+    yield r.within("alarms by a wrong name", r.each(rows, ("level",), r.share("wrong")), 0.0, 0.005)

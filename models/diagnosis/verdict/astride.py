@@ -1,0 +1,112 @@
+"""How large a change is, and when it came, over all that may be so.
+
+What is read of a changed parameter depends on what else changed, perhaps too little to be named, and on how much of the
+window is from after the change. Neither is known. So every set of parameters that holds the named ones and every moment
+are tried, and what is said is the mean over them by their probability, with the variance within and between.
+
+A window that holds the new state for a share of its time reads about that share of the change. One window cannot tell
+a small change from a late one; the windows before, which overlap it, show the share growing. Given the moment, the
+values before and after it are linear in what the windows read.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from models.diagnosis.verdict.stretch import Stretch
+from models.signals.block import FloatArray
+
+_STEPS = 2  # moments that are tried in every hop
+# How much a second of the new state weighs beside one of the old one: as much as it vibrates.
+_POWERS = np.array([0.25, 0.5, 1.0, 2.0, 4.0])
+# Variance that every window has for itself, over that of a window: its maximum is followed to a fraction of an error.
+_FOLLOWED = 0.1
+_BENT = 0.1  # how far the reading of a mixture is from the mixture of the readings, over the change
+_SIZE = 0.3  # standard deviation of possible changes, in the scale of the errors
+_HELD = 0.002  # the same of a parameter before it changes for the first time
+_ODDS = 0.1  # of each further parameter to have changed, once one has
+_BEFORE = 100.0  # odds of a change before data that have just begun
+_MOST = 2  # further parameters that are tried
+_QUANTILES = (0.5, 0.025, 0.975)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Changes:
+    """What the named parameters have changed to, in the scale of the errors, and when.
+
+    Attributes
+    ----------
+    values, errors : ndarray, shape (n_named,)
+    since_ns : (int, int, int) or None
+        Median and 95 % limits of the moment, never closer than half a hop; None where it is before the data.
+    """
+
+    values: FloatArray
+    errors: FloatArray
+    since_ns: tuple[int, int, int] | None
+
+
+def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, by_ns: int) -> Changes:
+    """Read what parameters have changed to by the end of the latest window.
+
+    Parameters
+    ----------
+    windows : sequence of Stretch
+        Of one length, which overlap, the latest one last; all know the same parameters.
+    named : sequence of int
+        Parameters that changed, as indices into `PARAMETERS`.
+    by_ns : int
+        When they had changed at the latest.
+    """
+    last = windows[-1]
+    known = list(last.known)
+    own, values = last.estimate()[1], np.array([one.estimate()[0] for one in windows])
+    shared = np.zeros_like(own) if last.common is None else last.common[np.ix_(known, known)]
+    whiten = np.linalg.inv(np.linalg.cholesky(own + shared))
+    seen = values @ whiten.T
+    bent = _BENT**2 * float(np.sum((seen[-1] - seen[0]) ** 2)) + 1e-12
+    starts, ends = (np.array([getattr(one, at) for one in windows], dtype=np.float64) for at in ("start_ns", "end_ns"))
+    # The first one stands for all before the data. It is as probable as the others together, and much more so where
+    # the data have only just begun: few machines change in their first minute.
+    moments = np.append(starts[0] - hop_ns, np.arange(starts[0], min(by_ns, ends[-1]), hop_ns / _STEPS))
+    watched = ends[0] <= starts[-1] + hop_ns / 2
+    odds = max(1, moments.size - 1) * (1.0 if watched else _BEFORE)
+    before = np.log(np.where(moments < starts[0], odds, 1.0))
+    length = ends[-1] - starts[-1]
+    overlap = np.clip((np.minimum(ends[:, None], ends) - np.maximum(starts[:, None], starts)) / length, 0.0, 1.0)
+    decorrelate = np.linalg.inv(np.linalg.cholesky(overlap + _FOLLOWED * np.eye(ends.size)))
+    share = np.clip((ends - moments[:, None]) / length, 0.0, 1.0)
+    part = _POWERS[:, None, None] * share
+    part /= part + 1 - share  # (n_powers, n_moments, n_windows)
+    design = decorrelate @ np.stack([1 - part, part, 4 * part * (1 - part)], axis=-1)
+    gram, right = (np.swapaxes(design, -1, -2) @ side for side in (design, decorrelate @ seen))
+
+    first = [known.index(i) for i in named]
+    others = [at for at in range(len(known)) if at not in first]
+    weights, means, variances = [], [], []
+    for count in range(min(_MOST, len(others)) + 1):
+        for further in combinations(others, count):
+            basis, scale = np.linalg.qr(whiten[:, [*first, *further]])
+            back = np.linalg.inv(scale)  # from what is seen along the basis to the set's parameters
+            gain = back @ basis.T @ whiten
+            common = gain @ shared @ gain.T
+            unit = float(np.mean(np.diag(back @ back.T)))
+            mine, n = right @ basis, len(first)
+            for spread in (_HELD**2 + float(np.mean(np.diag(common))), _SIZE**2):
+                prior = np.diag([unit / spread, unit / _SIZE**2, 1 / bent])
+                inverse = np.linalg.inv(gram + prior)
+                best = inverse @ mine
+                occam = (n + count) / 2 * np.log(np.linalg.det(inverse) * np.linalg.det(prior))
+                weights.append(before + np.sum(mine * best, axis=(-1, -2)) / 2 + occam + count * np.log(_ODDS))
+                means.append(best[..., 1, :] @ back.T[:, :n])
+                variances.append(inverse[..., 1, 1, None] * np.diag(gain @ own @ gain.T)[:n] + np.diag(common)[:n])
+    weight, every = np.exp(np.array(weights) - np.max(weights))[..., None], np.array(means)
+    weight /= weight.sum()
+    mean = np.sum(weight * every, axis=(0, 1, 2))
+    variance = np.sum(weight * (np.array(variances) + (every - mean) ** 2), axis=(0, 1, 2))
+    passed = np.cumsum(weight.sum(axis=(0, 1, 3)))
+    at = np.minimum(np.searchsorted(passed, _QUANTILES), moments.size - 1)
+    middle, low, high = (round(moment) for moment in (moments[at] + np.array([0, -0.5, 0.5]) * hop_ns).tolist())
+    return Changes(mean, np.sqrt(variance), None if middle < starts[0] else (middle, low, high))
