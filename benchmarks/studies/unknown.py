@@ -27,6 +27,8 @@ _CHANGES: tuple[dict[str, float], ...] = (
 )
 """True changes; their place is part of the seed."""
 _COMMISSIONINGS = 5
+_HEALTHY_WEIGHT = 8
+"""Windows of the healthy machine for each one of a change: false alarms are rare."""
 
 
 def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
@@ -107,11 +109,11 @@ def unknown(options: Options) -> Study:
         if name not in SUBJECTS:
             raise MachineFileError(f"--machine {name}: not among {', '.join(SUBJECTS)}")
     commissionings = 1 if options.small else _COMMISSIONINGS
-    share, rest = divmod(options.windows, commissionings)
+    plan = [options.windows * (1 if changes or options.small else _HEALTHY_WEIGHT) for changes in _CHANGES]
     cells = tuple(
         Cell(
             {"level": level.value, "machine": name, "commissioning": commissioning, "changed": changed_in(changes)},
-            share + (commissioning < rest),
+            plan[at] // commissionings + (commissioning < plan[at] % commissionings),
             (level, name, commissioning, at),
         )
         for level in (KnowledgeLevel.NONE, KnowledgeLevel.PARTIAL, KnowledgeLevel.FULL)
