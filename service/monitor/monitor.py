@@ -24,8 +24,8 @@ from models.diagnosis.moments import plan_for
 from models.diagnosis.sensors.check import sensor_findings
 from models.diagnosis.sensors.reference import implicated
 from models.diagnosis.verdict.calibration import detectable_changes
-from models.diagnosis.verdict.remembered import SequentialState
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
+from models.diagnosis.verdict.sequential_state import SequentialState
 from models.diagnosis.verdict.stretch import stretch_of
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError, EstimationError, WireError

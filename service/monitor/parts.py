@@ -14,7 +14,7 @@ from operator import itemgetter
 import numpy as np
 
 from models.checkpoint import from_bytes, prefixed, to_bytes, unprefixed
-from models.diagnosis.verdict.remembered import hop_arrays
+from models.diagnosis.verdict.sequential_state import hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 
 _HOP = "hop "

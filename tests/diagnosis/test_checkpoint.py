@@ -15,7 +15,7 @@ from models.commissioning.commissioned import install
 from models.diagnosis.likelihood.fit import LengthFits, LikelihoodFit
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.moments import plan_for
-from models.diagnosis.verdict.remembered import SequentialState, finding, hop_arrays
+from models.diagnosis.verdict.sequential_state import SequentialState, finding, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch
 from models.diagnosis.window import SlidingWindow, WindowStatistics
 from models.errors import CheckpointError

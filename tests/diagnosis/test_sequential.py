@@ -18,8 +18,8 @@ from models.diagnosis.verdict.calibration import (
     window_thresholds,
 )
 from models.diagnosis.verdict.isolation import isolate
-from models.diagnosis.verdict.remembered import SequentialState, hop_arrays
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
+from models.diagnosis.verdict.sequential_state import SequentialState, hop_arrays
 from models.diagnosis.verdict.stretch import Stretch, stretch_of, to_scale
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
