@@ -53,6 +53,16 @@ class Readiness(Record):
     machines: tuple[MachineReadiness, ...] = Field(description="machine by machine")
 
 
+class CallerRights(Record):
+    """Who calls, and what that caller may do."""
+
+    name: str = Field(description="name of the token; anonymous where none is needed", examples=["anna"])
+    scopes: tuple[str, ...] = Field(
+        description="read, operate, configure: those that the token has the way it was given, as a password read alone",
+        examples=[("read", "operate")],
+    )
+
+
 class Problem(BaseModel):
     """What went wrong with a request, after RFC 9457."""
 

@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, Query, Request
-from fastapi.responses import HTMLResponse, JSONResponse
+from fastapi.responses import JSONResponse
 from pydantic import AfterValidator, Field, WithJsonSchema
 
 from models.machine import MachineFile, load_machine
@@ -19,7 +19,7 @@ from service.api.routes.docs import add_docs_routes
 from service.api.routes.events import add_event_routes
 from service.api.routes.history import add_history_routes
 from service.api.routes.operations import add_operation_routes
-from service.api.routes.page import front_page
+from service.api.routes.page import add_page_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
 from service.api.routes.service import add_service_routes
@@ -95,6 +95,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_service_routes(app, service, guard)
     _add_readiness_routes(app, service, guard)
     add_docs_routes(app, guard)
+    add_page_routes(app, guard)
     guard.protect(app)
     return app
 
@@ -155,8 +156,3 @@ def _add_readiness_routes(app: FastAPI, service: ServiceView, guard: Guard) -> N
         if readiness.ready:
             return readiness
         return problem_answer(request, 503, "; ".join(readiness.reasons), readiness.model_dump(mode="json"))
-
-    @app.get("/", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
-    def page() -> str:
-        """Serve a plain page for people."""
-        return front_page(tuple(machine.health() for machine in service.machines()))

@@ -131,7 +131,11 @@ class EventFeed:
             self._lock.wait_for(lambda: not self._listeners, _LAST_S)
 
     async def follow(
-        self, logs: Mapping[str, MachineStore], cursor: Cursor, admitted: Callable[[], Awaitable[bool]]
+        self,
+        logs: Mapping[str, MachineStore],
+        cursor: Cursor,
+        admitted: Callable[[], Awaitable[bool]],
+        health: Callable[[str], str],
     ) -> AsyncIterator[str]:
         """Server-sent events from a cursor on, until the service or the right to listen ends.
 
@@ -143,6 +147,8 @@ class EventFeed:
             How far each has been heard, for all of `logs`.
         admitted : callable
             Whether the listener still may; asked every now and then.
+        health : callable
+            JSON of a machine's health as it is now: what was said last may be old, and with it the age of the data.
         """
         listener = _Listener(asyncio.get_running_loop())
         with self._lock:
@@ -161,8 +167,9 @@ class EventFeed:
                     waits = waits or cursor[place] < log.last_sequence()
                     said = self._health.get(place)
                     if said is not None and told.get(place) != said.number:
+                        text = said.text if place in told else await run_in_threadpool(health, place)
                         told[place] = said.number
-                        yield f"event: health\ndata: {said.text}\n\n"
+                        yield f"event: health\ndata: {text}\n\n"
                 if closes:
                     return
                 quiet = not await _woken(listener.news, _AGAIN_S if waits else _KEEP_ALIVE_S)

@@ -209,7 +209,7 @@ def test_answers_carry_safe_headers(monitor: Guarded) -> None:
             headers = client.get(path).headers
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["cache-control"] == "no-store"
-            assert headers["content-security-policy"].startswith("default-src 'none'; style-src 'unsafe-inline';")
+            assert headers["content-security-policy"].startswith("default-src 'none'; base-uri 'none';")
             assert "server" not in headers
 
 

@@ -26,7 +26,7 @@ from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import MachineEntry
 from service.stream.worker import MachineWorker
 from tests.service.live import endpoint, settings, until
-from tests.service.monitored import OPEN, client, problem, token
+from tests.service.monitored import OPEN, client, fed, problem, token
 
 EVENTS = "/api/v1/events"
 LAB, HEAVY = "demo/lab", "demo/heavy"
@@ -178,6 +178,18 @@ def test_a_reader_who_comes_back_again_and_again_has_the_exact_log(shared: Runti
         while len(found) < 150:
             found.append(reader.next().data)
     assert found == log(lab)[first + 1 :]
+
+
+def test_what_is_told_first_is_how_the_machine_is_now(tmp_path: Path) -> None:
+    with fed(tmp_path) as (runtime, feed):
+        (worker,) = runtime.machines()
+        with reading(runtime) as reader:
+            assert Health.model_validate_json(reader.next("health").data).quality.accepted_blocks == 0
+            for _ in range(3):  # too little for a report: nothing is news
+                feed.put_good()
+            until(lambda: worker.health().quality.accepted_blocks == 3, "blocks")
+        with reading(runtime) as reader:
+            assert Health.model_validate_json(reader.next("health").data).quality.accepted_blocks == 3
 
 
 def test_health_is_told_at_once_and_when_it_changes(shared: Runtime) -> None:

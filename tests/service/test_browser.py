@@ -1,21 +1,35 @@
-"""What a person sees in a browser: a real Chromium opens the pages of a running, guarded service.
+"""What a person sees in a browser: a real Chromium opens the pages of a running service.
 
 The browser is what ``ROTORWATCH_CHROMIUM`` names, or the system's own; no registry of Python packages has one that is
 kept up to date, so where there is none, these tests are skipped (what is asked of browsers is tested without one in
 ``test_access_http.py``). To keep what was seen: ``ROTORWATCH_SCREENSHOTS=FOLDER``.
 """
 
+import json
 import os
+import re
 import shutil
+import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import httpx
 import pytest
-from playwright.sync_api import Browser, Error, HttpCredentials, Page, sync_playwright
+from playwright.sync_api import Browser, Error, HttpCredentials, Page, Route, expect, sync_playwright
 
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health
+from rotorwatch.records.levels import LevelGrowth
+from rotorwatch.records.windows import SensorFault, Shape
 from service.access.scopes import Scope
-from service.runtime import Runtime
-from tests.service.monitored import GUARDED, fed, token
+from service.runtime import Runtime, running
+from service.settings.service import MachineEntry
+from simulator.scenario import parse_fault
+from tests.service.live import LAB, SHORT, Feed, endpoint, machine_file, open_session, scenario_blocks, settings
+from tests.service.monitored import GUARDED, PLACE, client, fed, token
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS = [
@@ -28,6 +42,8 @@ FLAGS = [
     "--disable-sync",
 ]
 PATIENCE_MS = 120_000.0
+FAULT_AT, SEEN_AT = 400, 700
+VIEWS = {"plant": "", "machine": "machines/demo/lab", "alarms": "alarms"}
 SCREENSHOTS = os.environ.get("ROTORWATCH_SCREENSHOTS")
 
 
@@ -47,6 +63,65 @@ def browser() -> Iterator[Browser]:
 def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
     with fed(tmp_path_factory.mktemp("machine"), GUARDED) as (running, _):
         yield running
+
+
+@dataclass(slots=True)
+class Plant:
+    """A machine whose data come as fast as they are taken up to a block, and then slowly; and one without any."""
+
+    runtime: Runtime
+    feed: Feed
+    until: int = 300
+    cut: threading.Event = field(default_factory=threading.Event)
+
+    def run(self) -> None:
+        for number, block in enumerate(scenario_blocks(100.0, parse_fault(f"k_by=-0.33@{FAULT_AT / 10}"))):
+            self.feed.put(block)
+            if self.cut.wait(0.0 if number < self.until else 1.0):
+                return
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    files = []
+    for name in ("lab", "spare"):
+        changes = (
+            *SHORT,
+            ('name = "lab"', f'name = "{name}"'),
+            ("[operation]", "[ingest]\nno_data_after_s = 6.0\n\n[operation]"),
+        )
+        files.append(machine_file(tmp_path_factory.mktemp(name), *changes))
+    address = endpoint()
+    entries = tuple(MachineEntry(file=file) for file in files)
+    plan = settings(address, when_full="wait").model_copy(update={"machines": entries})
+    with running(plan) as runtime, open_session(address) as session:
+        made = Plant(runtime, Feed(session, LAB))
+        thread = threading.Thread(target=made.run)
+        thread.start()
+        yield made
+        made.cut.set()
+        thread.join()
+
+
+@contextmanager
+def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = False) -> Iterator[Page]:
+    """A page that nothing goes wrong on and that asks nobody else, in a browser of its own."""
+    asked: list[str] = []
+    faults: list[str] = []
+    with browser.new_context(
+        viewport={"width": 390, "height": 844} if phone else {"width": 1360, "height": 850},
+        is_mobile=phone,
+        color_scheme="dark" if dark else "light",
+    ) as context:
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        yield page
+    assert asked
+    assert all(one.startswith((f"{url}/", "data:")) for one in asked), asked
+    assert not faults
 
 
 def kept(page: Page, name: str) -> None:
@@ -69,8 +144,130 @@ def test_a_browser_asks_for_the_token_and_shows_the_machine(browser: Browser, ru
         shown = page.goto(url)
         assert shown is not None
         assert shown.status == 200
+        page.locator("summary", has_text="1 without data").click()
         page.get_by_role("heading", name="demo/lab").wait_for()
         kept(page, "front")
+
+
+def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Plant) -> None:
+    url = plant.runtime.http_url
+    expect.set_options(timeout=PATIENCE_MS)
+    with looking(browser, url) as page, looking(browser, url) as second, client(plant.runtime) as http:
+        shown = page.goto(url)
+        assert shown is not None
+        policy = shown.headers["content-security-policy"]
+        assert "default-src 'none'; script-src 'self'; style-src 'self';" in policy
+        assert "unsafe" not in policy
+        tile = page.locator("machine-tile[place='demo/lab']")
+        expect(tile.locator("state-mark")).to_have_text("healthy")
+        expect(page.locator("summary")).to_have_text("1 without data")
+        second.goto(f"{url}/#/alarms")
+        plant.until = SEEN_AT
+
+        expect(tile.locator("state-mark.alert")).to_be_visible()
+        expect(tile).to_contain_text("bearing stiffness, horizontal")
+        expect(page).to_have_title(re.compile(r"^\(\d of \d\) rotorwatch$"))
+        tile.get_by_role("link").click()
+        row = page.locator("parameter-table tr", has_text="k_by")
+        expect(row).to_have_class("alert")
+        read = row.locator("td").nth(1).inner_text()
+        assert -0.4 < float(read.replace("−", "-").removesuffix(" %")) / 100 < -0.25
+        assert page.locator("parameter-table tr.alert").count() == 1
+        expect(page.locator("parameter-trend canvas")).to_have_count(6)
+        expect(page.locator("spectrum-plot canvas")).to_be_visible()
+        expect(page.get_by_role("img", name="orbit at the bearing")).to_be_visible()
+
+        seen = second.locator("alarm-list tr", has_text="k_by")
+        expect(seen).to_contain_text("unacknowledged")
+        page.locator("alarm-list tr", has_text="k_by").get_by_role("button", name="Acknowledge").click()
+        expect(seen.get_by_role("button", name="Acknowledge")).to_have_count(0)
+        assert http.get(f"{PLACE}/alarms/k_by").json()["state"] == "acknowledged"
+        expect(page.locator("alarm-history")).to_contain_text("acknowledged")
+
+        plant.cut.set()
+        page.goto(f"{url}/#/")
+        expect(tile.locator("state-mark")).to_have_text(["alert", "no data"])
+        page.goto(f"{url}/#/machines/demo/lab")
+        expect(page.locator("machine-view .head")).to_contain_text("last known: alert")
+    with client(plant.runtime) as http:
+        _two_operators(browser, plant, http)
+    for kind, phone, dark in (("light", False, False), ("dark", False, True), ("phone", True, False)):
+        with looking(browser, url, phone=phone, dark=dark) as page:
+            for name, path in VIEWS.items():
+                page.goto(f"{url}/#/{path}")
+                expect(page.locator(f"{name}-view" if name != "alarms" else "alarms-view alarm-list")).to_contain_text(
+                    "lab"
+                )
+                if name == "machine":
+                    expect(page.locator("spectrum-plot canvas")).to_be_visible()
+                kept(page, f"{name}-{kind}")
+                assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+                ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
+                assert (int(re.findall(r"\d+", ground)[0]) < 80) is dark
+
+
+def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser, plant: Plant) -> None:
+    url = plant.runtime.http_url
+    told: dict[str, Any] = dict(example(Health))
+    report: dict[str, Any] = told["report"] | {
+        "state": "watching",
+        "suspect": "a rub at the bearing",
+        "level_growth": example(LevelGrowth),
+        "sensors": [example(SensorFault)],
+        "shapes": [example(Shape)],
+    }
+    report["opinions"][0]["agreement"][0]["verdict"] = "disagree"
+    told |= {"report": report, "reason": "<b>reason</b> & more"}
+
+    def instead(route: Route) -> None:
+        lines = f"event: start\ndata: {{}}\n\nevent: health\ndata: {json.dumps(told)}\n\n"
+        route.fulfill(body=lines, content_type="text/event-stream")
+
+    with looking(browser, url) as page:
+        page.route("**/api/v1/events", instead)
+        page.goto(f"{url}/#/machines/demo/lab")
+        view = page.locator("machine-view")
+        expect(view).to_contain_text("<b>reason</b> & more")
+        verdict = report["verdict"]
+        growth = report["level_growth"]["text"]
+        quality = told["quality"]
+        for text in (
+            *(verdict["text"], "Best explained by: a rub at the bearing.", report["sensors"][0]["text"]),
+            *(report["shapes"][0]["text"], growth[1:], quality["last_refusal"], quality["last_gap"]),
+            *("not-finite 3", told["restart"], "1320 rpm", "0.4 standard deviations", "zone", "seen from", "relation"),
+            *(told["alarms"][0]["text"], "−24.7 %", "disagrees"),
+        ):
+            expect(view).to_contain_text(text)
+        expect(page.locator(".banner")).to_contain_text("No connection to the monitor since")  # the stream has ended
+
+
+def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
+    """Whoever comes second is told so; whoever may not act is not offered it."""
+    url = plant.runtime.http_url
+
+    def overtaken(route: Route) -> None:
+        order = {"reason": "I was first", "expected_state": "acknowledged"}
+        assert http.post(f"{PLACE}/alarms/k_by/shelve", json=order).status_code == 200
+        route.continue_()
+
+    with browser.new_context() as context:
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        page.route("**/shelve", overtaken)
+        page.goto(f"{url}/#/alarms")
+        row = page.locator("alarm-list tr", has_text="k_by")
+        row.get_by_role("button", name="Shelve").click()
+        page.get_by_label("Reason").fill("cable is replaced")
+        page.get_by_role("dialog").get_by_role("button", name="Shelve").click()
+        expect(page.locator("alarm-list [role=status]")).to_contain_text("Not done.")
+        expect(row).to_contain_text("I was first")
+        row.get_by_role("button", name="Unshelve").click()
+        expect(row.get_by_role("button", name="Unshelve")).to_have_count(0)
+        page.route("**/caller", lambda route: route.fulfill(json={"name": "viewer", "scopes": ["read"]}))
+        page.reload()
+        expect(row).to_be_visible()
+        expect(page.locator("alarms-view .note").first).to_contain_text("operate")
+        assert row.get_by_role("button").count() == 0
 
 
 def test_the_page_of_the_api_works_without_anything_from_elsewhere(browser: Browser, runtime: Runtime) -> None:

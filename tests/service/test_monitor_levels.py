@@ -19,7 +19,6 @@ from rotorwatch.records.alarms import EventKind
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.levels import ChannelLevels, LevelGrowth
-from service.api.routes.page import front_page
 from service.commands import watching
 from service.monitor.alarms.book import AlarmBook
 from service.monitor.levels import LevelWatch
@@ -202,10 +201,6 @@ def test_status_says_what_would_have_been_seen(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(watching, "_fetch_healths", lambda *_: [health])
     said = CliRunner().invoke(app, ["status"]).stdout
     assert f"demo/lab: {growth.text}" in said
-    assert growth.text[1:] in front_page((health,))
-    assert growth.text[1:] not in front_page(
-        (health.model_copy(update={"report": Report.model_validate(example(Report))}),)
-    )
 
 
 def held(stream: Iterator[SampleBlock], column: int, value: float) -> Iterator[SampleBlock]:

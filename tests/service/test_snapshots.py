@@ -258,6 +258,24 @@ def test_nothing_is_known_of_the_machine() -> None:
     assert all(orbit.ellipse is not None and orbit.path is not None for orbit in orbits.orbits)
 
 
+@pytest.mark.parametrize(("elsewhere", "held"), [("bearing", ["y2", "z2"]), ("bearing disc", [])])
+def test_only_levels_are_watched_at_other_places(elsewhere: str, held: list[str]) -> None:
+    moved = tuple(
+        one.model_copy(update={"location": "DE"}) if one.location in elsewhere.split() else one
+        for one in NOTHING.sensors
+    )
+    machine = NOTHING.model_copy(update={"sensors": moved})
+    data = LatestData(window_of(machine, stream(SECONDS, SEED)), 1.0, (), "", ())
+    made = snapshots_of(machine)
+    spectra, correlations = made.spectra(data), made.correlations(data)
+    assert [one.channel for one in spectra.densities] == held
+    assert {name for pair in correlations.pairs for name in (pair.first, pair.second)} == set(held)
+    assert all(("only levels are watched" in one.reason) is not bool(held) for one in (spectra, correlations))
+    for refused in (lambda: made.spectra(data, ["y1"]), lambda: made.correlations(data, ["y1"], ["y1"])):
+        with pytest.raises(SnapshotError, match="of y1 only levels are watched"):
+            refused()
+
+
 def test_a_window_that_was_not_evaluated_is_predicted_as_nominal() -> None:
     why = "demo/lab: gain of y1 is 20 % lower than when it was commissioned"
     data = LatestData(latest().window, 1.0, (), why)

@@ -88,6 +88,26 @@ def chosen_pairs(
     return tuple([*alone, *in_plane, *at_place][:MOST_PAIRS])
 
 
+def check_held(machine: MachineFile, channels: Sequence[Channel], states: Sequence[str]) -> None:
+    """Refuse channels at places of which only levels are watched.
+
+    Parameters
+    ----------
+    states : sequence of str
+        What the window holds correlations and spectra of.
+
+    Raises
+    ------
+    SnapshotError
+        If the window holds none of a channel.
+    """
+    without = [channel.name for channel in channels if state_name(channel) not in states]
+    if without:
+        raise SnapshotError(
+            f"{machine.site}/{machine.name}: of {', '.join(without)} only levels are watched, and no spectra are held"
+        )
+
+
 def vibration_channels(machine: MachineFile) -> tuple[Channel, ...]:
     """All but the shaft angle, in the order of the stream."""
     return tuple(channel for channel in machine.sensors if state_name(channel) != "theta")

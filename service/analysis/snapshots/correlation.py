@@ -9,7 +9,7 @@ from models.signals.channels import Channel, state_name
 from rotorwatch.records.snapshots import CorrelationPair, CorrelationSnapshot, Units
 from service.analysis.correlation import MeasuredCorrelations, measured_correlations
 from service.analysis.prediction import Prediction
-from service.analysis.snapshots.channels import chosen_pairs, figures, product_unit, seen_by
+from service.analysis.snapshots.channels import check_held, chosen_pairs, figures, product_unit, seen_by
 from service.analysis.snapshots.heading import LatestData, Subject, heading, no_window, theory
 
 
@@ -39,7 +39,9 @@ def correlation_snapshot(
     machine, window = subject.machine, None if data.window is None else data.window.as_mounted
     pairs = chosen_pairs(machine, first, second)
     stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
-    if window is None:
+    if window is not None and not (first or second):
+        pairs = tuple(pair for pair in pairs if all(state_name(one) in window.states for one in pair))
+    if window is None or not pairs:
         return CorrelationSnapshot(
             **heading(subject, data),
             lags_s=(),
@@ -50,6 +52,7 @@ def correlation_snapshot(
             reason=no_window(machine, data),
         )
     used = tuple(dict.fromkeys(channel for pair in pairs for channel in pair))
+    check_held(machine, used, window.states)
     states = tuple(map(state_name, used))
     columns = [window.states.index(state) for state in states]
     places = [(states.index(state_name(one)), states.index(state_name(other))) for one, other in pairs]

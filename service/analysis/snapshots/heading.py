@@ -57,7 +57,9 @@ def heading(subject: Subject, data: LatestData) -> Heading:
 
 
 def no_window(machine: MachineFile, data: LatestData) -> str:
-    """Why nothing can be shown before the first window is full."""
+    """Why nothing can be shown: before the first window is full, or where only levels are watched."""
+    if data.window is not None:
+        return f"{machine.site}/{machine.name}: only levels are watched at the places of its channels"
     return (
         f"{machine.site}/{machine.name}: no window of {machine.window.length_s:g} s is full yet, "
         f"{data.filled:.0%} of one is there"

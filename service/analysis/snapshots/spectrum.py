@@ -16,6 +16,7 @@ from service.analysis.excitation import LEFT_OUT_BINS
 from service.analysis.prediction import Prediction
 from service.analysis.snapshots.channels import (
     SnapshotError,
+    check_held,
     chosen_channels,
     chosen_pairs,
     figures,
@@ -75,7 +76,10 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
     within = _checked(machine, band_hz)
     stated = theory(prediction.changes, prediction.nominal_reason, prediction.estimated_reason)
     head = heading(subject, data)
-    if window is None:
+    if window is not None and not channels:
+        chosen = tuple(channel for channel in chosen if state_name(channel) in window.states)
+    used = tuple(dict.fromkeys((*chosen, *(one for pair in pairs for one in pair))))
+    if window is None or not used:
         return SpectrumSnapshot(
             **head,
             frequencies_hz=(),
@@ -91,10 +95,10 @@ def spectrum_snapshot(  # noqa: PLR0913  # what may be asked for
             theory=stated,
             reason=no_window(machine, data),
         )
+    check_held(machine, used, window.states)
     lines = (window.frequencies_hz >= within[0] - 1e-9) & (window.frequencies_hz <= within[1] + 1e-9)
     frequencies_hz = window.frequencies_hz[lines]
     spacing_hz = float(window.frequencies_hz[1] - window.frequencies_hz[0])
-    used = tuple(dict.fromkeys((*chosen, *(one for pair in pairs for one in pair))))
     states = tuple(map(state_name, used))
     columns = [window.states.index(state) for state in states]
     group = -(-frequencies_hz.size // MOST_LINES)

@@ -13,7 +13,7 @@ from rotorwatch.records.example import example
 from service.access.guard import Guard
 from service.access.problems import problem_responses
 from service.access.scopes import Caller
-from service.api.views import ServiceView
+from service.api.views import ServiceView, found_machine
 from service.delivery.event_feed import CURSOR_PATTERN, Cursor, CursorError, cursor_text, parsed_cursor
 from service.history.machine import MachineStore
 
@@ -86,8 +86,11 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
             except RotorwatchError:  # the database: nothing but health can be told meanwhile
                 return True
 
+        def health(place: str) -> str:
+            return found_machine(service, *place.split("/")).health().model_dump_json()
+
         return StreamingResponse(
-            service.feed.follow(logs, cursor, admitted),
+            service.feed.follow(logs, cursor, admitted, health),
             media_type="text/event-stream",
             headers={"X-Accel-Buffering": "no"},
         )

@@ -1,0 +1,63 @@
+import { clock } from "./figures.js";
+import { html, lay, table } from "./markup.js";
+import { monitor, pathOf } from "./monitor.js";
+import { MachineElement } from "./machine-element.js";
+import "./state-mark.js";
+
+const PAGE = 50;
+
+/** @typedef {import("./records.js").AlarmEvent} AlarmEvent */
+
+/** What happened to the alarms of a machine, newest first. */
+class AlarmHistory extends MachineElement {
+  /** @type {AlarmEvent[]} */
+  #events = [];
+  /** @type {number | null} */
+  #before = null;
+  #message = "";
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.follow("alarm", ({ detail }) => {
+      if (`${detail.site}/${detail.machine}` !== this.place || this.#events[0]?.sequence >= detail.sequence) return;
+      this.#events.unshift(detail);
+      this.#lay();
+    });
+    this.#events = [];
+    this.#before = null;
+    this.#load();
+  }
+
+  async #load() {
+    const older = this.#before === null ? "" : `&before=${this.#before}`;
+    try {
+      const found = await monitor.ask(`${pathOf(this.place)}/alarms/events?limit=${PAGE}${older}`);
+      this.#events.push(...found.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data));
+      this.#before = found.next_before;
+      this.#message = "";
+    } catch (error) {
+      this.#message = error instanceof Error ? error.message : String(error);
+    }
+    this.#lay();
+  }
+
+  #lay() {
+    const rows = this.#events.map((one) => ({
+      cells: [
+        html("time", { class: "number" }, clock(one.time_ns)),
+        html("span", {}, one.kind),
+        html("span", {}, one.text),
+        html("span", {}, one.actor || "monitor"),
+        html("span", {}, one.reason || one.note),
+      ],
+    }));
+    lay(
+      this,
+      html("p", { class: "message", role: "status" }, this.#message),
+      rows.length ? table(["time", "what", "event", "by", "reason"], rows, `History of ${this.place}`) : html("p", { class: "note" }, "Nothing has happened to an alarm of this machine."),
+      this.#before === null ? "" : html("button", { type: "button", click: () => this.#load() }, "Older"),
+    );
+  }
+}
+
+customElements.define("alarm-history", AlarmHistory);

@@ -1,0 +1,56 @@
+import { clock } from "./figures.js";
+import { html } from "./markup.js";
+import { monitor } from "./monitor.js";
+import { byUrgency, stands, UNSEEN } from "./states.js";
+import "./state-mark.js";
+
+const SHOWN = 5;
+
+/** Every standing alarm of every machine. */
+export function standing() {
+  return [...monitor.machines]
+    .flatMap(([place, { health }]) => health.alarms.filter(stands).map((alarm) => ({ place, alarm })))
+    .sort((one, other) => byUrgency(one.alarm, other.alarm));
+}
+
+/** The most urgent alarms of the plant in a few lines, unacknowledged ones first. */
+class AlarmStrip extends HTMLElement {
+  #gone = new AbortController();
+  #said = "";
+
+  connectedCallback() {
+    this.#gone = new AbortController();
+    monitor.addEventListener("health", () => this.#show(), { signal: this.#gone.signal });
+    this.#said = "";
+    this.#show();
+  }
+
+  disconnectedCallback() {
+    this.#gone.abort();
+  }
+
+  #show() {
+    const all = standing();
+    const said = JSON.stringify([all.length, all.slice(0, SHOWN)]);
+    if (said === this.#said) return;
+    this.#said = said;
+    const rows = all.slice(0, SHOWN).map(({ place, alarm }) =>
+      html(
+        "li",
+        { class: UNSEEN.has(alarm.state) ? "unseen" : null },
+        html("state-mark", { state: alarm.raised ? alarm.severity : "cleared" }),
+        html("a", { href: `#/machines/${place}` }, place),
+        html("span", { class: "what" }, alarm.text),
+        html("span", { class: "note" }, alarm.state),
+        html("time", { class: "number" }, clock(alarm.raised_ns ?? alarm.since_ns)),
+      ),
+    );
+    this.hidden = !all.length;
+    this.replaceChildren(
+      html("ul", { "aria-label": "standing alarms" }, ...rows),
+      html("a", { href: "#/alarms" }, all.length > SHOWN ? `all ${all.length} standing alarms` : "alarms"),
+    );
+  }
+}
+
+customElements.define("alarm-strip", AlarmStrip);

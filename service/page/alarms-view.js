@@ -1,0 +1,40 @@
+import { html } from "./markup.js";
+import { monitor } from "./monitor.js";
+import { standing } from "./alarm-strip.js";
+import "./alarm-history.js";
+import "./alarm-list.js";
+
+/** Alarms of the whole plant: those that are not normal, and the history of one machine. */
+class AlarmsView extends HTMLElement {
+  #gone = new AbortController();
+  #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Machine", change: () => this.#show() }));
+  #history = html("div");
+  #rights = html("p", { class: "note" });
+
+  connectedCallback() {
+    this.#gone = new AbortController();
+    this.replaceChildren(html("h1", {}, "Alarms"), this.#rights, html("alarm-list"), html("div", { class: "tools" }, html("h2", {}, "History"), this.#choice), this.#history);
+    monitor.addEventListener("health", () => this.#offer(), { signal: this.#gone.signal });
+    monitor.addEventListener("connection", () => this.#offer(), { signal: this.#gone.signal });
+    this.#offer();
+  }
+
+  disconnectedCallback() {
+    this.#gone.abort();
+  }
+
+  /** Every machine that has been heard of, the one with the most urgent alarm chosen first. */
+  #offer() {
+    this.#rights.textContent = !monitor.connected || monitor.may("operate") ? "" : "You may look: whoever acknowledges or shelves needs the scope operate.";
+    if (this.#choice.options.length === monitor.machines.size) return;
+    const chosen = this.#choice.value || standing()[0]?.place;
+    this.#choice.replaceChildren(...[...monitor.machines.keys()].sort().map((place) => html("option", { value: place, selected: place === chosen }, place)));
+    if (this.#history.firstElementChild?.getAttribute("place") !== this.#choice.value) this.#show();
+  }
+
+  #show() {
+    this.#history.replaceChildren(html("alarm-history", { place: this.#choice.value }));
+  }
+}
+
+customElements.define("alarms-view", AlarmsView);

@@ -1,0 +1,44 @@
+import { clock, figure, lasting } from "./figures.js";
+import { html } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import { monitor } from "./monitor.js";
+
+/** What came in, and what is to be known about it. */
+class DataQuality extends MachineElement {
+  connectedCallback() {
+    super.connectedCallback();
+    this.repeat(5, () => this.show());
+  }
+
+  show() {
+    const health = this.health;
+    if (!health) return;
+    const { quality, stream, report } = health;
+    const speed = report?.speed_rad_s ?? null;
+    const age = monitor.dataAge(this.place);
+    const refused = Object.entries(quality.refused_blocks);
+    /** @type {[string, string | false][]} */
+    const facts = [
+      ["newest data", age === null ? "never any" : `${lasting(age)} old`],
+      ["silent", stream.silent && `since ${clock(stream.silent_since_ns)}`],
+      ["window", `${(100 * health.filled).toFixed(0)} % full, until ${clock(report?.end_ns)}`],
+      ["speed", speed !== null && `${figure((speed * 30) / Math.PI)} rpm (${figure(speed)} rad/s)`],
+      ["misfit", typeof report?.misfit_z === "number" && `${figure(report.misfit_z)} standard deviations`],
+      ["blocks", `${quality.accepted_blocks} accepted, ${refused.reduce((sum, [, count]) => sum + count, 0)} refused`],
+      ["refused", refused.length > 0 && refused.map(([reason, count]) => `${reason} ${count}`).join(", ")],
+      ["last refusal", quality.last_refusal],
+      ["gaps", `${quality.gaps}${quality.missing_s ? `, ${figure(quality.missing_s)} s missing` : ""}`],
+      ["last gap", quality.last_gap],
+      ["dropped", quality.queue_dropped_blocks > 0 && `${quality.queue_dropped_blocks} blocks, the monitor could not keep up`],
+      ["lost on the way", quality.link_missed_blocks > 0 && `${quality.link_missed_blocks} blocks`],
+      ["publisher", stream.publisher_alive ? "announced" : "not announced"],
+      ["replay", stream.replay_announced && "somebody announces a replay on the machine's own keys; it is not evaluated"],
+      ["descriptor differs", stream.descriptor_mismatch.join(", ")],
+      ["restart", health.restart],
+      ["errors of the monitor", health.worker_errors > 0 && `${health.worker_errors}: ${health.last_worker_error}`],
+    ];
+    this.replaceChildren(html("h2", {}, "Data"), html("dl", {}, ...facts.filter(([, text]) => text).flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])));
+  }
+}
+
+customElements.define("data-quality", DataQuality);

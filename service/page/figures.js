@@ -1,0 +1,78 @@
+/** Numbers with units, and times, as people read them. */
+
+const MINUS = "−";
+const KEPT = "rotorwatch.times";
+export const Z95 = 1.96;
+
+/** @param {string} text */
+const signed = (text) => text.replace("-", MINUS);
+
+/**
+ * Three significant digits, without exponents where that can be read.
+ * @param {number | null | undefined} value
+ */
+export function figure(value) {
+  if (value === null || value === undefined) return "–";
+  const size = Math.abs(value);
+  if (size !== 0 && (size < 1e-3 || size >= 1e6)) return signed(value.toExponential(2));
+  return signed(size >= 100 ? value.toFixed(0) : String(Number(value.toPrecision(3))));
+}
+
+/**
+ * A relative change, with its sign.
+ * @param {number | null | undefined} ratio
+ */
+export function percent(ratio) {
+  if (ratio === null || ratio === undefined) return "–";
+  const text = (100 * ratio).toFixed(1);
+  return `${ratio > 0 && Number(text) ? "+" : ""}${signed(text)} %`;
+}
+
+/** A relative change with half its interval. @param {number} ratio @param {number} error */
+export const within = (ratio, error) => `${percent(ratio)} ± ${(100 * error).toFixed(1)} %`;
+
+/** @param {[number, number]} interval */
+export const interval = ([low, high]) => `${percent(low)} … ${percent(high)}`;
+
+/** A unit as it is printed. @param {string} unit */
+export function printed(unit) {
+  return unit.replace(/^u/, "µ").replace("/s2", "/s²").replace("^2", "²");
+}
+
+/** Whether times are local ones. */
+export const local = () => localStorage.getItem(KEPT) === "local";
+
+/** @param {boolean} wanted */
+export const showLocal = (wanted) => localStorage.setItem(KEPT, wanted ? "local" : "utc");
+
+/** @param {Intl.DateTimeFormatOptions} options */
+const format = (options) =>
+  new Intl.DateTimeFormat("sv-SE", { hourCycle: "h23", ...options, ...(local() ? {} : { timeZone: "UTC" }) });
+
+/**
+ * A time of the data or of an event; date and zone with it.
+ * @param {number | null | undefined} ns
+ */
+export function clock(ns) {
+  if (ns === null || ns === undefined) return "–";
+  return `${format({ dateStyle: "short", timeStyle: "medium" }).format(ns / 1e6)}${local() ? "" : " UTC"}`;
+}
+
+/**
+ * Times along an axis: date or time of day, as fine as the axis is divided.
+ * @param {number[]} seconds
+ * @param {number} step_s
+ */
+export function ticks(seconds, step_s) {
+  const day = format({ month: "2-digit", day: "2-digit" });
+  const time = format({ hour: "2-digit", minute: "2-digit", ...(step_s < 60 ? { second: "2-digit" } : {}) });
+  return seconds.map((each, at) => (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === 0 ? `\n${day.format(each * 1e3)}` : ""));
+}
+
+/** How long, roughly. @param {number} seconds */
+export function lasting(seconds) {
+  if (seconds < 100) return `${seconds.toFixed(0)} s`;
+  if (seconds < 100 * 60) return `${(seconds / 60).toFixed(0)} min`;
+  if (seconds < 72 * 3600) return `${(seconds / 3600).toFixed(0)} h`;
+  return `${(seconds / 86400).toFixed(0)} days`;
+}

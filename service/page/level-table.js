@@ -1,0 +1,40 @@
+import { figure, printed } from "./figures.js";
+import { html, table } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import { limitText, measureText } from "./states.js";
+import "./state-mark.js";
+
+const MEASURES = ["overall", "velocity", "x1", "x2", "mean", "crest", "kurtosis"];
+
+/** Vibration levels of each channel, their limits beside them, and what is beyond them. */
+class LevelTable extends MachineElement {
+  show() {
+    const report = this.health?.report;
+    this.hidden = !report?.levels.length;
+    if (!report?.levels.length) return this.replaceChildren();
+    const shown = MEASURES.filter((measure) => report.levels.some((one) => /** @type {any} */ (one)[measure] !== null));
+    const rows = report.levels.map((one) => {
+      const worst = one.limits.find((limit) => limit.state === "danger") ?? one.limits.find((limit) => limit.state === "alert");
+      const limits = one.limits.map((limit) =>
+        html("div", { title: limit.source }, `${measureText(limit.measure)}: ${limitText(limit)}`, html("small", {}, ` ${limit.source}`)),
+      );
+      const detection = one.detection === "peak to peak" ? "pp" : "rms";
+      return {
+        attributes: { class: worst?.state },
+        cells: [
+          html("b", {}, one.channel),
+          worst ? html("div", {}, html("state-mark", { state: worst.state }), html("div", {}, worst.text)) : "",
+          `${printed(one.unit)} ${detection}`,
+          ...shown.map((measure) => html("span", { class: "number" }, figure(/** @type {any} */ (one)[measure]))),
+          one.zone,
+          limits.length ? html("details", {}, html("summary", {}, `${limits.length}`), ...limits) : "none",
+        ],
+      };
+    });
+    const heads = ["channel", "alarm", "unit", ...shown.map((one) => (one === "velocity" ? "velocity, mm/s" : measureText(one))), "zone", "limits"];
+    const growth = report.level_growth?.text;
+    this.replaceChildren(table(heads, rows, "Vibration levels"), html("p", { class: "note" }, growth ? `${growth[0].toUpperCase()}${growth.slice(1)}.` : ""));
+  }
+}
+
+customElements.define("level-table", LevelTable);

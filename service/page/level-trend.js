@@ -1,0 +1,28 @@
+import { ReadingTrend } from "./reading-trend.js";
+import { levelUnit, measureText } from "./states.js";
+
+/** The leading level of every channel over time, with its limits. */
+class LevelTrend extends ReadingTrend {
+  quantity = "level";
+  title = "Levels over time";
+
+  async trended() {
+    return (this.health?.report?.levels ?? []).map((one) => {
+      const measure = one.limits.find((limit) => limit.state !== "normal")?.measure ?? (one.velocity === null ? "overall" : "velocity");
+      const limit = one.limits.find((each) => each.measure === measure);
+      const there = (/** @type {number | null | undefined} */ value) => (value === null || value === undefined ? [] : [value]);
+      return {
+        name: `${one.channel}:${measure}`,
+        alarm: `level:${one.channel}`,
+        title: `${one.channel} ${measureText(measure)}`,
+        unit: levelUnit(one, measure),
+        scale: 1,
+        alert: [...there(limit?.alert), ...there(limit?.fall)],
+        danger: there(limit?.danger),
+        zero: true,
+      };
+    });
+  }
+}
+
+customElements.define("level-trend", LevelTrend);

@@ -1,0 +1,136 @@
+import { html } from "./markup.js";
+import { clock, local, ticks } from "./figures.js";
+
+/** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number}} Line */
+/** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
+/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, xUnit?: string, shaded?: [number, number] | null, height: number}} Drawing */
+
+/** @type {Promise<any> | undefined} */
+let library;
+
+/** The library of charts, fetched by the first view that draws one. @returns {Promise<any>} */
+function charts() {
+  library ??= new Promise((resolve, reject) => {
+    const at = (/** @type {string} */ name) => new URL(name, import.meta.url).href;
+    document.head.append(html("link", { rel: "stylesheet", href: at("uPlot.min.css") }));
+    const script = html("script", { src: at("uPlot.iife.js"), load: () => resolve(/** @type {any} */ (window).uPlot), error: () => reject(new Error("charts cannot be loaded; load the page again")) });
+    document.head.append(script);
+  });
+  return library;
+}
+
+/** Lines over time or frequency, with bands, limits and marks; colours are names of properties of the style sheet. */
+class LineChart extends HTMLElement {
+  /** @type {any} */
+  #plot = null;
+  /** @type {Drawing | null} */
+  #drawing = null;
+  #shape = "";
+  #sized = new ResizeObserver(() => this.#plot?.setSize(this.#size()));
+  #dark = matchMedia("(prefers-color-scheme: dark)");
+  #again = () => {
+    this.#shape = "";
+    if (this.#drawing) this.draw(this.#drawing);
+  };
+
+  connectedCallback() {
+    this.#sized.observe(this);
+    this.#dark.addEventListener("change", this.#again);
+  }
+
+  disconnectedCallback() {
+    this.#sized.disconnect();
+    this.#dark.removeEventListener("change", this.#again);
+    this.#plot?.destroy();
+    this.#plot = null;
+    this.#shape = "";
+  }
+
+  /** @param {Drawing} drawing */
+  async draw(drawing) {
+    this.#drawing = drawing;
+    const uPlot = await charts();
+    if (!this.isConnected) return;
+    const data = [drawing.x, ...drawing.lines.map((line) => line.values)];
+    const shape = JSON.stringify([drawing.lines.map((line) => line.label), drawing.unit, local()]);
+    if (this.#plot && shape === this.#shape) return this.#plot.setData(data);
+    this.#plot?.destroy();
+    this.#shape = shape;
+    this.#plot = new uPlot(this.#options(uPlot, drawing), data, this);
+  }
+
+  #size() {
+    return { width: Math.max(this.clientWidth, 200), height: this.#drawing?.height ?? 160 };
+  }
+
+  /** @param {string} name */
+  #colour(name) {
+    return getComputedStyle(this).getPropertyValue(`--${name}`).trim();
+  }
+
+  /** @param {any} uPlot @param {Drawing} drawing */
+  #options(uPlot, drawing) {
+    const [ink, grid] = [this.#colour("ink-2"), this.#colour("line")];
+    const axis = { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { stroke: grid, width: 1 }, font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif" };
+    const lines = drawing.lines.map((line) => ({
+      label: line.label,
+      stroke: line.hidden ? "transparent" : this.#colour(line.colour ?? "trace"),
+      width: line.hidden ? 0 : (line.width ?? 1.5),
+      dash: line.dash,
+      points: { show: drawing.x.length < 3 && !line.hidden },
+      value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : Number(value.toPrecision(3)).toString().replace("-", "−")),
+    }));
+    return {
+      ...this.#size(),
+      series: [{ label: drawing.time ? "time" : drawing.xUnit, value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : drawing.time ? clock(value * 1e9) : value.toFixed(1)) }, ...lines],
+      bands: drawing.band ? [{ series: drawing.band.map((at) => at + 1), fill: this.#colour("band") }] : [],
+      scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
+      axes: [drawing.time ? { ...axis, space: 75, values: (/** @type {any} */ _, /** @type {number[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, label: drawing.unit, labelSize: 16 }],
+      tzDate: (/** @type {number} */ seconds) => (local() ? new Date(seconds * 1e3) : uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC")),
+      cursor: { drag: { x: true, y: false } },
+      hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)] },
+    };
+  }
+
+  /** All that is drawn, and the limits that shall be seen beside it. @param {number} low @param {number} high */
+  #range(low, high) {
+    const seen = [...(this.#drawing?.include ?? []), low, high].filter((each) => Number.isFinite(each));
+    const [bottom, top] = [Math.min(...seen), Math.max(...seen)];
+    const rim = 0.06 * (top - bottom || Math.abs(top) || 1);
+    return [bottom === 0 ? 0 : bottom - rim, top + rim];
+  }
+
+  /** @param {any} plot */
+  #shade(plot) {
+    if (!this.#drawing?.shaded) return;
+    const [from, to] = this.#drawing.shaded.map((each) => plot.valToPos(each, "x", true));
+    plot.ctx.fillStyle = this.#colour("shade");
+    plot.ctx.fillRect(from, plot.bbox.top, to - from, plot.bbox.height);
+  }
+
+  /** @param {any} plot */
+  #mark(plot) {
+    const { ctx, bbox } = plot;
+    ctx.save();
+    ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.lineWidth = 1.5 * devicePixelRatio;
+    ctx.beginPath();
+    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+    ctx.clip();
+    for (const mark of this.#drawing?.marks ?? []) {
+      const place = plot.valToPos(mark.at, mark.axis, true);
+      const upright = mark.axis === "x";
+      ctx.strokeStyle = ctx.fillStyle = this.#colour(mark.colour);
+      ctx.setLineDash((mark.dash ?? []).map((each) => each * devicePixelRatio));
+      ctx.beginPath();
+      ctx.moveTo(upright ? place : bbox.left, upright ? bbox.top : place);
+      ctx.lineTo(upright ? place : bbox.left + bbox.width, upright ? bbox.top + bbox.height : place);
+      ctx.stroke();
+      const gap = 3 * devicePixelRatio;
+      if (mark.text) ctx.fillText(mark.text, upright ? place + gap : bbox.left + gap, upright ? bbox.top + 4 * gap : place - gap);
+    }
+    ctx.restore();
+  }
+}
+
+customElements.define("line-chart", LineChart);

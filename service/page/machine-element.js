@@ -1,0 +1,40 @@
+import { monitor } from "./monitor.js";
+
+/** An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. */
+export class MachineElement extends HTMLElement {
+  #gone = new AbortController();
+
+  connectedCallback() {
+    this.#gone = new AbortController();
+    this.follow(`health:${this.place}`, () => this.show());
+    this.show();
+  }
+
+  disconnectedCallback() {
+    this.#gone.abort();
+  }
+
+  /** Listen to the monitor while the element is on the page. @param {string} kind @param {(event: any) => void} hear */
+  follow(kind, hear) {
+    monitor.addEventListener(kind, hear, { signal: this.#gone.signal });
+  }
+
+  /** Do something again and again while the element is on the page. @param {number} every_s @param {() => void} act */
+  repeat(every_s, act) {
+    const timer = setInterval(act, 1000 * every_s);
+    this.#gone.signal.addEventListener("abort", () => clearInterval(timer));
+  }
+
+  /** `site/machine` */
+  get place() {
+    return this.getAttribute("place") ?? "";
+  }
+
+  /** What was heard last; undefined before the first. */
+  get health() {
+    return monitor.machines.get(this.place)?.health;
+  }
+
+  /** Lay out what is known. */
+  show() {}
+}

@@ -1,0 +1,87 @@
+import { clock } from "./figures.js";
+import { html, lay } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import { pathOf } from "./monitor.js";
+import "./alarm-history.js";
+import "./alarm-list.js";
+import "./data-quality.js";
+import "./level-table.js";
+import "./level-trend.js";
+import "./orbit-plot.js";
+import "./parameter-table.js";
+import "./parameter-trend.js";
+import "./spectrum-plot.js";
+import "./state-mark.js";
+
+const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all there is"]]);
+const RAW = ["health", "reports", "alarms", "alarms/events", "detectable", "configuration"];
+
+/** Everything that is known of one machine. */
+class MachineView extends MachineElement {
+  #head = html("div", { class: "head" });
+  #built = false;
+
+  connectedCallback() {
+    super.connectedCallback();
+    document.title = `${this.place} · rotorwatch`;
+  }
+
+  show() {
+    const health = this.health;
+    if (!health) return lay(this, html("h1", {}, this.place), html("p", { class: "note" }, "Nothing has been heard of this machine yet."));
+    if (!this.#built) this.#build();
+    const { report, stream } = health;
+    const said = report?.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`;
+    const silent = stream.silent && health.state !== "no-data";
+    lay(
+      this.#head,
+      html("div", { class: "tools" }, html("h1", {}, html("small", {}, `${health.site}/`), health.machine), html("div", { class: "states" }, html("state-mark", { state: health.state }), silent && html("state-mark", { state: "no-data" }), silent && html("span", {}, `since ${clock(stream.silent_since_ns)}; last known: ${health.state}`))),
+      html("p", { class: "reason" }, health.reason),
+      html("p", { class: "verdict" }, said),
+      html("ul", {}, ...[...(report?.sensors ?? []).map((one) => html("li", {}, one.text))]),
+      this.#shapes(),
+    );
+  }
+
+  /** What is said channel by channel where no equation can be evaluated. */
+  #shapes() {
+    const shapes = this.health?.report?.shapes ?? [];
+    if (!shapes.length) return null;
+    return html("div", {}, html("p", {}, "Each channel beside its own healthy form; no part of the machine can be named:"), html("ul", {}, ...shapes.map((one) => html("li", {}, one.text))));
+  }
+
+  #build() {
+    this.#built = true;
+    const place = this.place;
+    const trends = [html("parameter-trend", { place, hours: "24" }), html("level-trend", { place, hours: "24" })];
+    const range = html(
+      "select",
+      {
+        "aria-label": "Range of the trends",
+        change: (event) => {
+          for (const trend of trends) {
+            trend.setAttribute("hours", event.target.value);
+            /** @type {any} */ (trend).load();
+          }
+        },
+      },
+      ...RANGES.map(([hours, text]) => html("option", { value: hours, selected: hours === "24" }, text)),
+    );
+    lay(
+      this,
+      this.#head,
+      html("alarm-list", { place }),
+      html("parameter-table", { place }),
+      html("level-table", { place }),
+      html("label", { class: "range" }, "Trends: ", range),
+      ...trends,
+      html("orbit-plot", { place }),
+      html("spectrum-plot", { place }),
+      html("data-quality", { place }),
+      html("alarm-history", { place }),
+      html("p", { class: "note" }, "As the API tells it: ", ...RAW.flatMap((part, at) => [at ? ", " : "", html("a", { href: `${pathOf(place)}/${part}` }, part)])),
+    );
+  }
+}
+
+customElements.define("machine-view", MachineView);

@@ -1,0 +1,77 @@
+/** Elements made by hand: text is always text, so nothing that a machine is called can become markup. */
+
+/** @typedef {Node | string | number | null | undefined | false} Child */
+/** @typedef {Record<string, string | number | boolean | null | undefined | ((event: any) => void)>} Attributes */
+
+const SVG = "http://www.w3.org/2000/svg";
+
+/**
+ * @param {Element} made
+ * @param {Attributes} attributes
+ * @param {Child[]} children
+ */
+function filled(made, attributes, children) {
+  for (const [name, value] of Object.entries(attributes)) {
+    if (typeof value === "function") made.addEventListener(name, value);
+    else if (value === true) made.setAttribute(name, "");
+    else if (value !== false && value !== null && value !== undefined) made.setAttribute(name, String(value));
+  }
+  made.append(...nodes(children)); // an element that has filled itself keeps what it has
+  return made;
+}
+
+/** What there is, as nodes and text. @param {Child[]} children */
+function nodes(children) {
+  const there = children.filter((child) => child !== null && child !== undefined && child !== false && child !== "");
+  return there.map((child) => (child instanceof Node ? child : String(child)));
+}
+
+/**
+ * Put children in the place of those that were there; what is empty is left out.
+ * @param {Element} parent
+ * @param {...Child} children
+ */
+export function lay(parent, ...children) {
+  parent.replaceChildren(...nodes(children));
+}
+
+/**
+ * An element of the page; attributes that are functions are listeners.
+ * @param {string} tag
+ * @param {Attributes} [attributes]
+ * @param {...Child} children
+ * @returns {HTMLElement}
+ */
+export function html(tag, attributes = {}, ...children) {
+  return /** @type {HTMLElement} */ (filled(document.createElement(tag), attributes, children));
+}
+
+/**
+ * An element of a drawing.
+ * @param {string} tag
+ * @param {Attributes} [attributes]
+ * @param {...Child} children
+ * @returns {SVGElement}
+ */
+export function svg(tag, attributes = {}, ...children) {
+  return /** @type {SVGElement} */ (filled(document.createElementNS(SVG, tag), attributes, children));
+}
+
+/**
+ * A table that a phone shows as cards: each cell carries the name of its column.
+ * @param {string[]} heads
+ * @param {{cells: Child[], attributes?: Attributes}[]} rows
+ * @param {string} caption
+ */
+export function table(heads, rows, caption) {
+  const body = rows.map(({ cells, attributes }) =>
+    html("tr", attributes, ...cells.map((cell, at) => html(at ? "td" : "th", { "data-head": heads[at], scope: at ? null : "row" }, cell))),
+  );
+  return html(
+    "table",
+    {},
+    html("caption", {}, caption),
+    html("thead", {}, html("tr", {}, ...heads.map((head) => html("th", { scope: "col" }, head)))),
+    html("tbody", {}, ...body),
+  );
+}

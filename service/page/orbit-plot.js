@@ -1,0 +1,92 @@
+import { figure, printed } from "./figures.js";
+import { html, svg } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import { monitor, pathOf } from "./monitor.js";
+
+const [REFRESH_S, REVOLUTIONS, SIZE] = [15, 8, 220];
+
+/** @typedef {import("./records.js").Ellipse} Ellipse */
+/** @typedef {import("./records.js").PlaceOrbit} PlaceOrbit */
+/** @typedef {import("./records.js").Orbits} Orbits */
+
+/** A length at or above another one with a single leading digit. @param {number} length */
+function round(length) {
+  const power = 10 ** Math.floor(Math.log10(length));
+  return power * (/** @type {number} */ ([1, 2, 5, 10].find((each) => each * power >= length)));
+}
+
+/** Where the shaft was when its mark passed the sensor. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
+function marked({ path }, pulses_s) {
+  if (!path) return [];
+  return pulses_s.flatMap((pulse) => {
+    const at = path.times_s.findIndex((time) => time >= pulse);
+    if (at < 1) return at === 0 ? [[path.y[0], path.z[0]]] : [];
+    const share = (pulse - path.times_s[at - 1]) / (path.times_s[at] - path.times_s[at - 1]);
+    const between = (/** @type {number[]} */ values) => values[at - 1] + share * (values[at] - values[at - 1]);
+    return [[between(path.y), between(path.z)]];
+  });
+}
+
+/** Orbits of the live window: samples, the ellipse at running speed, theory, and the keyphasor's mark. */
+class OrbitPlot extends MachineElement {
+  #loading = false;
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.repeat(REFRESH_S, () => this.load());
+    this.load();
+  }
+
+  async load() {
+    if (this.#loading || document.hidden) return;
+    this.#loading = true;
+    try {
+      const found = /** @type {Orbits} */ (await monitor.ask(`${pathOf(this.place)}/orbits?revolutions=${REVOLUTIONS}`));
+      const drawn = found.orbits.filter((one) => one.ellipse || one.path);
+      const reasons = [found.reason, found.path_reason].filter(Boolean).join("; ");
+      this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => this.#draw(one, found.pulses_s))), html("p", { class: "note" }, reasons));
+    } catch (error) {
+      this.replaceChildren(html("p", { class: "note" }, error instanceof Error ? error.message : String(error)));
+    } finally {
+      this.#loading = false;
+    }
+  }
+
+  /** @param {PlaceOrbit} orbit @param {number[]} pulses_s */
+  #draw(orbit, pulses_s) {
+    const { path, ellipse, nominal, estimated, location, unit } = orbit;
+    const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);
+    const scale = (0.46 * SIZE) / round(reach);
+    const oval = (/** @type {Ellipse | null} */ one, /** @type {string} */ kind) =>
+      one && svg("ellipse", { class: kind, rx: one.semi_major * scale, ry: one.semi_minor * scale, transform: `rotate(${-one.tilt_deg})` });
+    const points = path ? path.y.map((y, at) => `${(y * scale).toFixed(1)},${(-path.z[at] * scale).toFixed(1)}`).join(" ") : "";
+    const half = SIZE / 2;
+    const grid = [-1, -0.5, 0, 0.5, 1].flatMap((each) => {
+      const at = each * 0.46 * SIZE;
+      return [svg("line", { class: "grid", x1: -half, x2: half, y1: at, y2: at }), svg("line", { class: "grid", y1: -half, y2: half, x1: at, x2: at })];
+    });
+    const said = ellipse ? `${figure(2 * ellipse.semi_major)} × ${figure(2 * ellipse.semi_minor)} ${printed(unit)} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
+    const keys = [path && ["path", "samples"], ellipse && ["measured", "1× measured"], nominal && ["nominal", "as nominal"], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
+    return html(
+      "figure",
+      {},
+      html("figcaption", {}, location, html("small", { class: "number" }, ` ${said}`)),
+      svg(
+        "svg",
+        { viewBox: `${-half} ${-half} ${SIZE} ${SIZE}`, role: "img", "aria-label": `orbit at the ${location}: ${said}`, class: "orbit" },
+        ...grid,
+        svg("polyline", { class: "path", points }),
+        oval(nominal, "nominal"),
+        oval(estimated, "estimated"),
+        oval(ellipse, "measured"),
+        ...marked(orbit, pulses_s).map(([y, z]) => svg("circle", { class: "pulse", cx: y * scale, cy: -z * scale, r: 3 })),
+        svg("text", { x: half - 4, y: -4, "text-anchor": "end" }, "y"),
+        svg("text", { x: 4, y: -half + 12 }, "z"),
+        svg("text", { x: 0.46 * SIZE - 2, y: half - 4, "text-anchor": "end" }, `grid ${figure(round(reach) / 2)} ${printed(unit)}`),
+      ),
+      html("p", { class: "keys" }, ...keys.filter(Boolean).map((key) => html("span", { class: `key ${/** @type {string[]} */ (key)[0]}` }, /** @type {string[]} */ (key)[1]))),
+    );
+  }
+}
+
+customElements.define("orbit-plot", OrbitPlot);

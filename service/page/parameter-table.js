@@ -1,0 +1,61 @@
+import { interval, percent, within, Z95 } from "./figures.js";
+import { html, table } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import "./state-mark.js";
+
+/** @typedef {import("./records.js").Parameter} Parameter */
+/** @typedef {import("./records.js").Opinion} Opinion */
+/** @typedef {import("./records.js").Verdict} Verdict */
+
+/** What another diagnostician reads of a parameter, and whether that agrees. @param {Opinion} opinion @param {string} name */
+function other(opinion, name) {
+  const said = opinion.parameters.find((one) => one.name === name);
+  if (!said || said.relative_change === null || said.standard_error === null) return html("span", { class: "number" }, "–");
+  const apart = opinion.agreement.some((one) => one.name === name && one.verdict === "disagree");
+  return html("span", { class: "number" }, within(said.relative_change, Z95 * said.standard_error), apart && html("strong", {}, " disagrees"));
+}
+
+/** Change and interval, or why there is none. @param {Parameter} parameter @param {Verdict} verdict */
+function reading(parameter, verdict) {
+  const read = verdict.current.some((one) => one.name === parameter.name);
+  if (!verdict.settled && parameter.relative_change !== null && !read) return ["too little data since the change", ""];
+  if (parameter.relative_change === null || !parameter.interval_95) return [`not evaluable: ${parameter.reason}`, ""];
+  return [html("b", { class: "number" }, percent(parameter.relative_change)), html("span", { class: "number" }, interval(parameter.interval_95))];
+}
+
+/** Who reads what of each parameter, and what would have been noticed. */
+class ParameterTable extends MachineElement {
+  show() {
+    const report = this.health?.report;
+    const verdict = report?.verdict;
+    this.hidden = !report || !verdict || !report.parameters.some((one) => one.relative_change !== null);
+    if (this.hidden || !report || !verdict) return this.replaceChildren();
+    const readings = new Map((verdict.settled ? [] : verdict.current).map((one) => [one.name, one]));
+    const rows = report.parameters.map((stated) => {
+      const alarm = this.health?.alarms.find((one) => one.name === stated.name && one.raised);
+      const seen = report.detectable.find((one) => one.name === stated.name);
+      const parameter = readings.get(stated.name) ?? stated;
+      const name = html("div", {}, html("b", {}, stated.text), html("small", {}, ` ${stated.name}`), parameter.vector && html("div", { class: "note" }, parameter.vector.text));
+      const least = html("span", { class: "number" }, seen ? `${percent(seen.loss)} / ${percent(seen.gain)}` : "");
+      return {
+        attributes: { class: alarm?.severity },
+        cells: [name, alarm ? html("state-mark", { state: alarm.severity }) : "", ...reading(parameter, verdict), least, ...report.opinions.map((opinion) => other(opinion, stated.name))],
+      };
+    });
+    const heads = ["parameter", "alarm", "change", "95 % interval", "seen from", ...report.opinions.map((one) => one.by)];
+    const silent = report.opinions.filter((one) => one.reason).map((one) => `${one.by}: ${one.reason}. `);
+    this.replaceChildren(
+      table(heads, rows, "Parameters"),
+      html(
+        "p",
+        { class: "note" },
+        `Decided on the ${report.parameters[0].by}${report.opinions.length ? "; the others read the whole window beside it" : ""}. `,
+        verdict.settled ? "" : "While the window straddles a change, what is read is the machine since then. ",
+        ...silent,
+        "Seen from: smallest loss and gain that one window shows with 95 % probability.",
+      ),
+    );
+  }
+}
+
+customElements.define("parameter-table", ParameterTable);

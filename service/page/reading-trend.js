@@ -1,0 +1,121 @@
+import { html } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import { monitor, pathOf } from "./monitor.js";
+import { Z95 } from "./figures.js";
+import "./line-chart.js";
+
+const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
+const GAP = 2.5;
+
+/** @typedef {import("./records.js").Bucket} Bucket */
+/** @typedef {import("./records.js").AlarmEvent} AlarmEvent */
+/** @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, alert: number[], danger: number[], zero: boolean}} Trended */
+
+/** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */
+export class ReadingTrend extends MachineElement {
+  quantity = "";
+  title = "";
+  #loading = false;
+  /** @type {number | null} */
+  #oldest = null;
+  /** @type {Map<string, any>} */
+  #charts = new Map();
+  #figures = html("div", { class: "charts" });
+  #message = html("p", { class: "message" });
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.replaceChildren(html("h2", {}, this.title), this.#message, this.#figures);
+    this.repeat(REFRESH_S, () => this.load());
+    this.follow("alarm", ({ detail }) => `${detail.site}/${detail.machine}` === this.place && this.load());
+    this.load();
+  }
+
+  /**
+   * How far back: the attribute `hours`, all without one. Not further than there are readings, or all would be in one bucket.
+   * @param {Trended[]} shown
+   */
+  async #since(shown) {
+    const [hours, end] = [Number(this.getAttribute("hours")), this.health?.report?.end_ns];
+    if (this.#oldest === null) {
+      const asked = new URLSearchParams({ quantity: this.quantity, points: "1", name: shown[0].name });
+      const [first] = (await monitor.ask(`${pathOf(this.place)}/readings?${asked}`)).buckets;
+      this.#oldest = first?.start_ns ?? null;
+    }
+    return Math.max(this.#oldest ?? 0, hours && end ? end - hours * 3600e9 : 0);
+  }
+
+  /** What there is to be shown. @returns {Promise<Trended[]>} */
+  async trended() {
+    return [];
+  }
+
+  async load() {
+    if (this.#loading || document.hidden) return;
+    this.#loading = true;
+    try {
+      const shown = await this.trended();
+      this.hidden = !shown.length;
+      if (!shown.length) return;
+      const since = String(await this.#since(shown));
+      const asked = new URLSearchParams({ quantity: this.quantity, points: String(POINTS), since_ns: since });
+      for (const one of shown.slice(0, 64)) asked.append("name", one.name);
+      const [readings, events] = await Promise.all([
+        monitor.ask(`${pathOf(this.place)}/readings?${asked}`),
+        monitor.ask(`${pathOf(this.place)}/alarms/events?limit=${EVENTS}&since_ns=${since}`),
+      ]);
+      const happened = events.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
+      for (const one of shown) this.#draw(one, readings.buckets.filter((/** @type {Bucket} */ bucket) => bucket.name === one.name), happened);
+      this.#message.textContent = readings.buckets.length ? "" : "Nothing has been read yet.";
+    } catch (error) {
+      this.#message.textContent = error instanceof Error ? error.message : String(error);
+    } finally {
+      this.#loading = false;
+    }
+  }
+
+  /** @param {Trended} one @param {Bucket[]} buckets @param {AlarmEvent[]} events */
+  #draw(one, buckets, events) {
+    let chart = this.#charts.get(one.name);
+    if (!chart) {
+      chart = html("line-chart", { role: "img", "aria-label": `${one.title} over time` });
+      this.#charts.set(one.name, chart);
+      this.#figures.append(html("figure", {}, html("figcaption", {}, one.title), chart));
+    }
+    if (!buckets.length) return;
+    const x = [], mean = [], low = [], high = [];
+    const step = Math.min(...buckets.slice(1).map((each, at) => each.start_ns - buckets[at].start_ns), Infinity);
+    let before = buckets[0].start_ns;
+    for (const bucket of buckets) {
+      if (bucket.start_ns - before > GAP * step) {
+        x.push((before + step) / 1e9);
+        for (const line of [mean, low, high]) line.push(null);
+      }
+      before = bucket.start_ns;
+      const error = Z95 * (bucket.mean_standard_error ?? 0);
+      x.push(bucket.start_ns / 1e9);
+      mean.push(one.scale * bucket.mean);
+      low.push(one.scale * Math.min(bucket.minimum, bucket.mean - error));
+      high.push(one.scale * Math.max(bucket.maximum, bucket.mean + error));
+    }
+    const reached = Math.max(...[...low, ...high].map((each) => Math.abs(each ?? 0)));
+    const near = (/** @type {number[]} */ limits) => limits.filter((each) => Math.abs(each) < 2.5 * reached || Math.abs(each) <= 10);
+    const marks = [
+      ...one.alert.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "alert-line", text: "alert", dash: [6, 4] })),
+      ...one.danger.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "danger-line", text: "danger" })),
+      ...events
+        .filter((event) => event.name === one.alarm && ["raised", "escalated", "cleared"].includes(event.kind))
+        .map((event) => ({ at: event.time_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: event.kind === "cleared" ? "ink-2" : `${event.severity}-line`, text: event.kind, dash: [2, 3] })),
+    ];
+    chart.draw({
+      x,
+      lines: [{ label: "mean", values: mean, width: 2 }, { label: "low", values: low, hidden: true }, { label: "high", values: high, hidden: true }],
+      band: [2, 1],
+      marks,
+      time: true,
+      include: [...near(one.alert), ...near(one.danger), ...(one.zero ? [0] : [])],
+      unit: one.unit,
+      height: 170,
+    });
+  }
+}

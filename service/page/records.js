@@ -1,0 +1,23 @@
+/**
+ * The records of the API as far as the page reads them; `/openapi.json` describes them all.
+ *
+ * @typedef {{name: string, text: string, state: string, pending: boolean, clearing: boolean, present: boolean, raised: boolean, severity: string, since_ns: number, raised_ns: number | null, occurrence: number, relative_change: number | null, standard_error: number | null, interval_95: [number, number] | null, low_confidence: boolean, note: string, shelf: {until_ns: number, one_shot: boolean, by: string, reason: string} | null, suppressed_by: string, out_of_service_by: string, out_of_service_reason: string, version: number}} Alarm
+ * @typedef {{site: string, machine: string, name: string, text: string, kind: string, state: string, severity: string, time_ns: number, sequence: number, actor: string, reason: string, note: string}} AlarmEvent
+ * @typedef {{name: string, text: string, by: string, relative_change: number | null, standard_error: number | null, interval_95: [number, number] | null, reason: string, vector: {text: string} | null}} Parameter
+ * @typedef {{by: string, reason: string, parameters: Parameter[], agreement: {name: string, verdict: string}[]}} Opinion
+ * @typedef {{name: string, loss: number, gain: number, length_s: number}} Detectable
+ * @typedef {{text: string, settled: boolean, current: Parameter[]}} Verdict
+ * @typedef {{measure: string, alert: number | null, danger: number | null, fall: number | null, source: string, state: string, text: string}} LevelLimits
+ * @typedef {{channel: string, unit: string, detection: string, overall: number | null, velocity: number | null, x1: number | null, x2: number | null, mean: number | null, crest: number | null, kurtosis: number | null, zone: string, limits: LevelLimits[]}} ChannelLevels
+ * @typedef {{start_ns: number, end_ns: number, state: string, filled: number, speed_rad_s: number | null, misfit_z: number | null, suspect: string, verdict: Verdict | null, parameters: Parameter[], opinions: Opinion[], detectable: Detectable[], sensors: {text: string}[], shapes: {text: string}[], levels: ChannelLevels[], level_growth: {text: string} | null, reason: string}} Report
+ * @typedef {{accepted_blocks: number, refused_blocks: Record<string, number>, gaps: number, missing_s: number, queue_dropped_blocks: number, link_missed_blocks: number, last_refusal: string, last_gap: string}} Quality
+ * @typedef {{publisher_alive: boolean, silent: boolean, silent_since_ns: number | null, data_age_s: number | null, replay_announced: boolean, descriptor_mismatch: string[]}} Stream
+ * @typedef {{site: string, machine: string, state: string, reason: string, filled: number, report: Report | null, alarms: Alarm[], quality: Quality, stream: Stream, restart: string, worker_errors: number, last_worker_error: string}} Health
+ * @typedef {{name: string, start_ns: number, length_ns: number, count: number, minimum: number, mean: number, maximum: number, mean_standard_error: number | null}} Bucket
+ * @typedef {{semi_major: number, semi_minor: number, tilt_deg: number, sense: string, precession: string | null}} Ellipse
+ * @typedef {{location: string, unit: string, ellipse: Ellipse | null, nominal: Ellipse | null, estimated: Ellipse | null, path: {times_s: number[], y: number[], z: number[]} | null}} PlaceOrbit
+ * @typedef {{speed_rad_s: number | null, orbits: PlaceOrbit[], revolutions: number, pulses_s: number[], reason: string, path_reason: string}} Orbits
+ * @typedef {{channel: string, quantity: string, unit: string, measured: number[], nominal: number[] | null, estimated: number[] | null, rms: number | null}} Density
+ * @typedef {{frequencies_hz: number[], rotation_hz: number | null, left_out_hz: [number, number] | null, densities: Density[], theory: {nominal_reason: string, estimated_reason: string}, reason: string, interval_95: [number, number] | null}} Spectra
+ */
+export {};

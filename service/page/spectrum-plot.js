@@ -1,0 +1,68 @@
+import { figure, printed } from "./figures.js";
+import { html } from "./markup.js";
+import { MachineElement } from "./machine-element.js";
+import { monitor, pathOf } from "./monitor.js";
+import "./line-chart.js";
+
+const [REFRESH_S, ORDERS] = [15, 5];
+
+/** @typedef {import("./records.js").Spectra} Spectra */
+
+/** Power spectral densities of the live window beside theory, with the orders of the running speed. */
+class SpectrumPlot extends MachineElement {
+  #loading = false;
+  #message = html("p", { class: "note" });
+  #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Channel", change: () => this.load() }));
+  #chart = /** @type {any} */ (html("line-chart", { role: "img", "aria-label": "spectrum" }));
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.replaceChildren(html("div", { class: "tools" }, html("h2", {}, "Spectrum"), this.#choice), this.#chart, this.#message);
+    this.repeat(REFRESH_S, () => this.load());
+    this.load();
+  }
+
+  async load() {
+    if (this.#loading || document.hidden) return;
+    this.#loading = true;
+    try {
+      this.#draw(await monitor.ask(`${pathOf(this.place)}/spectra`));
+    } catch (error) {
+      this.#message.textContent = error instanceof Error ? error.message : String(error);
+    } finally {
+      this.#loading = false;
+    }
+  }
+
+  /** @param {Spectra} found */
+  #draw(found) {
+    const names = found.densities.map((one) => one.channel);
+    if (this.#choice.options.length !== names.length) this.#choice.replaceChildren(...names.map((name) => html("option", { value: name }, name)));
+    const shown = found.densities.find((one) => one.channel === this.#choice.value) ?? found.densities[0];
+    this.#chart.hidden = this.#choice.hidden = !shown;
+    const theory = found.theory;
+    this.#message.textContent = [found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
+    if (!shown) return;
+    const turning = found.rotation_hz;
+    const last = found.frequencies_hz[found.frequencies_hz.length - 1];
+    const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= last) : [];
+    /** @type {import("./line-chart.js").Line[]} */
+    const lines = [{ label: "measured", values: shown.measured }];
+    if (shown.nominal) lines.push({ label: "as nominal", values: shown.nominal, colour: "nominal", dash: [6, 4] });
+    if (shown.estimated) lines.push({ label: "as estimated", values: shown.estimated, colour: "estimated", width: 2 });
+    this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
+    this.#chart.draw({
+      x: found.frequencies_hz,
+      lines,
+      marks: orders.map((order) => ({ at: order * /** @type {number} */ (turning), axis: "x", colour: "ink-2", text: `${order}×`, dash: [2, 3] })),
+      time: false,
+      log: true,
+      unit: printed(shown.unit),
+      xUnit: "frequency, Hz",
+      shaded: found.left_out_hz,
+      height: 280,
+    });
+  }
+}
+
+customElements.define("spectrum-plot", SpectrumPlot);

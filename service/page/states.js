@@ -1,0 +1,112 @@
+/** What states are called, how urgent they are, and what of a machine is worst. */
+import { figure, percent, printed, within, Z95 } from "./figures.js";
+
+/** @typedef {import("./records.js").Health} Health */
+/** @typedef {import("./records.js").Alarm} Alarm */
+/** @typedef {import("./records.js").ChannelLevels} ChannelLevels */
+/** @typedef {import("./records.js").LevelLimits} LevelLimits */
+/** @typedef {{title: string, value: string, limit: string, quantity: string, series: string}} Worst */
+
+/** Every state of a machine in words, the most urgent first. @type {Record<string, string>} */
+export const STATES = {
+  danger: "danger",
+  alert: "alert",
+  "outside-model": "outside the model",
+  "data-health": "sensor at fault",
+  "not-evaluable": "not evaluable",
+  "no-data": "no data",
+  warming: "warming up",
+  watching: "watching levels",
+  unchanged: "unchanged",
+  healthy: "healthy",
+};
+
+/** What is abnormal: everything else is grey. */
+export const ABNORMAL = new Set(["danger", "alert", "outside-model", "data-health", "not-evaluable"]);
+
+/** @param {string} state */
+export const urgency = (state) => Object.keys(STATES).indexOf(state);
+
+/** Of alarms that somebody has to look at. */
+export const UNSEEN = new Set(["unacknowledged", "returned", "latched-unacknowledged"]);
+
+/** Whether an alarm stands: operators are to see it. @param {Alarm} alarm */
+export const stands = (alarm) => alarm.raised || UNSEEN.has(alarm.state) || alarm.state.startsWith("latched");
+
+/** Unacknowledged first, then danger, then the newest. @param {Alarm} one @param {Alarm} other */
+export function byUrgency(one, other) {
+  const rank = (/** @type {Alarm} */ alarm) =>
+    (UNSEEN.has(alarm.state) ? 0 : 4) + (alarm.raised ? 0 : 2) + (alarm.severity === "danger" ? 0 : 1);
+  return rank(one) - rank(other) || (other.raised_ns ?? other.since_ns) - (one.raised_ns ?? one.since_ns);
+}
+
+/** What a measure of a channel is called. @type {Record<string, string>} */
+const MEASURES = { x_half: "½×", x1: "1×", x2: "2×", x3: "3×", not_x1: "not 1×", mean: "gap", s_max: "S_max", crest: "crest factor" };
+
+/** @param {string} measure */
+export const measureText = (measure) => MEASURES[measure] ?? measure;
+
+/** Unit of one level of a channel. @param {ChannelLevels} levels @param {string} measure */
+export function levelUnit(levels, measure) {
+  if (["crest", "kurtosis", "growth"].includes(measure)) return "";
+  if (measure === "velocity") return "mm/s rms";
+  const detection = levels.detection === "peak to peak" ? "pp" : "rms";
+  const plain = measure === "mean" || measure === "peak" || measure === "s_max";
+  const suffix = plain ? "" : measure === "overall" || /^x/.test(measure) ? ` ${detection}` : " rms";
+  return printed(levels.unit) + suffix;
+}
+
+/** A level's limits in words. @param {LevelLimits | undefined} limit */
+export function limitText(limit) {
+  if (!limit) return "";
+  const parts = [["alert from", limit.alert], ["danger from", limit.danger], ["alert below", limit.fall]];
+  return parts.filter(([, value]) => value !== null).map(([word, value]) => `${word} ${figure(Number(value))}`).join(", ");
+}
+
+/** @param {Health} health @returns {(Worst & {nearness: number})[]} */
+function levels(health) {
+  return (health.report?.levels ?? []).flatMap((one) => {
+    const limits = one.limits.length ? one.limits : [{ measure: one.velocity === null ? "overall" : "velocity", alert: null, danger: null, fall: null, state: "normal" }];
+    return limits.map((limit) => {
+      const value = /** @type {any} */ (one)[limit.measure];
+      const beyond = { normal: 0, alert: 10, danger: 20 }[limit.state] ?? 0;
+      return {
+        title: `${one.channel} ${measureText(limit.measure)}`,
+        value: `${figure(value)} ${levelUnit(one, limit.measure)}`,
+        limit: limitText(/** @type {LevelLimits} */ (limit)) || "no limit",
+        quantity: "level",
+        series: `${one.channel}:${limit.measure}`,
+        nearness: beyond + (limit.alert ? value / limit.alert : 0),
+      };
+    });
+  });
+}
+
+/** @param {Health} health @returns {(Worst & {nearness: number})[]} */
+function parameters(health) {
+  const report = health.report;
+  const verdict = report?.verdict;
+  if (!report || !verdict) return [];
+  const current = new Map((verdict.settled ? report.parameters : verdict.current).map((one) => [one.name, one]));
+  return report.parameters.flatMap((stated) => {
+    const { name, text, relative_change: change = null, standard_error: error = null } = current.get(stated.name) ?? /** @type {Partial<import("./records.js").Parameter>} */ ({});
+    if (change === null || error === null || !name) return [];
+    const seen = report.detectable.find((one) => one.name === name);
+    const least = seen && (change < 0 ? seen.loss : seen.gain);
+    return [{ title: text ?? name, value: within(change, Z95 * error), limit: least ? `seen from ${percent(least)}` : "", quantity: "parameter", series: name, nearness: least ? change / least : 0 }];
+  });
+}
+
+/**
+ * What is worst at a machine: what an alarm is about, else what is nearest to its limit.
+ * @param {Health} health
+ * @returns {Worst | null}
+ */
+export function worst(health) {
+  const alarm = health.alarms.filter((one) => one.raised).sort(byUrgency).sort((one, other) => Number(other.severity === "danger") - Number(one.severity === "danger"))[0];
+  const found = [...parameters(health), ...levels(health)].sort((one, other) => other.nearness - one.nearness);
+  if (!alarm) return found[0] ?? null;
+  const same = found.find((one) => one.series === alarm.name || `level:${one.series}`.startsWith(`${alarm.name}:`));
+  const value = alarm.relative_change !== null && alarm.standard_error !== null ? within(alarm.relative_change, Z95 * alarm.standard_error) : "";
+  return { title: alarm.text, value: same?.value ?? value, limit: same?.limit ?? "", quantity: same?.quantity ?? "", series: same?.series ?? "" };
+}
