@@ -103,7 +103,9 @@ function parameters(health) {
  * @returns {Worst | null}
  */
 export function worst(health) {
-  const alarm = health.alarms.filter((one) => one.raised).sort(byUrgency).sort((one, other) => Number(other.severity === "danger") - Number(one.severity === "danger"))[0];
+  // Missing data hides nothing of the machine: what an alarm says of it comes before what one says of the data.
+  const rank = (/** @type {Alarm} */ one) => (/^(stream|data|monitor)-/.test(one.name) ? 2 : 0) + (one.severity === "danger" ? 0 : 1);
+  const alarm = health.alarms.filter((one) => one.raised).sort(byUrgency).sort((one, other) => rank(one) - rank(other))[0];
   const found = [...parameters(health), ...levels(health)].sort((one, other) => other.nearness - one.nearness);
   if (!alarm) return found[0] ?? null;
   const same = found.find((one) => one.series === alarm.name || `level:${one.series}`.startsWith(`${alarm.name}:`));

@@ -187,6 +187,8 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         plant.cut.set()
         page.goto(f"{url}/#/")
         expect(tile.locator("state-mark")).to_have_text(["alert", "no data"])
+        expect(page.locator("alarm-strip")).to_contain_text("stream lost")
+        expect(tile.locator(".worst")).to_contain_text("bearing stiffness, horizontal")
         page.goto(f"{url}/#/machines/demo/lab")
         expect(page.locator("machine-view .head")).to_contain_text("last known: alert")
     with client(plant.runtime) as http:
