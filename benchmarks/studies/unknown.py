@@ -27,8 +27,6 @@ _CHANGES: tuple[dict[str, float], ...] = (
 )
 """True changes; their place is part of the seed."""
 _COMMISSIONINGS = 5
-_HEALTHY_WEIGHT = 8
-"""Windows of the healthy machine for each one of a change: false alarms are rare."""
 
 
 def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
@@ -109,11 +107,11 @@ def unknown(options: Options) -> Study:
         if name not in SUBJECTS:
             raise MachineFileError(f"--machine {name}: not among {', '.join(SUBJECTS)}")
     commissionings = 1 if options.small else _COMMISSIONINGS
-    plan = [options.windows * (1 if changes or options.small else _HEALTHY_WEIGHT) for changes in _CHANGES]
+    share, rest = divmod(options.windows, commissionings)
     cells = tuple(
         Cell(
             {"level": level.value, "machine": name, "commissioning": commissioning, "changed": changed_in(changes)},
-            plan[at] // commissionings + (commissioning < plan[at] % commissionings),
+            share + (commissioning < rest),
             (level, name, commissioning, at),
         )
         for level in (KnowledgeLevel.NONE, KnowledgeLevel.PARTIAL, KnowledgeLevel.FULL)

@@ -28,11 +28,10 @@ from models.diagnosis.baseline.learned import (
     disagreements,
     learn_baseline,
     learned_rows,
-    planes_coupled,
     undetermined,
     unsuitable,
 )
-from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, evaluable_rows, formation_of, not_measured
+from models.diagnosis.baseline.rows import ROWS, evaluable_rows, formation_of
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
@@ -226,19 +225,14 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
     Raises
     ------
     EstimationError
-        If they determine none; in one condition, if they do not determine all whose motions are measured.
+        If they determine none.
     """
-    rows = COUPLED_ROWS if planes_coupled(windows) else ROWS
-    baseline = learn_baseline(windows, conditions, rows)
+    baseline = learn_baseline(windows, conditions)
     weak = undetermined(baseline)
     relations = tuple(None if why else one for one, why in zip(baseline.relations, weak, strict=True))
     reasons = tuple(why or reason for why, reason in zip(weak, baseline.reasons, strict=True))
-    states = windows[0].states
-    measured = [not not_measured(row.motions, states) for row in learned_rows(baseline.rows)]
-    lost = [relation is None for relation, there in zip(relations, measured, strict=True) if there]
-    # A single recording that does not determine one of two planes is no ground to believe the other one.
-    if all(lost) or (any(lost) and len(set(conditions)) < 2):
-        raise EstimationError("; ".join(dict.fromkeys(reason for reason in reasons if reason)))
+    if all(relation is None for relation in relations):
+        raise EstimationError("; ".join(dict.fromkeys(reasons)))
     return replace(baseline, relations=relations, reasons=reasons)
 
 
@@ -246,7 +240,7 @@ def _differentiated(baseline: Baseline, band_to_hz: float) -> str:
     """Up to which frequency the derivatives of what is measured hold, in a sentence."""
     deepest = max(
         formation_of([term.motions for term in row.terms], relation.states).deepest
-        for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True)
+        for row, relation in zip(learned_rows(ROWS), baseline.relations, strict=True)
         if relation is not None
     )
     edge = passband_hz(deepest, band_to_hz)

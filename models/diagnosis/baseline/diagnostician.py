@@ -7,7 +7,7 @@ or of all that share a transducer, nothing else would show it.
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.special import chdtrc, ndtr, ndtri
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
 from models.diagnosis.baseline.relation import Relation, RowChange, one_source, read_row
-from models.diagnosis.baseline.rows import Row, parameters_of
+from models.diagnosis.baseline.rows import ROWS, Row, parameters_of
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
     ForceRow,
@@ -95,7 +95,6 @@ _WORST_ERROR = 0.2
 _RPM = 30 / math.pi
 _GONE = -0.95  # a loss beyond this is no loss of a bearing
 _LOST = 0.5  # standard error of a stiffness beyond which the relation does not hold in the window at all
-_GUESS = 1.0  # standard error of a damping beyond which the same is so
 _SURELY_OUTSIDE = 8.0
 
 
@@ -118,7 +117,6 @@ class _Unbalance:
     variance: float
     common_covariance: FloatArray
     common_variance: float
-    slope: FloatArray  # (n_own,), to the bearing's changes
 
 
 class BaselineDiagnostician:
@@ -130,8 +128,7 @@ class BaselineDiagnostician:
 
     by = "baseline"
 
-    def __init__(self, baseline: Baseline, rows: Sequence[Row] | None = None) -> None:
-        rows = baseline.rows if rows is None else rows
+    def __init__(self, baseline: Baseline, rows: Sequence[Row] = ROWS) -> None:
         self._baseline = baseline
         self._rows = learned_rows(rows)
         self._slices = coefficient_slices(self._rows)
@@ -144,8 +141,7 @@ class BaselineDiagnostician:
         }
         self._names = tuple(own.parameter for row in self._rows for own in row.own)
         self._parameters = parameters_of(rows)
-        self._own_of = {own.parameter: own for row in rows for own in row.own}
-        self._conditions = max(1, len({one.condition for one in baseline.consistency}))
+        self._one_source = {own.parameter: own.one_source for row in rows for own in row.own}
         self._coefficients = np.zeros(self._slices[-1].stop)
         for at, relation in zip(self._slices, baseline.relations, strict=True):
             if relation is not None:
@@ -165,7 +161,6 @@ class BaselineDiagnostician:
         bearing = self._bearing(changes)
         names = list(self._names)
         values, total, common = bearing.values, bearing.noise + bearing.common, bearing.common
-        through = np.eye(values.size)  # from the bearing's changes to all
         if "e" in self._parameters:
             names.append("e")
             reasons["e"] = ""
@@ -177,41 +172,9 @@ class BaselineDiagnostician:
                 values = np.append(values, e.value)
                 total = _bordered(total, e.covariance, e.variance)
                 common = _bordered(common, e.common_covariance, e.common_variance)
-                through = np.vstack([through, e.slope])
         if one_source(window):
-            wider = np.array([self._own_of[name].one_source for name in names[: values.size]])
+            wider = np.array([self._one_source[name] for name in names[: values.size]])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
-        elsewhere = self._elsewhere(names[: values.size], values, through)
-        total, common = total + elsewhere, common + elsewhere
-        variances = dict(zip(names, np.diag(elsewhere).tolist(), strict=False))  # none of an e that was not read
-        misfit_z = _misfit(changes)
-
-        def stated(reasons: Mapping[str, str]) -> Diagnosis:
-            diagnosis = self._stated(names, values, total, common, reasons)
-            return replace(diagnosis, elsewhere=variances, misfit_z=misfit_z)
-
-        diagnosis = stated(reasons)
-        impossible = _impossible(diagnosis)
-        if impossible:
-            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
-        vague = _vague(diagnosis, self._rows)
-        if vague:
-            diagnosis = stated(reasons | vague)
-        relations = self._baseline.relations
-        suspicion = gain_suspicion(diagnosis, self._rows, relations) if diagnosis.evaluable else None
-        if suspicion is None:
-            return diagnosis
-        misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
-        return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
-
-    def _stated(
-        self,
-        names: Sequence[str],
-        values: FloatArray,
-        total: FloatArray,
-        common: FloatArray,
-        reasons: Mapping[str, str],
-    ) -> Diagnosis:
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
         errors = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
@@ -221,20 +184,21 @@ class BaselineDiagnostician:
             else parameter_reading(name, self.by, float(values[names.index(name)]), errors[names.index(name)])
             for name in self._parameters
         )
-        return Diagnosis(
+        diagnosis = Diagnosis(
             by=self.by,
             parameters=parameters,
             covariance=covariance if known else None,
             common=positive(common[np.ix_(known, known)]) if known else None,
+            misfit_z=_misfit(changes),
         )
-
-    def _elsewhere(self, names: Sequence[str], values: FloatArray, through: FloatArray) -> FloatArray:
-        """Covariance of what a relation is off in another condition; each that it holds in is a witness against it."""
-        variances = np.array([self._own_of[name].elsewhere ** 2 for name in names]) / self._conditions
-        n = through.shape[1]
-        own = variances[:n] * np.maximum(1 + values[:n], 1 + _MOST_LOSS) ** 2
-        found = through @ np.diag(own) @ through.T + np.diag(np.append(np.zeros(n), variances[n:]))
-        return np.asarray(found, dtype=np.float64)
+        impossible = _impossible(diagnosis)
+        if impossible:
+            return replace(diagnosis, misfit_z=max(_SURELY_OUTSIDE, diagnosis.misfit_z or 0.0), suspect=impossible)
+        suspicion = gain_suspicion(diagnosis, self._rows, self._baseline.relations) if known else None
+        if suspicion is None:
+            return diagnosis
+        misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
+        return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:
         n = len(self._names)
@@ -312,8 +276,7 @@ class BaselineDiagnostician:
             raise EstimationError(
                 f"unbalance not seen well enough: standard error {text} %, at most {limit} % is a reading"
             )
-        common_variance = float(along @ shared @ along)
-        return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, common_variance, along @ to_d)
+        return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, float(along @ shared @ along))
 
     def _rotations(
         self, coordinates: tuple[str, ...], window: WindowStatistics
@@ -348,19 +311,6 @@ def _impossible(diagnosis: Diagnosis) -> str:
         if gone or (reading.name.startswith("k") and reading.standard_error > _LOST):
             return f"a sensor of this plane that is swapped, reversed or late ({reading.name} makes no sense)"
     return ""
-
-
-def _vague(diagnosis: Diagnosis, rows: Sequence[Row]) -> dict[str, str]:
-    """Why a row whose damping is anybody's guess says nothing of its other parameters either."""
-    errors = {reading.name: reading.standard_error or 0.0 for reading in diagnosis.evaluable}
-    return {
-        own.parameter: f"{row.title}: it does not hold in this window, {worst.parameter} is known to "
-        f"{errors[worst.parameter]:.0%} only"
-        for row in rows
-        for worst in row.own
-        if errors.get(worst.parameter, 0.0) > _GUESS
-        for own in row.own
-    }
 
 
 def _bordered(matrix: FloatArray, border: FloatArray, corner: float) -> FloatArray:
