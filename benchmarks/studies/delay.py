@@ -12,8 +12,8 @@ from functools import partial
 import numpy as np
 from scipy.special import ndtri
 
+from benchmarks.studies import alarm_readings as t
 from benchmarks.studies import results as r
-from benchmarks.studies import told as t
 from benchmarks.studies.bound import cramer_rao
 from benchmarks.studies.evaluate import true_condition
 from benchmarks.studies.opinions import LAYOUTS, SEVERAL

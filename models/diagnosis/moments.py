@@ -341,7 +341,7 @@ def _hann(size: int, rate_hz: float) -> FloatArray:
 
 
 SpeedSource = Literal["phase reference", "estimated", "unknown"]
-_DEPENDENT = 1e-15
+_DEPENDENT = 1e-15  # singular value over the largest one, below which a regressor is made of the others
 STEADY = 0.01  # range of the hops' speeds, relative, up to which one set of coefficients serves the window
 
 

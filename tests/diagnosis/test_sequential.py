@@ -7,7 +7,6 @@ import pytest
 from scipy.stats.qmc import MultivariateNormalQMC
 
 from models.diagnosis.readings import Z95
-from models.diagnosis.verdict.astride import read_changes
 from models.diagnosis.verdict.calibration import (
     MONTH_S,
     crossing_rate,
@@ -17,6 +16,7 @@ from models.diagnosis.verdict.calibration import (
     overshoot_correction,
     window_thresholds,
 )
+from models.diagnosis.verdict.change_point import read_changes
 from models.diagnosis.verdict.isolation import isolate
 from models.diagnosis.verdict.sequential import SequentialSettings, SequentialTest
 from models.diagnosis.verdict.sequential_state import SequentialState, hop_arrays

@@ -113,7 +113,7 @@ def test_reports_are_cut_by_time_and_number(http: httpx.Client) -> None:
 def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Client) -> None:
     report = answered(http.get(f"{PLACE}/health"), Health).report
     assert report is not None
-    page = (ROOT / "service/page/data-quality.js").read_text(encoding="utf-8")
+    page = (ROOT / "service/api/page/data-quality.js").read_text(encoding="utf-8")
     for name, (field, measure) in MEASURES.items():
         value = getattr(report, field)
         assert answered(http.get(f"{PLACE}/readings?quantity={name}"), ReadingList).readings[-1].value == value

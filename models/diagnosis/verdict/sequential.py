@@ -22,8 +22,8 @@ from datetime import UTC, datetime
 import numpy as np
 from scipy.special import ndtr
 
-from models.diagnosis.verdict.astride import read_changes
 from models.diagnosis.verdict.calibration import Thresholds, month_thresholds, window_thresholds
+from models.diagnosis.verdict.change_point import read_changes
 from models.diagnosis.verdict.isolation import Isolation, isolate, model_test, reading_of
 from models.diagnosis.verdict.sequential_state import SequentialState, finding
 from models.diagnosis.verdict.stretch import Stretch, added

@@ -15,7 +15,7 @@ from fastapi.responses import HTMLResponse
 
 from service.access.guard import Guard
 
-_FOLDER = Path(str(files("service"))) / "page"
+_FOLDER = Path(str(files("service"))) / "api" / "page"
 _INDEX = "index.html"
 _TYPES = {".js": "text/javascript", ".css": "text/css"}
 _CHARTS = ("uPlot.iife.js", "uPlot.min.css")

@@ -3,6 +3,7 @@ import { monitor } from "./monitor.js";
 /** An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. */
 export class MachineElement extends HTMLElement {
   #gone = new AbortController();
+  #loading = false;
 
   connectedCallback() {
     this.#gone = new AbortController();
@@ -24,6 +25,31 @@ export class MachineElement extends HTMLElement {
     const timer = setInterval(act, 1000 * every_s);
     this.#gone.signal.addEventListener("abort", () => clearInterval(timer));
   }
+
+  /** Load now, and again and again while the element is on the page. @param {number} every_s */
+  keepLoading(every_s) {
+    this.repeat(every_s, () => this.load());
+    this.load();
+  }
+
+  /** Ask for what is shown: never twice at once, nor while nobody looks. */
+  async load() {
+    if (this.#loading || document.hidden) return;
+    this.#loading = true;
+    try {
+      await this.ask();
+    } catch (error) {
+      this.refused(error instanceof Error ? error.message : String(error));
+    } finally {
+      this.#loading = false;
+    }
+  }
+
+  /** Ask the monitor, and lay out what it answers. */
+  async ask() {}
+
+  /** Say why there is nothing new to be shown. @param {string} _why */
+  refused(_why) {}
 
   /** `site/machine` */
   get place() {

@@ -15,7 +15,6 @@ const GAP = 2.5;
 export class ReadingTrend extends MachineElement {
   quantity = "";
   title = "";
-  #loading = false;
   /** @type {number | null} */
   #oldest = null;
   /** @type {Map<string, any>} */
@@ -26,9 +25,8 @@ export class ReadingTrend extends MachineElement {
   connectedCallback() {
     super.connectedCallback();
     this.replaceChildren(html("h2", {}, this.title), this.#message, this.#figures);
-    this.repeat(REFRESH_S, () => this.load());
     this.follow("alarm", ({ detail }) => `${detail.site}/${detail.machine}` === this.place && this.load());
-    this.load();
+    this.keepLoading(REFRESH_S);
   }
 
   /**
@@ -50,28 +48,25 @@ export class ReadingTrend extends MachineElement {
     return [];
   }
 
-  async load() {
-    if (this.#loading || document.hidden) return;
-    this.#loading = true;
-    try {
-      const shown = await this.trended();
-      this.hidden = !shown.length;
-      if (!shown.length) return;
-      const since = String(await this.#since(shown));
-      const asked = new URLSearchParams({ quantity: this.quantity, points: String(POINTS), since_ns: since });
-      for (const one of shown.slice(0, 64)) asked.append("name", one.name);
-      const [readings, events] = await Promise.all([
-        monitor.ask(`${pathOf(this.place)}/readings?${asked}`),
-        monitor.ask(`${pathOf(this.place)}/alarms/events?limit=${EVENTS}&since_ns=${since}`),
-      ]);
-      const happened = events.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
-      for (const one of shown) this.#draw(one, readings.buckets.filter((/** @type {Bucket} */ bucket) => bucket.name === one.name), happened);
-      this.#message.textContent = readings.buckets.length ? "" : "Nothing has been read yet.";
-    } catch (error) {
-      this.#message.textContent = error instanceof Error ? error.message : String(error);
-    } finally {
-      this.#loading = false;
-    }
+  async ask() {
+    const shown = await this.trended();
+    this.hidden = !shown.length;
+    if (!shown.length) return;
+    const since = String(await this.#since(shown));
+    const asked = new URLSearchParams({ quantity: this.quantity, points: String(POINTS), since_ns: since });
+    for (const one of shown.slice(0, 64)) asked.append("name", one.name);
+    const [readings, events] = await Promise.all([
+      monitor.ask(`${pathOf(this.place)}/readings?${asked}`),
+      monitor.ask(`${pathOf(this.place)}/alarms/events?limit=${EVENTS}&since_ns=${since}`),
+    ]);
+    const happened = events.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
+    for (const one of shown) this.#draw(one, readings.buckets.filter((/** @type {Bucket} */ bucket) => bucket.name === one.name), happened);
+    this.#message.textContent = readings.buckets.length ? "" : "Nothing has been read yet.";
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    this.#message.textContent = why;
   }
 
   /** @param {Trended} one @param {Bucket[]} buckets @param {AlarmEvent[]} events */

@@ -10,7 +10,6 @@ const [REFRESH_S, ORDERS] = [15, 5];
 
 /** Power spectral densities of the live window beside theory, with the orders of the running speed. */
 class SpectrumPlot extends MachineElement {
-  #loading = false;
   #message = html("p", { class: "note" });
   #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Channel", change: () => this.load() }));
   #chart = /** @type {any} */ (html("line-chart", { role: "img", "aria-label": "spectrum" }));
@@ -18,20 +17,16 @@ class SpectrumPlot extends MachineElement {
   connectedCallback() {
     super.connectedCallback();
     this.replaceChildren(html("div", { class: "tools" }, html("h2", {}, "Spectrum"), this.#choice), this.#chart, this.#message);
-    this.repeat(REFRESH_S, () => this.load());
-    this.load();
+    this.keepLoading(REFRESH_S);
   }
 
-  async load() {
-    if (this.#loading || document.hidden) return;
-    this.#loading = true;
-    try {
-      this.#draw(await monitor.ask(`${pathOf(this.place)}/spectra`));
-    } catch (error) {
-      this.#message.textContent = error instanceof Error ? error.message : String(error);
-    } finally {
-      this.#loading = false;
-    }
+  async ask() {
+    this.#draw(await monitor.ask(`${pathOf(this.place)}/spectra`));
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    this.#message.textContent = why;
   }
 
   /** @param {Spectra} found */

@@ -29,27 +29,21 @@ function marked({ path }, pulses_s) {
 
 /** Orbits of the live window: samples, the ellipse at running speed, theory, and the keyphasor's mark. */
 class OrbitPlot extends MachineElement {
-  #loading = false;
-
   connectedCallback() {
     super.connectedCallback();
-    this.repeat(REFRESH_S, () => this.load());
-    this.load();
+    this.keepLoading(REFRESH_S);
   }
 
-  async load() {
-    if (this.#loading || document.hidden) return;
-    this.#loading = true;
-    try {
-      const found = /** @type {Orbits} */ (await monitor.ask(`${pathOf(this.place)}/orbits?revolutions=${REVOLUTIONS}`));
-      const drawn = found.orbits.filter((one) => one.ellipse || one.path);
-      const reasons = [found.reason, found.path_reason].filter(Boolean).join("; ");
-      this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => this.#draw(one, found.pulses_s))), html("p", { class: "note" }, reasons));
-    } catch (error) {
-      this.replaceChildren(html("p", { class: "note" }, error instanceof Error ? error.message : String(error)));
-    } finally {
-      this.#loading = false;
-    }
+  async ask() {
+    const found = /** @type {Orbits} */ (await monitor.ask(`${pathOf(this.place)}/orbits?revolutions=${REVOLUTIONS}`));
+    const drawn = found.orbits.filter((one) => one.ellipse || one.path);
+    const reasons = [found.reason, found.path_reason].filter(Boolean).join("; ");
+    this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => this.#draw(one, found.pulses_s))), html("p", { class: "note" }, reasons));
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    this.replaceChildren(html("p", { class: "note" }, why));
   }
 
   /** @param {PlaceOrbit} orbit @param {number[]} pulses_s */
