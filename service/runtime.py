@@ -291,7 +291,7 @@ class _Supervisor:
         self._watched = watched
         self._feed = feed
         self._stop = threading.Event()
-        self._published: dict[int, Health] = {}
+        self._published: dict[int, tuple[Health, int]] = {}
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
 
     def start(self) -> None:
@@ -317,11 +317,13 @@ class _Supervisor:
                 return
 
     def _look(self, number: int, worker: MachineWorker, link: MachineLink) -> None:
+        # An alarm that changed and changed back is news to whoever asked in between; so the log is looked at first.
+        sequence = worker.history.last_sequence()
         health = worker.health()
-        before = self._published.get(number)
-        if before is not None and _news(before) == _news(health):
+        before, told = self._published.get(number, (None, -1))
+        if before is not None and told == sequence and _news(before) == _news(health):
             return
-        self._published[number] = health
+        self._published[number] = health, sequence
         link.publish_health(health.model_dump_json())
         self._feed.health(health)
         if before is None or before.state != health.state:

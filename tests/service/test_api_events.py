@@ -210,6 +210,21 @@ def test_health_is_told_at_once_and_when_it_changes(shared: Runtime) -> None:
         told_until(shelved, reader.next("health"))
 
 
+def test_health_that_changed_and_changed_back_is_told(shared: Runtime) -> None:
+    """Whoever begins to listen in between has been told what is no longer so."""
+    lab, _ = shared.machines()
+    for _ in range(3):
+        with reading(shared, f"?machine={LAB}") as reader:
+            before = is_shelved(Health.model_validate_json(reader.next("health").data))
+        time.sleep(0.6)  # until that is what was published last
+        happen(lab)
+        with reading(shared, f"?machine={LAB}") as reader:
+            begun = is_shelved(Health.model_validate_json(reader.next("health").data))
+            happen(lab)
+            while begun != before:
+                begun = is_shelved(Health.model_validate_json(reader.next("health").data))
+
+
 @pytest.mark.parametrize(
     ("query", "header", "status", "text"),
     [
