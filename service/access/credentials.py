@@ -6,9 +6,13 @@ import ipaddress
 
 from fastapi import Request
 from starlette.datastructures import Headers
+from starlette.requests import cookie_parser
 
 from service.access.origin import SAFE_METHODS
 from service.access.scopes import Caller
+
+COOKIE = "rotorwatch_token"
+"""In which a browser keeps the token of who has signed in."""
 
 NEEDED = "an access token is needed, as header Authorization: Bearer rw_…"
 BEARER = 'Bearer realm="rotorwatch"'
@@ -40,7 +44,13 @@ def key_of(caller: Caller) -> str:
 
 
 def presented_text(headers: Headers, method: str) -> str | None:
-    """Token in the header ``Authorization``; the password of HTTP Basic counts only where nothing can be changed."""
+    """Token in the header ``Authorization``, or in the cookie of who has signed in.
+
+    The password of HTTP Basic counts only where nothing can be changed.
+    """
+    kept = kept_text(headers)
+    if kept is not None:
+        return kept
     found = headers.getlist("authorization")
     scheme, _, value = found[0].partition(" ") if len(found) == 1 else ("", "", "")
     if scheme.lower() == "bearer":
@@ -51,6 +61,16 @@ def presented_text(headers: Headers, method: str) -> str | None:
         except (binascii.Error, ValueError):
             return None
     return None
+
+
+def kept_text(headers: Headers) -> str | None:
+    """Token of who has signed in, which the browser adds by itself; None where a program gives its own.
+
+    A password does not count beside it: a browser that was once given one goes on adding it, to look only.
+    """
+    if headers.get("authorization", "basic").partition(" ")[0].lower() != "basic":
+        return None
+    return cookie_parser(headers.get("cookie", "")).get(COOKIE)
 
 
 def challenges(request: Request) -> tuple[str, ...]:
@@ -65,6 +85,8 @@ def challenges(request: Request) -> tuple[str, ...]:
 
 def unauthenticated(request: Request) -> str:
     """Why a request has no caller; a token that is not valid is not told whether it ever was."""
+    if kept_text(request.headers) is not None:
+        return "you are no longer signed in: the token has expired or was revoked"
     if "authorization" not in request.headers:
         return NEEDED
     if presented_text(request.headers, request.method) is None:

@@ -2,7 +2,7 @@
 
 ::
 
-    middleware   token, rate, origin -----------> 401, 403, 413, 415, 429   (every path but /healthz needs a token)
+    middleware   token, rate, origin -----------> 401, 403, 413, 415, 429   (all but /healthz and the page)
     gate         scopes of the route, audit log -> 403, 503                 (before the route's own code)
     route        dependencies=[guard.read], or caller: Annotated[Caller, guard.operate]
 
@@ -30,12 +30,12 @@ from starlette.exceptions import HTTPException
 
 from models.errors import RotorwatchError
 from service.access.audit import AuditTrail, Visit
-from service.access.credentials import address_of, key_of, network_of, presented_text, unauthenticated
+from service.access.credentials import address_of, kept_text, key_of, network_of, presented_text, unauthenticated
 from service.access.middleware import VISIT, AccessMiddleware
 from service.access.origin import SAFE_METHODS, check_body_type, check_origin
 from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import Requirement, requires
-from service.access.routes import PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
+from service.access.routes import PAGE_FILES, PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
 from service.access.tokens import PresentedToken, parse_token, token_is_valid
 from service.history.records import TokenRecord
@@ -163,7 +163,10 @@ class Guard:
         if caller is None:
             raise HTTPException(401, unauthenticated(request))
         hosts = self.access.hosts
-        check_origin(request.headers, request.method, listens_on=self._host, hosts=hosts, open_to_all=in_the_open)
+        kept = kept_text(request.headers) is not None
+        check_origin(
+            request.headers, request.method, listens_on=self._host, hosts=hosts, open_to_all=in_the_open, kept=kept
+        )
         return caller
 
     def pass_gate(self, request: Request) -> None:
@@ -212,12 +215,12 @@ class Guard:
 
     async def _authenticated(self, request: Request, address: str) -> Caller | None:
         """Return the owner of the token that is presented; None if none is presented or it is not valid."""
-        if "authorization" not in request.headers:
-            return None
         text = presented_text(request.headers, request.method)
+        # Of what was presented only its digest is kept, and nobody can tell from it what it was.
+        given = kept_text(request.headers) or "\n".join(request.headers.getlist("authorization"))
+        if not given:
+            return None
         presented = None if text is None else parse_token(text)
-        # Of what was presented only this is kept, and nobody can tell from it what it was.
-        given = "\n".join(request.headers.getlist("authorization"))
         identity = hmac.digest(self._secret, given.encode(), "sha256").hex()
         if wait_s := self._failures.wait(identity):
             raise _too_many("too many attempts with this wrong token", wait_s)
@@ -257,7 +260,8 @@ class Guard:
 
 
 def _is_public(request: Request) -> bool:
-    return request.scope["path"] in PUBLIC_PATHS and request.method in SAFE_METHODS
+    path = request.scope["path"]
+    return request.method in SAFE_METHODS and (path in PUBLIC_PATHS or path.startswith(PAGE_FILES))
 
 
 def _is_probe(request: Request) -> bool:

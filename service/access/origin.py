@@ -20,7 +20,9 @@ _FROM_HERE = ("none", "same-origin")
 _FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "x-real-ip")
 
 
-def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple[str, ...], open_to_all: bool) -> None:
+def check_origin(
+    headers: Headers, method: str, *, listens_on: str, hosts: tuple[str, ...], open_to_all: bool, kept: bool
+) -> None:
     """Refuse what may come from a page of somebody else's.
 
     Parameters
@@ -31,6 +33,8 @@ def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple
         Other names under which browsers reach the service.
     open_to_all : bool
         Whether callers need no token; then the service's name is looked at, and nothing is taken from a proxy.
+    kept : bool
+        Whether the caller is known by what a browser adds by itself: then it must say which page asks.
 
     Raises
     ------
@@ -50,6 +54,10 @@ def check_origin(headers: Headers, method: str, *, listens_on: str, hosts: tuple
     if method in SAFE_METHODS:
         return
     origin = headers.get("origin")
+    if kept and origin is None:
+        raise HTTPException(
+            403, "by a cookie alone nothing is changed: the header Origin, which browsers send, is missing"
+        )
     if origin is not None and not _is_ours(origin, host, hosts):
         raise HTTPException(403, f"a page from {origin[:200]} may not do this")
     if headers.get("sec-fetch-site", "none") not in _FROM_HERE:

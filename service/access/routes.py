@@ -10,8 +10,11 @@ from fastapi.routing import APIRoute, RouteContext, iter_route_contexts
 from service.access.requirement import Requirement
 from service.access.scopes import Scope
 
-PUBLIC_PATHS = frozenset(("/healthz",))
-"""Paths that anybody may GET."""
+PUBLIC_PATHS = frozenset(("/", "/healthz"))
+"""Paths that anybody may GET: the page knows nothing until somebody has signed in there."""
+
+PAGE_FILES = "/page/"
+"""How paths begin that anybody may GET besides."""
 
 PROBE_PATHS = frozenset(("/healthz", "/readyz"))
 """Paths by which others decide whether to restart the service; however many ask, they are answered."""

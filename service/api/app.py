@@ -23,6 +23,7 @@ from service.api.routes.page import add_page_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
 from service.api.routes.service import add_service_routes
+from service.api.routes.session import add_session_routes
 from service.api.routes.snapshots import add_snapshot_routes
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
@@ -93,9 +94,10 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_recording_routes(app, service.catalogue, guard)
     add_replay_routes(app, service.replays, guard)
     add_service_routes(app, service, guard)
+    add_session_routes(app, guard)
     _add_readiness_routes(app, service, guard)
     add_docs_routes(app, guard)
-    add_page_routes(app, guard)
+    add_page_routes(app)
     guard.protect(app)
     return app
 

@@ -89,7 +89,7 @@ def application(guard: Guard, done: list[str]) -> FastAPI:
     def readyz() -> bool:
         return True
 
-    @app.get("/", dependencies=[guard.read], response_class=HTMLResponse)
+    @app.get("/docs", dependencies=[guard.read], response_class=HTMLResponse)
     def page() -> str:
         return "<!doctype html><title>t</title>"
 

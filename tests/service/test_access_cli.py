@@ -193,7 +193,7 @@ def test_the_hint_knows_where_the_history_is_and_shows_no_password(
 
 def test_status_says_why_a_token_is_refused(tmp_path: Path) -> None:
     with guarded(tmp_path) as monitor, monitor.client() as client:
-        wanted = client.get("/").json()["detail"]
+        wanted = client.get("/docs").json()["detail"]
         wrong = "rw_000000000000_" + 43 * "0"
         plain = {name: value for name, value in os.environ.items() if name != "ROTORWATCH_TOKEN"}
         without, mistaken = (

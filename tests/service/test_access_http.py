@@ -18,7 +18,7 @@ READ, OPERATE, CONFIGURE = Scope
 DAY_NS = 86_400 * 10**9
 #: Every route of the small application with the scopes that it needs.
 ROUTES = {
-    ("GET", "/"): {READ},
+    ("GET", "/docs"): {READ},
     ("GET", "/health"): {READ},
     ("GET", "/alarms"): {READ},
     ("GET", "/openapi.json"): {READ},
@@ -110,15 +110,15 @@ def test_browsers_give_the_token_as_password(monitor: Guarded) -> None:
     token = monitor.token(READ)
     with monitor.client() as client:
         for given in ({}, basic("rw_000000000000_" + 43 * "0")):
-            asked = client.get("/", headers={"accept": "text/html,*/*"} | given)
+            asked = client.get("/docs", headers={"accept": "text/html,*/*"} | given)
             assert asked.status_code == 401
             bearer, in_browsers = asked.headers.get_list("www-authenticate")  # Chromium reads one challenge a line
             assert bearer == ASKED + (', error="invalid_token"' if given else "")
             assert in_browsers == 'Basic realm="rotorwatch", charset="UTF-8"'
-        assert client.get("/", headers=basic(token)).status_code == 200
-        assert client.get("/", headers=basic(token, "")).status_code == 200
+        assert client.get("/docs", headers=basic(token)).status_code == 200
+        assert client.get("/docs", headers=basic(token, "")).status_code == 200
         for wrong in ("Basic", "Basic ===", "Basic eA==", f"Basic {base64.b64encode(b'x:' + bytes([255])).decode()}"):
-            problem(client.get("/", headers={"authorization": wrong}), 401)
+            problem(client.get("/docs", headers={"authorization": wrong}), 401)
 
 
 def test_a_route_that_declares_nothing_is_refused_to_everybody(monitor: Guarded) -> None:
@@ -205,7 +205,7 @@ def test_openapi_tells_of_tokens_and_scopes(monitor: Guarded) -> None:
 
 def test_answers_carry_safe_headers(monitor: Guarded) -> None:
     with monitor.client(monitor.token(READ)) as client:
-        for path in ("/", "/health", "/nowhere", "/healthz", "/openapi.json"):
+        for path in ("/docs", "/health", "/nowhere", "/healthz", "/openapi.json"):
             headers = client.get(path).headers
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["cache-control"] == "no-store"

@@ -113,7 +113,7 @@ def test_reports_are_cut_by_time_and_number(http: httpx.Client) -> None:
 def test_measures_of_the_window_are_in_history_and_on_the_page(http: httpx.Client) -> None:
     report = answered(http.get(f"{PLACE}/health"), Health).report
     assert report is not None
-    page = (ROOT / "service/api/page/data-quality.js").read_text(encoding="utf-8")
+    page = (ROOT / "service/api/page/machine/data-quality.js").read_text(encoding="utf-8")
     for name, (field, measure) in MEASURES.items():
         value = getattr(report, field)
         assert answered(http.get(f"{PLACE}/readings?quantity={name}"), ReadingList).readings[-1].value == value
@@ -309,14 +309,15 @@ def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
     assert not re.search(r"<script(?! type=\"module\" src=)|<style|style=|\bon\w+=", answer.text)
     paths = re.findall(r'(?:src|href)="(/page/[^"]+)"', answer.text)
     assert len(paths) == 3
-    for path in (*paths, str(Path(paths[0]).parent / "uPlot.iife.js")):
+    _, _, version, _ = paths[0].split("/")
+    for path in (*paths, *(f"/page/{version}/{name}" for name in ("uPlot.iife.js", "machine/orbit-plot.js"))):
         loaded = http.get(path)
         assert loaded.status_code == 200
         assert "immutable" in loaded.headers["cache-control"]
         assert loaded.headers["content-type"].startswith(("text/css", "text/javascript"))
-        _, _, version, name = path.split("/")
-        problem(http.get(f"/page/{version[::-1]}/{name}"), 404)
-    problem(http.get(f"/page/{version}/index.html"), 404)
+        problem(http.get(path.replace(version, version[::-1])), 404)
+    for name in ("index.html", "../routes/page.py", "%2e%2e/routes/page.py"):
+        problem(http.get(f"/page/{version}/{name}"), 404)
     problem(http.get("/redoc"), 404)
 
 

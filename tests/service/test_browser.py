@@ -129,24 +129,45 @@ def kept(page: Page, name: str) -> None:
         page.screenshot(path=Path(SCREENSHOTS) / f"{name}.png", full_page=True)
 
 
-def test_a_browser_asks_for_the_token_and_shows_the_machine(browser: Browser, runtime: Runtime) -> None:
+def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
-    with browser.new_page() as stranger, stranger.expect_response(url + "/") as refused:
-        with pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"):  # it asked, and nobody gave a password
+    expect.set_options(timeout=PATIENCE_MS)
+    with browser.new_context() as context:
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        page.goto(f"{url}/#/alarms")
+        said = page.locator("sign-in [role=status]")
+        expect(said).to_contain_text("an access token is needed")
+        page.get_by_label("Access token").fill("rw_wrong")
+        page.get_by_role("button", name="Sign in").click()
+        expect(said).to_contain_text("not valid")
+        kept(page, "sign-in")
+        page.get_by_label("Access token").fill(token(runtime, Scope.READ, Scope.OPERATE, name="screen"))
+        page.keyboard.press("Enter")
+        expect(page.locator("alarms-view")).to_contain_text("No alarm is raised")
+        expect(page.locator("header")).to_contain_text("screen")
+        assert page.evaluate("document.cookie") == ""
+        page.reload()
+        expect(page.locator("sign-in")).to_have_count(0)
+        page.goto(f"{url}/#/")
+        page.locator("summary", has_text="1 without data").click()
+        page.get_by_role("heading", name="demo/lab").wait_for()
+        page.get_by_role("button", name="Sign out").click()
+        expect(said).to_have_text("Signed out.")
+        assert not context.cookies()
+        page.reload()
+        expect(page.locator("sign-in")).to_be_visible()
+        expect(page.locator("machine-tile")).to_have_count(0)
+
+
+def test_a_browser_that_shows_the_page_of_the_api_asks_for_a_password(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url + "/docs"
+    with browser.new_page() as stranger, stranger.expect_response(url) as refused:
+        with pytest.raises(Error, match="ERR_INVALID_AUTH_CREDENTIALS"):  # it asked, and nobody gave one
             stranger.goto(url)
         assert refused.value.status == 401
         asked = [one["value"].split()[0] for one in refused.value.headers_array() if one["name"] == "www-authenticate"]
         assert asked == ["Bearer", "Basic"]
-    given = HttpCredentials(username="anybody", password=token(runtime, Scope.READ, name="screen"), origin=url)
-    with browser.new_context(http_credentials=given) as context:
-        context.set_default_timeout(PATIENCE_MS)
-        page = context.new_page()
-        shown = page.goto(url)
-        assert shown is not None
-        assert shown.status == 200
-        page.locator("summary", has_text="1 without data").click()
-        page.get_by_role("heading", name="demo/lab").wait_for()
-        kept(page, "front")
 
 
 def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Plant) -> None:

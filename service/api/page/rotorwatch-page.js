@@ -1,30 +1,33 @@
-import { clock, local, showLocal } from "./figures.js";
-import { html } from "./markup.js";
-import { monitor } from "./monitor.js";
-import { standing } from "./alarm-strip.js";
-import { UNSEEN } from "./states.js";
-import "./plant-view.js";
+import { clock, local, showLocal } from "./monitor/figures.js";
+import { html } from "./elements/markup.js";
+import { monitor } from "./monitor/monitor.js";
+import { standing } from "./alarms/alarm-strip.js";
+import { UNSEEN } from "./monitor/states.js";
+import "./plant/plant-view.js";
+import "./sign-in.js";
 
 /** Views by the first part of the address after `#/`; what is not needed for the plant is loaded when it is asked for. @type {Record<string, () => Promise<unknown>>} */
-const VIEWS = { machines: () => import("./machine-view.js"), alarms: () => import("./alarms-view.js") };
+const VIEWS = { machines: () => import("./machine/machine-view.js"), alarms: () => import("./alarms/alarms-view.js") };
 
 /** The page: what is always there, and the view that the address names. */
 class RotorwatchPage extends HTMLElement {
   #banner = html("p", { class: "banner", role: "alert", hidden: true });
   #alarms = html("a", { href: "#/alarms" }, "Alarms");
   #who = html("span", { class: "note" });
+  #leave = html("button", { type: "button", hidden: true, click: () => this.#signOut() }, "Sign out");
   #times = html("button", { type: "button", click: () => this.#switch() });
   #main = html("main", { tabindex: "-1", id: "main" });
 
   connectedCallback() {
     this.replaceChildren(
-      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms), this.#who, this.#times),
+      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms), this.#who, this.#leave, this.#times),
       this.#banner,
       this.#main,
       html("footer", {}, "Monitoring, not machine protection. ", html("a", { href: "/docs" }, "HTTP API"), ", ", html("a", { href: "/openapi.json" }, "its description"), ", ", html("a", { href: "/readyz" }, "readiness")),
     );
     addEventListener("hashchange", () => this.#go(true));
     monitor.addEventListener("connection", ({ detail }) => this.#connection(detail));
+    monitor.addEventListener("caller", () => this.#caller());
     monitor.addEventListener("health", () => this.#count());
     this.#count();
     this.#go(false);
@@ -40,6 +43,7 @@ class RotorwatchPage extends HTMLElement {
       this.#main.replaceChildren(html("p", {}, "The monitor serves another page by now: load this one again."));
       return;
     }
+    if (monitor.stranger) return this.#main.replaceChildren(html("sign-in"));
     const view = name === "machines" ? html("machine-view", { place: rest.join("/") }) : html(name === "alarms" ? "alarms-view" : "plant-view");
     for (const link of this.querySelectorAll("nav a")) {
       if (link.getAttribute("href") === (location.hash || "#/")) link.setAttribute("aria-current", "page");
@@ -48,6 +52,23 @@ class RotorwatchPage extends HTMLElement {
     this.#main.replaceChildren(view);
     this.#count();
     if (moved) this.#main.focus();
+  }
+
+  /** Whoever looks has changed: what was shown was for another one's eyes. */
+  #caller() {
+    this.#who.textContent = monitor.caller?.name ?? "";
+    this.#leave.hidden = !monitor.caller || monitor.caller.name === "anonymous";
+    this.#banner.hidden = true;
+    if (monitor.stranger || this.querySelector("sign-in")) this.#go(true);
+    this.#count();
+  }
+
+  async #signOut() {
+    try {
+      await monitor.signOut();
+    } catch (error) {
+      this.#connection(error instanceof Error ? error.message : String(error));
+    }
   }
 
   #switch() {
@@ -73,7 +94,6 @@ class RotorwatchPage extends HTMLElement {
     this.#banner.hidden = monitor.connected;
     this.classList.toggle("lost", !monitor.connected);
     this.#banner.textContent = monitor.connected ? "" : `No connection to the monitor since ${clock(Number(monitor.lostAt) * 1e6)}: ${why}. What is shown is from before.`;
-    this.#who.textContent = monitor.name;
     this.#count();
   }
 }

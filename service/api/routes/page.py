@@ -1,4 +1,4 @@
-"""The page for people: files that ask the API for everything they show.
+"""The page for people: files that ask the API for everything they show, and so are anybody's.
 
 They are served below the digest of all of them, so that a browser keeps them for good and never mixes two versions.
 """
@@ -13,7 +13,7 @@ from fastapi import FastAPI, HTTPException, Response
 from fastapi import Path as InPath
 from fastapi.responses import HTMLResponse
 
-from service.access.guard import Guard
+from service.access.routes import PAGE_FILES
 
 _FOLDER = Path(str(files("service"))) / "api" / "page"
 _INDEX = "index.html"
@@ -29,22 +29,23 @@ def page_files() -> dict[str, bytes]:
     """Everything the page is made of, by name, the library of charts included."""
     # The package itself is not imported: it brings a shell for notebooks along.
     charts = Path(str(distribution("uplot-python").locate_file("uplot/static")))
-    paths = [*(path for path in _FOLDER.iterdir() if path.suffix in _TYPES), *(charts / name for name in _CHARTS)]
-    return {path.name: path.read_bytes() for path in sorted(paths)}
+    found = {path.relative_to(_FOLDER).as_posix(): path for path in _FOLDER.rglob("*") if path.suffix in _TYPES}
+    found |= {name: charts / name for name in _CHARTS}
+    return {name: path.read_bytes() for name, path in sorted(found.items())}
 
 
-def add_page_routes(app: FastAPI, guard: Guard) -> None:
+def add_page_routes(app: FastAPI) -> None:
     """Add the page and what it loads."""
     found = page_files()
-    digest = hashlib.sha256(repr(sorted(found.items())).encode()).hexdigest()[:16]
-    index = (_FOLDER / _INDEX).read_text(encoding="utf-8").replace("/page/", f"/page/{digest}/")
+    digest = hashlib.sha256(repr(found).encode()).hexdigest()[:16]
+    index = (_FOLDER / _INDEX).read_text(encoding="utf-8").replace(PAGE_FILES, f"{PAGE_FILES}{digest}/")
 
-    @app.get("/", dependencies=[guard.read], include_in_schema=False, response_class=HTMLResponse)
+    @app.get("/", include_in_schema=False, response_class=HTMLResponse)
     def page() -> HTMLResponse:
         """Serve the page for people."""
         return HTMLResponse(index, headers={"Content-Security-Policy": _POLICY, "Cache-Control": "no-cache"})
 
-    @app.get("/page/{version}/{name}", dependencies=[guard.read], include_in_schema=False)
+    @app.get(PAGE_FILES + "{version}/{name:path}", include_in_schema=False)
     def page_file(
         version: Annotated[str, InPath(description="digest of all files")],
         name: Annotated[str, InPath(description="of the file")],
@@ -52,5 +53,5 @@ def add_page_routes(app: FastAPI, guard: Guard) -> None:
         """Serve what the page loads."""
         if version != digest or name not in found:
             raise HTTPException(404, f"the page has no file {name[:80]} of this version; load / again")
-        keep = {"Cache-Control": "private, max-age=31536000, immutable"}
+        keep = {"Cache-Control": "public, max-age=31536000, immutable"}
         return Response(found[name], media_type=_TYPES[Path(name).suffix], headers=keep)

@@ -158,7 +158,7 @@ def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     _add_changing_routes(app, desk, guard)
 
 
-_NoOrder = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
+NothingToSay = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
 _Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldest")]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
@@ -224,13 +224,13 @@ def _add_changing_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
         return _there(None if desk.jobs is None else desk.jobs.stop(replay_id), replay_id)
 
     @app.post(f"{_JOB}/pause", responses=responses(ReplayJob, *problems, 409), **common)
-    def pause_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
+    def pause_replay(replay_id: str, order: NothingToSay) -> ReplayJob:
         """Pause a paced replay."""
         _ = order
         return _order(desk, replay_id, "pause")
 
     @app.post(f"{_JOB}/resume", responses=responses(ReplayJob, *problems, 409), **common)
-    def resume_replay(replay_id: str, order: _NoOrder) -> ReplayJob:
+    def resume_replay(replay_id: str, order: NothingToSay) -> ReplayJob:
         """Let a paused replay go on."""
         _ = order
         return _order(desk, replay_id, "resume")

@@ -1,16 +1,12 @@
-"""What is said of the monitor itself over HTTP: metrics for Prometheus, how webhooks stand, what the caller may do."""
+"""What is said of the monitor itself over HTTP: metrics for Prometheus, and how webhooks stand."""
 
-from typing import Annotated
-
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Response
 from fastapi.responses import PlainTextResponse
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from rotorwatch.records.monitor import CallerRights, WebhookList
-from service.access.credentials import presented_text
+from rotorwatch.records.monitor import WebhookList
 from service.access.guard import Guard
 from service.access.problems import problem_responses, responses
-from service.access.scopes import Caller, Scope
 from service.api.views import ServiceView
 
 _EXAMPLE = (
@@ -41,10 +37,3 @@ def add_service_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     def webhooks() -> WebhookList:
         """Programs that are told of alarm events, and whether they take them."""
         return service.webhooks.statuses()
-
-    @app.get("/api/v1/caller", tags=["service"], responses=responses(CallerRights))
-    def caller(request: Request, caller: Annotated[Caller, guard.read]) -> CallerRights:
-        """Who calls, and which scopes that caller has; as a password a token lets its owner look and no more."""
-        looks = "authorization" in request.headers and presented_text(request.headers, "POST") is None
-        scopes = {Scope.READ} if looks else caller.scopes
-        return CallerRights(name=caller.name, scopes=tuple(scope.value for scope in Scope if scope in scopes))

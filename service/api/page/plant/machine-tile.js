@@ -1,10 +1,10 @@
-import { lasting } from "./figures.js";
-import { html, lay } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { monitor } from "./monitor.js";
-import { ABNORMAL, stands, UNSEEN, worst } from "./states.js";
-import "./spark-line.js";
-import "./state-mark.js";
+import { lasting } from "../monitor/figures.js";
+import { html, lay } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { monitor } from "../monitor/monitor.js";
+import { ABNORMAL, stands, UNSEEN, worst } from "../monitor/states.js";
+import "../elements/spark-line.js";
+import "../elements/state-mark.js";
 
 /** One machine of the plant: its worst standing state, what is worst, and how old that is. */
 class MachineTile extends MachineElement {
@@ -44,7 +44,7 @@ class MachineTile extends MachineElement {
     if (shown) shown.textContent = age === null ? "never any data" : `data ${lasting(age)} old`;
   }
 
-  /** The same element as long as it shows the same series. @param {import("./states.js").Worst | null} found */
+  /** The same element as long as it shows the same series. @param {import("../monitor/states.js").Worst | null} found */
   #line(found) {
     if (!found?.series) return null;
     if (this.#spark?.getAttribute("series") !== found.series)

@@ -1,11 +1,11 @@
-import { interval, percent, within, Z95 } from "./figures.js";
-import { html, table } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import "./state-mark.js";
+import { interval, percent, within, Z95 } from "../monitor/figures.js";
+import { html, table } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import "../elements/state-mark.js";
 
-/** @typedef {import("./records.js").Parameter} Parameter */
-/** @typedef {import("./records.js").Opinion} Opinion */
-/** @typedef {import("./records.js").Verdict} Verdict */
+/** @typedef {import("../monitor/records.js").Parameter} Parameter */
+/** @typedef {import("../monitor/records.js").Opinion} Opinion */
+/** @typedef {import("../monitor/records.js").Verdict} Verdict */
 
 /** What another diagnostician reads of a parameter, and whether that agrees. @param {Opinion} opinion @param {string} name */
 function other(opinion, name) {

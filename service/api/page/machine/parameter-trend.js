@@ -1,4 +1,4 @@
-import { monitor, pathOf } from "./monitor.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
 import { ReadingTrend } from "./reading-trend.js";
 
 /** Changes of the parameters over time, with their 95 % intervals and the limits of the machine file. */

@@ -1,8 +1,8 @@
-import { clock } from "./figures.js";
-import { html } from "./markup.js";
-import { monitor } from "./monitor.js";
-import { byUrgency, stands, UNSEEN } from "./states.js";
-import "./state-mark.js";
+import { clock } from "../monitor/figures.js";
+import { html } from "../elements/markup.js";
+import { monitor } from "../monitor/monitor.js";
+import { byUrgency, stands, UNSEEN } from "../monitor/states.js";
+import "../elements/state-mark.js";
 
 const SHOWN = 5;
 

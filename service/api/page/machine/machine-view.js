@@ -1,9 +1,9 @@
-import { clock } from "./figures.js";
-import { html, lay } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { pathOf } from "./monitor.js";
-import "./alarm-history.js";
-import "./alarm-list.js";
+import { clock } from "../monitor/figures.js";
+import { html, lay } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { pathOf } from "../monitor/monitor.js";
+import "../alarms/alarm-history.js";
+import "../alarms/alarm-list.js";
 import "./data-quality.js";
 import "./level-table.js";
 import "./level-trend.js";
@@ -11,7 +11,7 @@ import "./orbit-plot.js";
 import "./parameter-table.js";
 import "./parameter-trend.js";
 import "./spectrum-plot.js";
-import "./state-mark.js";
+import "../elements/state-mark.js";
 
 const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all there is"]]);
 const RAW = ["health", "reports", "alarms", "alarms/events", "detectable", "configuration"];

@@ -1,5 +1,5 @@
 import { html } from "./markup.js";
-import { clock, local, ticks } from "./figures.js";
+import { clock, local, ticks } from "../monitor/figures.js";
 
 /** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number}} Line */
 /** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
@@ -11,7 +11,7 @@ let library;
 /** The library of charts, fetched by the first view that draws one. @returns {Promise<any>} */
 function charts() {
   library ??= new Promise((resolve, reject) => {
-    const at = (/** @type {string} */ name) => new URL(name, import.meta.url).href;
+    const at = (/** @type {string} */ name) => new URL(`../${name}`, import.meta.url).href;
     document.head.append(html("link", { rel: "stylesheet", href: at("uPlot.min.css") }));
     const script = html("script", { src: at("uPlot.iife.js"), load: () => resolve(/** @type {any} */ (window).uPlot), error: () => reject(new Error("charts cannot be loaded; load the page again")) });
     document.head.append(script);

@@ -1,10 +1,10 @@
-import { html } from "./markup.js";
-import { monitor } from "./monitor.js";
-import { STATES, stands, urgency } from "./states.js";
-import "./alarm-strip.js";
+import { html } from "../elements/markup.js";
+import { monitor } from "../monitor/monitor.js";
+import { STATES, stands, urgency } from "../monitor/states.js";
+import "../alarms/alarm-strip.js";
 import "./machine-tile.js";
 
-/** @typedef {import("./records.js").Health} Health */
+/** @typedef {import("../monitor/records.js").Health} Health */
 
 /** Every machine as a tile, the most urgent first; those without data and without an alarm apart. */
 class PlantView extends HTMLElement {

@@ -1,5 +1,5 @@
 import { html, svg } from "./markup.js";
-import { STATES } from "./states.js";
+import { STATES } from "../monitor/states.js";
 
 /** Outlines for what is as it should be, filled shapes for what is not. @type {Record<string, string>} */
 const SHAPES = {

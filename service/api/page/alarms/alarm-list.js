@@ -1,11 +1,11 @@
-import { clock, interval, percent } from "./figures.js";
-import { html, table } from "./markup.js";
-import { monitor, Refused } from "./monitor.js";
-import { byUrgency, UNSEEN } from "./states.js";
+import { clock, interval, percent } from "../monitor/figures.js";
+import { html, table } from "../elements/markup.js";
+import { monitor, Refused } from "../monitor/monitor.js";
+import { byUrgency, UNSEEN } from "../monitor/states.js";
 import { ordered } from "./alarm-order.js";
-import "./state-mark.js";
+import "../elements/state-mark.js";
 
-/** @typedef {import("./records.js").Alarm} Alarm */
+/** @typedef {import("../monitor/records.js").Alarm} Alarm */
 /** @typedef {{place: string, alarm: Alarm}} Placed */
 
 /** Why it is silenced, or how large the change is, or what the note says. @param {Alarm} alarm */
@@ -65,7 +65,7 @@ class AlarmList extends HTMLElement {
   /** Only if something has changed: whoever is about to press a button shall not miss it. */
   #show() {
     const all = this.#alarms();
-    const said = JSON.stringify([all.map(({ place, alarm }) => [place, { ...alarm, evidence: null }]), [...monitor.scopes]]);
+    const said = JSON.stringify([all.map(({ place, alarm }) => [place, { ...alarm, evidence: null }]), monitor.caller?.scopes]);
     if (said === this.#said) return;
     this.#said = said;
     const focused = document.activeElement instanceof HTMLElement ? document.activeElement.dataset.order : undefined;

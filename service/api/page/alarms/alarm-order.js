@@ -1,4 +1,4 @@
-import { html } from "./markup.js";
+import { html } from "../elements/markup.js";
 
 const TITLES = /** @type {Record<string, string>} */ ({ shelve: "Shelve", "remove-from-service": "Take out of service" });
 const HOURS = [1, 4, 8];

@@ -1,12 +1,12 @@
-import { figure, printed } from "./figures.js";
-import { html } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { monitor, pathOf } from "./monitor.js";
-import "./line-chart.js";
+import { figure, printed } from "../monitor/figures.js";
+import { html } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
+import "../elements/line-chart.js";
 
 const [REFRESH_S, ORDERS] = [15, 5];
 
-/** @typedef {import("./records.js").Spectra} Spectra */
+/** @typedef {import("../monitor/records.js").Spectra} Spectra */
 
 /** Power spectral densities of the live window beside theory, with the orders of the running speed. */
 class SpectrumPlot extends MachineElement {
@@ -41,7 +41,7 @@ class SpectrumPlot extends MachineElement {
     const turning = found.rotation_hz;
     const last = found.frequencies_hz[found.frequencies_hz.length - 1];
     const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= last) : [];
-    /** @type {import("./line-chart.js").Line[]} */
+    /** @type {import("../elements/line-chart.js").Line[]} */
     const lines = [{ label: "measured", values: shown.measured }];
     if (shown.nominal) lines.push({ label: "as nominal", values: shown.nominal, colour: "nominal", dash: [6, 4] });
     if (shown.estimated) lines.push({ label: "as estimated", values: shown.estimated, colour: "estimated", width: 2 });

@@ -1,7 +1,7 @@
-import { clock, figure, lasting } from "./figures.js";
-import { html } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { monitor } from "./monitor.js";
+import { clock, figure, lasting } from "../monitor/figures.js";
+import { html } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { monitor } from "../monitor/monitor.js";
 
 /** What came in, and what is to be known about it. */
 class DataQuality extends MachineElement {

@@ -1,12 +1,12 @@
-import { clock } from "./figures.js";
-import { html, lay, table } from "./markup.js";
-import { monitor, pathOf } from "./monitor.js";
-import { MachineElement } from "./machine-element.js";
-import "./state-mark.js";
+import { clock } from "../monitor/figures.js";
+import { html, lay, table } from "../elements/markup.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
+import { MachineElement } from "../elements/machine-element.js";
+import "../elements/state-mark.js";
 
 const PAGE = 50;
 
-/** @typedef {import("./records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
 
 /** What happened to the alarms of a machine, newest first. */
 class AlarmHistory extends MachineElement {

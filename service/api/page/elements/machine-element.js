@@ -1,4 +1,4 @@
-import { monitor } from "./monitor.js";
+import { monitor } from "../monitor/monitor.js";
 
 /** An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. */
 export class MachineElement extends HTMLElement {

@@ -1,8 +1,8 @@
-import { figure, printed } from "./figures.js";
-import { html, table } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { limitText, measureText } from "./states.js";
-import "./state-mark.js";
+import { figure, printed } from "../monitor/figures.js";
+import { html, table } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { limitText, measureText } from "../monitor/states.js";
+import "../elements/state-mark.js";
 
 const MEASURES = ["overall", "velocity", "x1", "x2", "mean", "crest", "kurtosis"];
 

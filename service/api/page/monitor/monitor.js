@@ -19,14 +19,15 @@ export class Refused extends Error {
 export const pathOf = (place) => `${API}/machines/${place}`;
 
 /**
- * Tells `health` (the detail is the machine), `health:SITE/MACHINE`, `alarm` and `connection`.
+ * Tells `health` (the detail is the machine), `health:SITE/MACHINE`, `alarm`, `connection`, and `caller` where another one, or nobody, is signed in.
  */
 export class Monitor extends EventTarget {
   /** @type {Map<string, {health: Health, heard: number}>} */
   machines = new Map();
-  /** @type {Set<string>} */
-  scopes = new Set();
-  name = "";
+  /** @type {{name: string, scopes: string[]} | null} who is signed in */
+  caller = null;
+  /** Why somebody has to sign in; empty if nobody has to. */
+  stranger = "";
   connected = false;
   /** @type {number | null} since when nothing is heard */
   lostAt = null;
@@ -36,9 +37,9 @@ export class Monitor extends EventTarget {
   /** Begin to listen, now and whenever the stream has ended. */
   async listen() {
     try {
-      const caller = await this.ask(`${API}/caller`);
-      [this.name, this.scopes] = [caller.name, new Set(caller.scopes)];
+      this.#known(await this.ask(`${API}/caller`), "");
     } catch (error) {
+      if (error instanceof Refused && error.status === 401) return this.#known(null, error.message);
       this.#lost(error instanceof Error ? error.message : String(error));
       setTimeout(() => this.listen(), AGAIN_MS);
       return;
@@ -58,7 +59,29 @@ export class Monitor extends EventTarget {
 
   /** Whether the caller may operate alarms, or with `configure` take them out of service. @param {string} scope */
   may(scope) {
-    return this.scopes.has(scope);
+    return this.caller?.scopes.includes(scope) ?? false;
+  }
+
+  /**
+   * Let the browser keep a token, in a cookie that no script can read.
+   * @param {string} token
+   * @throws {Refused}
+   */
+  async signIn(token) {
+    await this.#session("POST", { Authorization: `Bearer ${token}` });
+    await this.listen();
+  }
+
+  async signOut() {
+    await this.#session("DELETE");
+    this.#stream?.close();
+    this.machines.clear();
+    this.#known(null, "Signed out.");
+  }
+
+  /** @param {string} method @param {Record<string, string>} [headers] */
+  #session(method, headers = {}) {
+    return this.ask(`${API}/session`, { method, headers: { "Content-Type": "application/json", ...headers }, body: "{}" });
   }
 
   /**
@@ -104,6 +127,12 @@ export class Monitor extends EventTarget {
     this.machines.set(place, { health, heard: performance.now() });
     this.#tell(`health:${place}`, place);
     this.#tell("health", place);
+  }
+
+  /** @param {{name: string, scopes: string[]} | null} caller @param {string} stranger */
+  #known(caller, stranger) {
+    [this.caller, this.stranger] = [caller, stranger];
+    this.#tell("caller", stranger);
   }
 
   #found() {

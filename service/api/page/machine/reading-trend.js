@@ -1,14 +1,14 @@
-import { html } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { monitor, pathOf } from "./monitor.js";
-import { Z95 } from "./figures.js";
-import "./line-chart.js";
+import { html } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
+import { Z95 } from "../monitor/figures.js";
+import "../elements/line-chart.js";
 
 const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
 const GAP = 2.5;
 
-/** @typedef {import("./records.js").Bucket} Bucket */
-/** @typedef {import("./records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.js").Bucket} Bucket */
+/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
 /** @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, alert: number[], danger: number[], zero: boolean}} Trended */
 
 /** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */

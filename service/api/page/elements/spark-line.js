@@ -1,5 +1,5 @@
 import { svg } from "./markup.js";
-import { monitor, pathOf } from "./monitor.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
 import { MachineElement } from "./machine-element.js";
 
 const [WIDTH, HEIGHT, POINTS, DAY_NS] = [120, 28, 48, 86_400e9];
@@ -61,7 +61,7 @@ class SparkLine extends MachineElement {
     }
   }
 
-  /** @param {import("./records.js").Bucket[]} buckets */
+  /** @param {import("../monitor/records.js").Bucket[]} buckets */
   #draw(buckets) {
     if (buckets.length < 2) return this.replaceChildren();
     const [first, last] = [buckets[0].start_ns, buckets[buckets.length - 1].start_ns];

@@ -1,5 +1,5 @@
-import { html } from "./markup.js";
-import { monitor } from "./monitor.js";
+import { html } from "../elements/markup.js";
+import { monitor } from "../monitor/monitor.js";
 import { standing } from "./alarm-strip.js";
 import "./alarm-history.js";
 import "./alarm-list.js";

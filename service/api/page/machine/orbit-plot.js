@@ -1,13 +1,13 @@
-import { figure, printed } from "./figures.js";
-import { html, svg } from "./markup.js";
-import { MachineElement } from "./machine-element.js";
-import { monitor, pathOf } from "./monitor.js";
+import { figure, printed } from "../monitor/figures.js";
+import { html, svg } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
 
 const [REFRESH_S, REVOLUTIONS, SIZE] = [15, 8, 220];
 
-/** @typedef {import("./records.js").Ellipse} Ellipse */
-/** @typedef {import("./records.js").PlaceOrbit} PlaceOrbit */
-/** @typedef {import("./records.js").Orbits} Orbits */
+/** @typedef {import("../monitor/records.js").Ellipse} Ellipse */
+/** @typedef {import("../monitor/records.js").PlaceOrbit} PlaceOrbit */
+/** @typedef {import("../monitor/records.js").Orbits} Orbits */
 
 /** A length at or above another one with a single leading digit. @param {number} length */
 function round(length) {

@@ -1,5 +1,5 @@
 import { ReadingTrend } from "./reading-trend.js";
-import { levelUnit, measureText } from "./states.js";
+import { levelUnit, measureText } from "../monitor/states.js";
 
 /** The leading level of every channel over time, with its limits. */
 class LevelTrend extends ReadingTrend {
