@@ -291,7 +291,7 @@ class _Supervisor:
         self._watched = watched
         self._feed = feed
         self._stop = threading.Event()
-        self._published: dict[int, tuple[Health, int]] = {}
+        self._published: dict[int, Health] = {}
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
 
     def start(self) -> None:
@@ -317,13 +317,11 @@ class _Supervisor:
                 return
 
     def _look(self, number: int, worker: MachineWorker, link: MachineLink) -> None:
-        # An alarm that changed and changed back is news to whoever asked in between; so the log is looked at first.
-        sequence = worker.history.last_sequence()
         health = worker.health()
-        before, told = self._published.get(number, (None, -1))
-        if before is not None and told == sequence and _news(before) == _news(health):
+        before = self._published.get(number)
+        if before is not None and _news(before) == _news(health):
             return
-        self._published[number] = health, sequence
+        self._published[number] = health
         link.publish_health(health.model_dump_json())
         self._feed.health(health)
         if before is None or before.state != health.state:
@@ -331,7 +329,10 @@ class _Supervisor:
 
 
 def _news(health: Health) -> Health:
-    """Blank what changes with every block: it is no reason to publish."""
+    """Blank what changes with every block: it is no reason to publish.
+
+    An alarm that changed and changed back is one, to whoever asked in between: the number of its event has changed.
+    """
     return health.model_copy(
         update={
             "stream": health.stream.model_copy(update={"data_age_s": None}),

@@ -173,6 +173,9 @@ class Health(Record):
     filled: float = Field(description="fraction of a full window that is there now", examples=[1.0])
     report: Report | None = Field(description="the latest window; null before the first hop")
     alarms: tuple[Alarm, ...] = Field(description="alarms that are not normal")
+    sequence: int = Field(
+        default=-1, description="sequence number of the latest alarm event in them; -1 before the first", examples=[0]
+    )
     quality: Quality = Field(description="what came in")
     stream: StreamStatus = Field(description="what is known about the publisher")
     restart: str = Field(

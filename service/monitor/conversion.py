@@ -40,6 +40,7 @@ def health(  # noqa: PLR0913  # what the worker counts
         filled=record.filled,
         report=record.latest,
         alarms=alarm_entries(record.alarms),
+        sequence=record.sequence,
         quality=quality.model_copy(update=lost),
         stream=stream,
         restart=restart,
