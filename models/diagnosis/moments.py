@@ -341,7 +341,7 @@ def _hann(size: int, rate_hz: float) -> FloatArray:
 
 
 SpeedSource = Literal["phase reference", "estimated", "unknown"]
-_DEPENDENT = 1e-15  # singular value over the largest one, below which a regressor is made of the others
+_DEPENDENT = 1e-15  # eigenvalue over the largest one, below which a regressor is made of the others
 STEADY = 0.01  # range of the hops' speeds, relative, up to which one set of coefficients serves the window
 
 
@@ -381,7 +381,9 @@ def rotation_of(plan: Plan, hops: tuple[HopMoments, ...]) -> Rotation:
 
 def regression(zero_lag: FloatArray, n: int) -> FloatArray:
     """β of x on the regressors, shape (…, n, n_regressors); of least norm where a stuck angle makes them dependent."""
-    between = np.linalg.pinv(zero_lag[..., n:, n:], rcond=_DEPENDENT, hermitian=True)
+    values, vectors = np.linalg.eigh(zero_lag[..., n:, n:])
+    kept = np.abs(values) > _DEPENDENT * np.abs(values).max(axis=-1, keepdims=True)
+    between = (vectors * (kept / np.where(kept, values, 1.0))[..., None, :]) @ vectors.swapaxes(-1, -2)
     return np.asarray((between @ zero_lag[..., n:, :n]).swapaxes(-1, -2), dtype=np.float64)
 
 

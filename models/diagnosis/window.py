@@ -32,8 +32,6 @@ from models.errors import CheckpointError
 from models.levels.measures import WindowLevels, window_levels
 from models.signals.block import FloatArray
 
-_AT_ONCE = 32  # bins whose coefficients stay in a processor's cache
-
 
 @dataclass(frozen=True)
 class WindowStatistics:
@@ -144,15 +142,13 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         remove = np.hstack([np.eye(n), -beta])
         hop_correlation = (remove @ products @ remove.T) / plan.hop
         correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
-        cleaned = segments @ remove.T
+        # One product of large matrices: as many as there are segments take longer.
+        cleaned = (segments.reshape(-1, segments.shape[2]) @ remove.T).reshape(*segments.shape[:2], n)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:
         hop_synchronous = _synchronous(regression(products[:, 0], n))
-    spectrum = np.empty((plan.bins.size, n, n), dtype=np.complex128)
-    for first in range(0, plan.bins.size, _AT_ONCE):
-        rest = np.ascontiguousarray(cleaned[:, first : first + _AT_ONCE].transpose(1, 2, 0))
-        spectrum[first : first + _AT_ONCE] = rest @ rest.conj().transpose(0, 2, 1) / segments.shape[0]
+    by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2))
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(
         states=plan.mounted,
@@ -163,7 +159,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         lags_s=plan.lags_s[:n_lags],
         correlation=correlation,
         hop_correlation=hop_correlation,
-        spectrum=spectrum,
+        spectrum=by_bin.transpose(0, 2, 1) @ by_bin.conj() / segments.shape[0],
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,

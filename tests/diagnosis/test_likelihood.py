@@ -16,6 +16,7 @@ from models.diagnosis.readings import Diagnosis
 from models.diagnosis.window import SlidingWindow
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
+from models.physics.rotor import M_matrix, P_matrix, Q_matrix, changed
 from simulator.training.draws import Anomaly, Draw, Excitation, Layout, Purpose, simulate_window
 
 SEED = 7_700_001
@@ -53,6 +54,23 @@ def test_expected_segment_spectrum_of_a_line_in_noise() -> None:
     count = len(range(0, 32 * 60 - 63, 32)) * 24
     assert np.mean(averages) == pytest.approx(1, rel=0.01)
     assert 1 / np.var(band) == pytest.approx(AVERAGES_PER_BIN * count, rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["lab", "heavy", "light"])
+def test_the_receptance_is_the_inverse_of_the_dynamic_matrix(name: str) -> None:
+    """At random frequencies, speeds and changes, relative to how far each degree of freedom moves by itself."""
+    machine, rng = load_machine(name), np.random.default_rng(38)
+    motions = Motions(("y1", "z1"), np.ones(2))
+    model = SpectralModel(machine, motions, groups_of(machine))
+    for _ in range(20):
+        w, speed = 2 * np.pi * rng.uniform(0, 500, rng.integers(1, 50)), rng.normal(0, 500)
+        ratios = rng.uniform(-2, 2, len(STRUCTURAL))
+        rotor = changed(machine.rotor, dict(zip(STRUCTURAL, np.expm1(ratios).tolist(), strict=True)))
+        P, W = P_matrix(rotor, speed), w[:, None, None]
+        expected = np.linalg.inv(-(W**2) * M_matrix(rotor) + 1j * W * P + Q_matrix(rotor))
+        scale = np.sqrt(np.abs(np.einsum("fii->fi", expected)))
+        off = (model.receptance(ratios, speed, w) - expected) / (scale[:, :, None] * scale[:, None, :])
+        assert np.abs(off).max() < 1e-9
 
 
 def test_derivatives_of_the_spectra() -> None:

@@ -24,7 +24,8 @@ from models.signals.block import FloatArray
 # Of the elements of the dynamic matrix: what couples motions in y, and what couples motions in z.
 _SIGNS = np.kron([[1.0, 0.0], [0.0, -1.0]], np.ones((3, 3)))
 _UNEQUAL = "shaft stiffer in y than in z"
-_MASSES = {"mass at the bearing": (0, 3), "mass of the disc": (1, 4), "inertia of the disc": (2, 5)}
+# In which degree of freedom of y; that of z is three further on.
+_MASSES = {"mass at the bearing": 0, "mass of the disc": 1, "inertia of the disc": 2}
 _LEAST_SUSPECT_Z = 5.0
 _LEAST_SUSPECT = 5e-4  # a smaller one would read as ±0.0 %, and no machine is built as true as that
 _LINEAR = 0.5  # largest one-step estimate that is worth telling: farther out it only says that the thing is not small
@@ -100,9 +101,8 @@ def goodness_of_fit(
     flat = found.slopes.reshape(model.size, -1)
     weighted = (slopes * weight).reshape(len(names), -1)
     cross = weighted @ flat.T
-    gradient = (found.slopes * weight).reshape(model.size, -1) @ excess.ravel()
     projection = np.linalg.solve(found.information, cross.T).T
-    score = weighted @ excess.ravel() - projection @ gradient
+    score = weighted @ excess.ravel() - projection @ (flat @ (excess * weight).ravel())
     alone = np.einsum("af,af->a", weighted, slopes.reshape(len(names), -1))
     left = alone - np.einsum("ap,ap->a", projection, cross)
     alternatives = tuple(
@@ -149,15 +149,13 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
         names.append(f"gain of {state}")
         slopes.append(twice_packed(outer))
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
-    rotor = machine.rotor
-    for (name, dofs), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):
-        held = np.zeros((6, 6))
-        held[dofs, dofs] = mass
+    rotor, sides = machine.rotor, model.sides(point, whitened, response)
+    for (name, first), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):
         names.append(name)
-        slopes.append(model.dynamic_slope(point, whitened, response, held, w2))
+        slopes.append(sides.slope(mass * w2, slice(first, None, 3)))
     shaft = Q_shaft(rotor) * np.exp(found.theta[STRUCTURAL.index("EI")])
     names.append(_UNEQUAL)
-    slopes.append(model.dynamic_slope(point, whitened, response, shaft * _SIGNS, -np.ones_like(w2)))
+    slopes.append(sides.slope(-np.ones_like(w2), change=shaft * _SIGNS))
     return names, np.stack(slopes)
 
 

@@ -91,13 +91,12 @@ def _largest_part(course: FloatArray, error: float) -> tuple[float, float]:
         return 0.0, 0.0
     if n > 5:
         error = max(error, 1.4826 * float(np.median(np.abs(np.diff(course)))) / np.sqrt(2))
-    best, most = 0.0, 0.0
-    for k in range(1, n):
-        change = float(course[k:].mean() - course[:k].mean())
-        z = abs(change) / (error * np.sqrt(1 / k + 1 / (n - k)))
-        if z > most:
-            best, most = change, z
-    return best, most
+    before = np.arange(1, n)
+    sums = np.cumsum(course)
+    changes = (sums[-1] - sums[:-1]) / (n - before) - sums[:-1] / before
+    z = np.abs(changes) / (error * np.sqrt(1 / before + 1 / (n - before)))
+    best = int(np.argmax(z))
+    return float(changes[best]), float(z[best])
 
 
 def _gain(

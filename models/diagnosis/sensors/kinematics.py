@@ -5,6 +5,7 @@ common with the motion is free of both noises, so it serves as the instrument: h
 place, the two biased ratios bracket the gain. The rotation-synchronous vectors add a line with little noise on it.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -100,9 +101,11 @@ def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
 def shared(bands: Banded) -> float:
     """How much of the motion two sensors share at the best gain, polarity and delay, rotation included, 0 to 1."""
     z, v, cross = _even(bands)
-    if not (z > 0 and v > 0):
-        return 0.0
-    return float(min(1.0, abs(_turned(bands.w, cross)[1]) / np.sqrt(z * v)))
+    return _part(z, v, _turned(bands.w, cross)[1]) if z > 0 and v > 0 else 0.0
+
+
+def _part(z: float, v: float, aligned: float) -> float:
+    return min(1.0, abs(aligned) / math.sqrt(z * v))
 
 
 def same(bands: Banded) -> float:
@@ -149,14 +152,15 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
         return None
     incoherent = np.maximum(1 - np.abs(bands.spectra[:, 1, 0]) ** 2 / (z * v), _FLOOR)
     h, variance, bias = _transfer(bands, incoherent)
-    level, _, cross = _even(bands)
+    level, other, cross = _even(bands)
     delay_s, total = _turned(bands.w, cross)
     start = _Start(1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR))), delay_s)
+    in_common = _part(level, other, total)
     alone = _fitted(pair, start, bands.w, h, variance, bias)
     rotation = _rotation(window, pair)
     line = None if rotation is None else _line(rotation, window, bands, incoherent)
     if line is None:
-        return replace(alone, shared=shared(bands))
+        return replace(alone, shared=in_common)
     speed, ratio, spread = line
     found = _fitted(
         pair, start, np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0)
@@ -164,7 +168,7 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
     runout = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
     if runout and alone.log_gain_error < _RUNOUT:
         found = alone
-    return replace(found, shared=shared(bands))
+    return replace(found, shared=in_common)
 
 
 @dataclass(frozen=True, slots=True)
