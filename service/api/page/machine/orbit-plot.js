@@ -27,6 +27,42 @@ function marked({ path }, pulses_s) {
   });
 }
 
+/** One place: samples, ellipses and marks. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
+export function orbitFigure(orbit, pulses_s) {
+  const { path, ellipse, nominal, estimated, location, unit } = orbit;
+  const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);
+  const scale = (0.46 * SIZE) / round(reach);
+  const oval = (/** @type {Ellipse | null} */ one, /** @type {string} */ kind) =>
+    one && svg("ellipse", { class: kind, rx: one.semi_major * scale, ry: one.semi_minor * scale, transform: `rotate(${-one.tilt_deg})` });
+  const points = path ? path.y.map((y, at) => `${(y * scale).toFixed(1)},${(-path.z[at] * scale).toFixed(1)}`).join(" ") : "";
+  const half = SIZE / 2;
+  const grid = [-1, -0.5, 0, 0.5, 1].flatMap((each) => {
+    const at = each * 0.46 * SIZE;
+    return [svg("line", { class: "grid", x1: -half, x2: half, y1: at, y2: at }), svg("line", { class: "grid", y1: -half, y2: half, x1: at, x2: at })];
+  });
+  const said = ellipse ? `${figure(2 * ellipse.semi_major)} × ${figure(2 * ellipse.semi_minor)} ${printed(unit)} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
+  const keys = [path && ["path", "samples"], ellipse && ["measured", "1× measured"], nominal && ["nominal", "as nominal"], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
+  return html(
+    "figure",
+    {},
+    html("figcaption", {}, location, html("small", { class: "number" }, ` ${said}`)),
+    svg(
+      "svg",
+      { viewBox: `${-half} ${-half} ${SIZE} ${SIZE}`, role: "img", "aria-label": `orbit at the ${location}: ${said}`, class: "orbit" },
+      ...grid,
+      svg("polyline", { class: "path", points }),
+      oval(nominal, "nominal"),
+      oval(estimated, "estimated"),
+      oval(ellipse, "measured"),
+      ...marked(orbit, pulses_s).map(([y, z]) => svg("circle", { class: "pulse", cx: y * scale, cy: -z * scale, r: 3 })),
+      svg("text", { x: half - 4, y: -4, "text-anchor": "end" }, "y"),
+      svg("text", { x: 4, y: -half + 12 }, "z"),
+      svg("text", { x: 0.46 * SIZE - 2, y: half - 4, "text-anchor": "end" }, `grid ${figure(round(reach) / 2)} ${printed(unit)}`),
+    ),
+    html("p", { class: "keys" }, ...keys.filter(Boolean).map((key) => html("span", { class: `key ${/** @type {string[]} */ (key)[0]}` }, /** @type {string[]} */ (key)[1]))),
+  );
+}
+
 /** Orbits of the live window: samples, the ellipse at running speed, theory, and the keyphasor's mark. */
 class OrbitPlot extends MachineElement {
   connectedCallback() {
@@ -38,48 +74,12 @@ class OrbitPlot extends MachineElement {
     const found = /** @type {Orbits} */ (await monitor.ask(`${pathOf(this.place)}/orbits?revolutions=${REVOLUTIONS}`));
     const drawn = found.orbits.filter((one) => one.ellipse || one.path);
     const reasons = [found.reason, found.path_reason].filter(Boolean).join("; ");
-    this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => this.#draw(one, found.pulses_s))), html("p", { class: "note" }, reasons));
+    this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => orbitFigure(one, found.pulses_s))), html("p", { class: "note" }, reasons));
   }
 
   /** @param {string} why */
   refused(why) {
     this.replaceChildren(html("p", { class: "note" }, why));
-  }
-
-  /** @param {PlaceOrbit} orbit @param {number[]} pulses_s */
-  #draw(orbit, pulses_s) {
-    const { path, ellipse, nominal, estimated, location, unit } = orbit;
-    const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);
-    const scale = (0.46 * SIZE) / round(reach);
-    const oval = (/** @type {Ellipse | null} */ one, /** @type {string} */ kind) =>
-      one && svg("ellipse", { class: kind, rx: one.semi_major * scale, ry: one.semi_minor * scale, transform: `rotate(${-one.tilt_deg})` });
-    const points = path ? path.y.map((y, at) => `${(y * scale).toFixed(1)},${(-path.z[at] * scale).toFixed(1)}`).join(" ") : "";
-    const half = SIZE / 2;
-    const grid = [-1, -0.5, 0, 0.5, 1].flatMap((each) => {
-      const at = each * 0.46 * SIZE;
-      return [svg("line", { class: "grid", x1: -half, x2: half, y1: at, y2: at }), svg("line", { class: "grid", y1: -half, y2: half, x1: at, x2: at })];
-    });
-    const said = ellipse ? `${figure(2 * ellipse.semi_major)} × ${figure(2 * ellipse.semi_minor)} ${printed(unit)} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
-    const keys = [path && ["path", "samples"], ellipse && ["measured", "1× measured"], nominal && ["nominal", "as nominal"], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
-    return html(
-      "figure",
-      {},
-      html("figcaption", {}, location, html("small", { class: "number" }, ` ${said}`)),
-      svg(
-        "svg",
-        { viewBox: `${-half} ${-half} ${SIZE} ${SIZE}`, role: "img", "aria-label": `orbit at the ${location}: ${said}`, class: "orbit" },
-        ...grid,
-        svg("polyline", { class: "path", points }),
-        oval(nominal, "nominal"),
-        oval(estimated, "estimated"),
-        oval(ellipse, "measured"),
-        ...marked(orbit, pulses_s).map(([y, z]) => svg("circle", { class: "pulse", cx: y * scale, cy: -z * scale, r: 3 })),
-        svg("text", { x: half - 4, y: -4, "text-anchor": "end" }, "y"),
-        svg("text", { x: 4, y: -half + 12 }, "z"),
-        svg("text", { x: 0.46 * SIZE - 2, y: half - 4, "text-anchor": "end" }, `grid ${figure(round(reach) / 2)} ${printed(unit)}`),
-      ),
-      html("p", { class: "keys" }, ...keys.filter(Boolean).map((key) => html("span", { class: `key ${/** @type {string[]} */ (key)[0]}` }, /** @type {string[]} */ (key)[1]))),
-    );
   }
 }
 

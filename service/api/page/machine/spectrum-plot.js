@@ -8,6 +8,28 @@ const [REFRESH_S, ORDERS] = [15, 5];
 
 /** @typedef {import("../monitor/records.js").Spectra} Spectra */
 
+/** One channel's spectrum beside its theory, with the orders. @param {Spectra} found @param {import("../monitor/records.js").Density} shown @returns {import("../elements/line-chart.js").Drawing} */
+export function spectrumDrawing(found, shown) {
+  const turning = found.rotation_hz;
+  const last = found.frequencies_hz[found.frequencies_hz.length - 1];
+  const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= last) : [];
+  /** @type {import("../elements/line-chart.js").Line[]} */
+  const lines = [{ label: "measured", values: shown.measured }];
+  if (shown.nominal) lines.push({ label: "as nominal", values: shown.nominal, colour: "nominal", dash: [6, 4] });
+  if (shown.estimated) lines.push({ label: "as estimated", values: shown.estimated, colour: "estimated", width: 2 });
+  return {
+    x: found.frequencies_hz,
+    lines,
+    marks: orders.map((order) => ({ at: order * /** @type {number} */ (turning), axis: "x", colour: "ink-2", text: `${order}×`, dash: [2, 3] })),
+    time: false,
+    log: true,
+    unit: printed(shown.unit),
+    xUnit: "frequency, Hz",
+    shaded: found.left_out_hz,
+    height: 280,
+  };
+}
+
 /** Power spectral densities of the live window beside theory, with the orders of the running speed. */
 class SpectrumPlot extends MachineElement {
   #message = html("p", { class: "note" });
@@ -38,25 +60,8 @@ class SpectrumPlot extends MachineElement {
     const theory = found.theory;
     this.#message.textContent = [found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
     if (!shown) return;
-    const turning = found.rotation_hz;
-    const last = found.frequencies_hz[found.frequencies_hz.length - 1];
-    const orders = turning ? Array.from({ length: ORDERS }, (_, at) => at + 1).filter((order) => order * turning <= last) : [];
-    /** @type {import("../elements/line-chart.js").Line[]} */
-    const lines = [{ label: "measured", values: shown.measured }];
-    if (shown.nominal) lines.push({ label: "as nominal", values: shown.nominal, colour: "nominal", dash: [6, 4] });
-    if (shown.estimated) lines.push({ label: "as estimated", values: shown.estimated, colour: "estimated", width: 2 });
     this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
-    this.#chart.draw({
-      x: found.frequencies_hz,
-      lines,
-      marks: orders.map((order) => ({ at: order * /** @type {number} */ (turning), axis: "x", colour: "ink-2", text: `${order}×`, dash: [2, 3] })),
-      time: false,
-      log: true,
-      unit: printed(shown.unit),
-      xUnit: "frequency, Hz",
-      shaded: found.left_out_hz,
-      height: 280,
-    });
+    this.#chart.draw(spectrumDrawing(found, shown));
   }
 }
 
