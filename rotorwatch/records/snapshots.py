@@ -248,8 +248,8 @@ class PathSamples(Record):
     """The newest whole revolutions as measured, about their mean; n_samples values each."""
 
     times_s: tuple[float, ...] = Field(description="time of each sample after `start_ns`", examples=[(0.0, 0.0005)])
-    y: _Series = Field(description="samples of the y channel, in `unit` of the orbit", examples=[(3.2, 4.1)])
-    z: _Series = Field(description="samples of the z channel", examples=[(-7.7, -7.1)])
+    y: tuple[float, ...] = Field(description="samples of the y channel, in `unit` of the orbit", examples=[(3.2, 4.1)])
+    z: tuple[float, ...] = Field(description="samples of the z channel", examples=[(-7.7, -7.1)])
 
 
 class PlaceOrbit(Record):

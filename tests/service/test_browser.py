@@ -1,61 +1,37 @@
-"""What a person sees in a browser: a real Chromium opens the pages of a running service.
-
-The browser is what ``ROTORWATCH_CHROMIUM`` names, or the system's own; no registry of Python packages has one that is
-kept up to date, so where there is none, these tests are skipped (what is asked of browsers is tested without one in
-``test_access_http.py``). To keep what was seen: ``ROTORWATCH_SCREENSHOTS=FOLDER``.
-"""
+"""What a person sees in a browser: a real Chromium opens the pages of a running service."""
 
 import json
-import os
 import re
-import shutil
-import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
-from playwright.sync_api import Browser, Error, HttpCredentials, Page, Route, expect, sync_playwright
+from playwright.sync_api import Browser, Error, HttpCredentials, Route, expect
 
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.levels import LevelGrowth
 from rotorwatch.records.windows import SensorFault, Shape
 from service.access.scopes import Scope
-from service.runtime import Runtime, running
-from service.settings.service import MachineEntry
-from simulator.scenario import parse_fault
-from tests.service.live import LAB, SHORT, Feed, endpoint, machine_file, open_session, scenario_blocks, settings
+from service.runtime import Runtime
+from tests.service.browsing import (
+    PATIENCE_MS,
+    SEEN_AT,
+    VIEWS,
+    Plant,
+    chromium,
+    kept,
+    looking,
+    plant_running,
+    violations,
+)
 from tests.service.monitored import GUARDED, PLACE, client, fed, token
-
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-FLAGS = [
-    "--no-sandbox",  # tests may run as root
-    "--disable-gpu",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-PATIENCE_MS = 120_000.0
-FAULT_AT, SEEN_AT = 400, 700
-VIEWS = {"plant": "", "machine": "machines/demo/lab", "alarms": "alarms"}
-SCREENSHOTS = os.environ.get("ROTORWATCH_SCREENSHOTS")
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    path = os.environ.get("ROTORWATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
-    if path is None:  # a fresh machine has none, and it takes an administrator to install one
-        pytest.skip(f"no browser: ROTORWATCH_CHROMIUM is not set, and none of {', '.join(NAMES)} is there")
-    with (
-        sync_playwright() as playwright,
-        playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=PATIENCE_MS) as found,
-    ):
+    with chromium() as found:
         yield found
 
 
@@ -65,68 +41,10 @@ def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
         yield running
 
 
-@dataclass(slots=True)
-class Plant:
-    """A machine whose data come as fast as they are taken up to a block, and then slowly; and one without any."""
-
-    runtime: Runtime
-    feed: Feed
-    until: int = 300
-    cut: threading.Event = field(default_factory=threading.Event)
-
-    def run(self) -> None:
-        for number, block in enumerate(scenario_blocks(100.0, parse_fault(f"k_by=-0.33@{FAULT_AT / 10}"))):
-            self.feed.put(block)
-            if self.cut.wait(0.0 if number < self.until else 1.0):
-                return
-
-
 @pytest.fixture(scope="module")
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
-    files = []
-    for name in ("lab", "spare"):
-        changes = (
-            *SHORT,
-            ('name = "lab"', f'name = "{name}"'),
-            ("[operation]", "[ingest]\nno_data_after_s = 6.0\n\n[operation]"),
-        )
-        files.append(machine_file(tmp_path_factory.mktemp(name), *changes))
-    address = endpoint()
-    entries = tuple(MachineEntry(file=file) for file in files)
-    plan = settings(address, when_full="wait").model_copy(update={"machines": entries})
-    with running(plan) as runtime, open_session(address) as session:
-        made = Plant(runtime, Feed(session, LAB))
-        thread = threading.Thread(target=made.run)
-        thread.start()
+    with plant_running(tmp_path_factory) as made:
         yield made
-        made.cut.set()
-        thread.join()
-
-
-@contextmanager
-def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = False) -> Iterator[Page]:
-    """A page that nothing goes wrong on and that asks nobody else, in a browser of its own."""
-    asked: list[str] = []
-    faults: list[str] = []
-    with browser.new_context(
-        viewport={"width": 390, "height": 844} if phone else {"width": 1360, "height": 850},
-        is_mobile=phone,
-        color_scheme="dark" if dark else "light",
-    ) as context:
-        context.set_default_timeout(PATIENCE_MS)
-        page = context.new_page()
-        page.on("request", lambda request: asked.append(request.url))
-        page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
-        page.on("pageerror", lambda error: faults.append(str(error)))
-        yield page
-    assert asked
-    assert all(one.startswith((f"{url}/", "data:")) for one in asked), asked
-    assert not faults
-
-
-def kept(page: Page, name: str) -> None:
-    if SCREENSHOTS:
-        page.screenshot(path=Path(SCREENSHOTS) / f"{name}.png", full_page=True)
 
 
 def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: Browser, runtime: Runtime) -> None:
@@ -141,6 +59,7 @@ def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: B
         page.get_by_label("Access token").fill("rw_wrong")
         page.get_by_role("button", name="Sign in").click()
         expect(said).to_contain_text("not valid")
+        assert not violations(page)
         kept(page, "sign-in")
         page.get_by_label("Access token").fill(token(runtime, Scope.READ, Scope.OPERATE, name="screen"))
         page.keyboard.press("Enter")
@@ -214,6 +133,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         expect(page.locator("machine-view .head")).to_contain_text("last known: alert")
     with client(plant.runtime) as http:
         _two_operators(browser, plant, http)
+    broken: list[str] = []
     for kind, phone, dark in (("light", False, False), ("dark", False, True), ("phone", True, False)):
         with looking(browser, url, phone=phone, dark=dark) as page:
             for name, path in VIEWS.items():
@@ -224,9 +144,11 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
                 if name == "machine":
                     expect(page.locator("spectrum-plot canvas")).to_be_visible()
                 kept(page, f"{name}-{kind}")
+                broken += [f"{name}, {kind}: {one}" for one in violations(page)]
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
                 ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
                 assert (int(re.findall(r"\d+", ground)[0]) < 80) is dark
+    assert not broken, "\n".join(broken)
 
 
 def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser, plant: Plant) -> None:

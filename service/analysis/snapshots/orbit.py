@@ -196,11 +196,9 @@ def _path(machine: MachineFile, path: Revolutions, pair: tuple[Channel, Channel]
     samples = path.excerpt.samples
     y, z = planes_of(pair).turned(np.stack([samples[:, names.index(one.name)] * one.to_si * factor for one in pair]))
     times_s = np.arange(y.size) / machine.rate_hz
-    return PathSamples(
-        times_s=tuple(one for one in figures(times_s) if one is not None),
-        y=figures(y - y.mean()),
-        z=figures(z - z.mean()),
-    )
+    # What is not finite was refused when it came in.
+    shown = (tuple(one for one in figures(each) if one is not None) for each in (times_s, y - y.mean(), z - z.mean()))
+    return PathSamples(**dict(zip(("times_s", "y", "z"), shown, strict=True)))
 
 
 def _rounded(value: float) -> float:

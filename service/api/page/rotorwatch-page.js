@@ -26,7 +26,7 @@ class RotorwatchPage extends HTMLElement {
       html("footer", {}, "Monitoring, not machine protection. ", html("a", { href: "/docs" }, "HTTP API"), ", ", html("a", { href: "/openapi.json" }, "its description"), ", ", html("a", { href: "/readyz" }, "readiness")),
     );
     addEventListener("hashchange", () => this.#go(true));
-    monitor.addEventListener("connection", ({ detail }) => this.#connection(detail));
+    monitor.addEventListener("connection", (event) => this.#connection(/** @type {CustomEvent<string>} */ (event).detail));
     monitor.addEventListener("caller", () => this.#caller());
     monitor.addEventListener("health", () => this.#count());
     this.#count();

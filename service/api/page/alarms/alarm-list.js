@@ -18,17 +18,19 @@ function known(alarm) {
   return [size, alarm.note].filter(Boolean).join("; ");
 }
 
-/** What can be done to an alarm as it is: the order, the button, and the scope that takes. @param {Alarm} alarm */
+/** What can be done to an alarm as it is: the order, the button, and the scope that takes. @param {Alarm} alarm @returns {[string, string, string, boolean][]} */
 function operations(alarm) {
   const silenced = ["shelved", "out-of-service"].includes(alarm.state);
-  return [
+  /** @type {[string, string, string, boolean][]} */
+  const all = [
     ["acknowledge", "Acknowledge", "operate", UNSEEN.has(alarm.state)],
     ["reset", "Reset", "operate", alarm.state.startsWith("latched")],
     ["shelve", "Shelve …", "operate", !silenced && alarm.state !== "normal"],
     ["unshelve", "Unshelve", "operate", alarm.state === "shelved"],
     ["remove-from-service", "Out of service …", "configure", alarm.state !== "out-of-service"],
     ["return-to-service", "Return to service", "configure", alarm.state === "out-of-service"],
-  ].filter(([, , scope, possible]) => possible && monitor.may(String(scope)));
+  ];
+  return all.filter(([, , scope, possible]) => possible && monitor.may(scope));
 }
 
 /** Alarms that are not normal, with what can be done to them: `<alarm-list place="site/machine">`, or of all machines. */
@@ -79,7 +81,7 @@ class AlarmList extends HTMLElement {
   #row({ place, alarm }) {
     const machine = this.hasAttribute("place") ? null : html("a", { href: `#/machines/${place}` }, place);
     const buttons = operations(alarm).map(([kind, text]) =>
-      html("button", { type: "button", "data-order": `${place} ${alarm.name} ${kind}`, click: () => this.#operate(place, alarm, String(kind)) }, text),
+      html("button", { type: "button", "data-order": `${place} ${alarm.name} ${kind}`, click: () => this.#operate(place, alarm, kind) }, text),
     );
     return {
       attributes: { class: [alarm.raised && alarm.severity, UNSEEN.has(alarm.state) && "unseen"].filter(Boolean).join(" ") || null },

@@ -22,7 +22,7 @@ function next() {
 }
 
 const seen = new IntersectionObserver((entries) => {
-  for (const entry of entries) if (entry.isIntersecting) /** @type {SparkLine} */ (entry.target).ask();
+  for (const entry of entries) if (entry.isIntersecting) /** @type {SparkLine} */ (entry.target).queue();
 });
 
 /** The last 24 h of one reading, without numbers: `<spark-line place quantity series>`. */
@@ -32,7 +32,7 @@ class SparkLine extends MachineElement {
   connectedCallback() {
     super.connectedCallback();
     seen.observe(this);
-    this.repeat(REFRESH_S, () => this.ask());
+    this.repeat(REFRESH_S, () => this.queue());
   }
 
   disconnectedCallback() {
@@ -40,25 +40,26 @@ class SparkLine extends MachineElement {
     seen.unobserve(this);
   }
 
-  ask() {
+  /** Load when it is one's turn. */
+  queue() {
     if (performance.now() - this.#asked < 1000 * REFRESH_S - 1 || waiting.includes(this)) return;
     waiting.push(this);
     next();
   }
 
-  async load() {
+  async ask() {
     const end = this.health?.report?.end_ns;
     if (!this.isConnected || !end) return;
     this.#asked = performance.now();
     const of = { quantity: this.getAttribute("quantity") ?? "", name: this.getAttribute("series") ?? "", points: String(POINTS) };
     const read = (/** @type {Record<string, string>} */ more) => monitor.ask(`${pathOf(this.place)}/readings?${new URLSearchParams({ ...of, ...more })}`);
-    try {
-      const day = await read({ since_ns: String(Math.max(0, end - DAY_NS)) });
-      // Buckets divide the time that was asked for: of a monitor that is younger than a day all may be in the last.
-      this.#draw(day.buckets.length > POINTS / 4 ? day.buckets : (await read({})).buckets.filter((/** @type {{start_ns: number}} */ one) => one.start_ns >= end - DAY_NS));
-    } catch {
-      this.replaceChildren();
-    }
+    const day = await read({ since_ns: String(Math.max(0, end - DAY_NS)) });
+    // Buckets divide the time that was asked for: of a monitor that is younger than a day all may be in the last.
+    this.#draw(day.buckets.length > POINTS / 4 ? day.buckets : (await read({})).buckets.filter((/** @type {{start_ns: number}} */ one) => one.start_ns >= end - DAY_NS));
+  }
+
+  refused() {
+    this.replaceChildren();
   }
 
   /** @param {import("../monitor/records.js").Bucket[]} buckets */

@@ -78,7 +78,9 @@ export class ReadingTrend extends MachineElement {
       this.#figures.append(html("figure", {}, html("figcaption", {}, one.title), chart));
     }
     if (!buckets.length) return;
-    const x = [], mean = [], low = [], high = [];
+    const x = [];
+    /** @type {(number | null)[][]} */
+    const [mean, low, high] = [[], [], []];
     const step = Math.min(...buckets.slice(1).map((each, at) => each.start_ns - buckets[at].start_ns), Infinity);
     let before = buckets[0].start_ns;
     for (const bucket of buckets) {

@@ -17,7 +17,7 @@
  * @typedef {{semi_major: number, semi_minor: number, tilt_deg: number, sense: string, precession: string | null}} Ellipse
  * @typedef {{location: string, unit: string, ellipse: Ellipse | null, nominal: Ellipse | null, estimated: Ellipse | null, path: {times_s: number[], y: number[], z: number[]} | null}} PlaceOrbit
  * @typedef {{speed_rad_s: number | null, orbits: PlaceOrbit[], revolutions: number, pulses_s: number[], reason: string, path_reason: string}} Orbits
- * @typedef {{channel: string, quantity: string, unit: string, measured: number[], nominal: number[] | null, estimated: number[] | null, rms: number | null}} Density
+ * @typedef {{channel: string, quantity: string, unit: string, measured: (number | null)[], nominal: (number | null)[] | null, estimated: (number | null)[] | null, rms: number | null}} Density
  * @typedef {{frequencies_hz: number[], rotation_hz: number | null, left_out_hz: [number, number] | null, densities: Density[], theory: {nominal_reason: string, estimated_reason: string}, reason: string, interval_95: [number, number] | null}} Spectra
  */
 export {};

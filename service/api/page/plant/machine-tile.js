@@ -27,7 +27,7 @@ class MachineTile extends MachineElement {
     lay(
       this,
       html("div", { class: "states" }, html("state-mark", { state: health.state }), silent && health.state !== "no-data" && html("state-mark", { state: "no-data" })),
-      html("h3", {}, html("a", { href: `#/machines/${this.place}` }, html("small", {}, `${health.site}/`), health.machine)),
+      html("h2", {}, html("a", { href: `#/machines/${this.place}` }, html("small", {}, `${health.site}/`), health.machine)),
       html(
         "p",
         { class: "worst" },

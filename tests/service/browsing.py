@@ -1,0 +1,130 @@
+"""A real Chromium that looks at the page of a running service, and a plant to look at.
+
+The browser is what ``ROTORWATCH_CHROMIUM`` names, or the system's own; no registry of Python packages has one that is
+kept up to date, so where there is none, these tests are skipped (what is asked of browsers is tested without one in
+``test_access_http.py``). To keep what was seen: ``ROTORWATCH_SCREENSHOTS=FOLDER``.
+"""
+
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from service.runtime import Runtime, running
+from service.settings.service import MachineEntry
+from simulator.scenario import parse_fault
+from tests.service.live import LAB, SHORT, Feed, endpoint, machine_file, open_session, scenario_blocks, settings
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+FLAGS = [
+    "--no-sandbox",  # tests may run as root
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+PATIENCE_MS = 120_000.0
+FAULT_AT, SEEN_AT = 400, 700
+VIEWS = {"plant": "", "machine": "machines/demo/lab", "alarms": "alarms"}
+SCREENSHOTS = os.environ.get("ROTORWATCH_SCREENSHOTS")
+RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A browser, or a test that is skipped."""
+    path = os.environ.get("ROTORWATCH_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
+    if path is None:  # a fresh machine has none, and it takes an administrator to install one
+        pytest.skip(f"no browser: ROTORWATCH_CHROMIUM is not set, and none of {', '.join(NAMES)} is there")
+    with (
+        sync_playwright() as playwright,
+        playwright.chromium.launch(executable_path=path, args=FLAGS, timeout=PATIENCE_MS) as found,
+    ):
+        yield found
+
+
+@dataclass(slots=True)
+class Plant:
+    """A machine whose data come as fast as they are taken up to a block, and then slowly; and one without any."""
+
+    runtime: Runtime
+    feed: Feed
+    until: int = 300
+    cut: threading.Event = field(default_factory=threading.Event)
+
+    def run(self) -> None:
+        for number, block in enumerate(scenario_blocks(100.0, parse_fault(f"k_by=-0.33@{FAULT_AT / 10}"))):
+            self.feed.put(block)
+            if self.cut.wait(0.0 if number < self.until else 1.0):
+                return
+
+
+@contextmanager
+def plant_running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
+    """Machine lab with a fault to come, and spare without data."""
+    entries = []
+    for name in ("lab", "spare"):
+        changes = (
+            *SHORT,
+            ('name = "lab"', f'name = "{name}"'),
+            ("[operation]", "[ingest]\nno_data_after_s = 6.0\n\n[operation]"),
+        )
+        entries.append(MachineEntry(file=machine_file(tmp_path_factory.mktemp(name), *changes)))
+    address = endpoint()
+    plan = settings(address, when_full="wait").model_copy(update={"machines": tuple(entries)})
+    with running(plan) as runtime, open_session(address) as session:
+        made = Plant(runtime, Feed(session, LAB))
+        thread = threading.Thread(target=made.run)
+        thread.start()
+        yield made
+        made.cut.set()
+        thread.join()
+
+
+@contextmanager
+def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = False) -> Iterator[Page]:
+    """A page that nothing goes wrong on and that asks nobody else, in a browser of its own."""
+    asked: list[str] = []
+    faults: list[str] = []
+    with browser.new_context(
+        viewport={"width": 390, "height": 844} if phone else {"width": 1360, "height": 850},
+        is_mobile=phone,
+        color_scheme="dark" if dark else "light",
+    ) as context:
+        context.set_default_timeout(PATIENCE_MS)
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.on("console", lambda message: faults.append(message.text) if message.type == "error" else None)
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        yield page
+    assert asked
+    assert all(one.startswith((f"{url}/", "data:")) for one in asked), asked
+    assert not faults
+
+
+def kept(page: Page, name: str) -> None:
+    if SCREENSHOTS:
+        page.screenshot(path=Path(SCREENSHOTS) / f"{name}.png", full_page=True)
+
+
+def violations(page: Page) -> list[str]:
+    """What breaks a rule of WCAG 2.2 AA on the page as it is now, as axe-core tells it; nothing of it stays there."""
+    if not page.evaluate("'axe' in window"):
+        page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
+    found: dict[str, Any] = page.evaluate("rules => axe.run(document, {runOnly: rules})", RULES)
+    assert len(found["passes"]) > 10
+    return [
+        f"{rule['id']}: {node['html'][:200]}: {node['failureSummary']}"
+        for rule in found["violations"]
+        for node in rule["nodes"]
+    ]
