@@ -113,6 +113,13 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         read = row.locator("td").nth(1).inner_text()
         assert -0.4 < float(read.replace("−", "-").removesuffix(" %")) / 100 < -0.25
         assert page.locator("parameter-table tr.alert").count() == 1
+        part = page.locator("rotor-drawing .part.alert")
+        expect(part).to_have_count(1)
+        expect(part).to_contain_text(re.compile(r"k_by ▲ alert−\d\d\.\d % ± \d\.\d %"))
+        expect(page.locator("rotor-drawing .sensor")).to_have_count(4)
+        assert page.locator("machine-facts").count() == 0
+        page.get_by_text("Machine file", exact=True).click()
+        expect(page.locator("machine-facts")).to_contain_text("rotor.k_by_N_per_m50000")
         expect(page.locator("parameter-trend canvas")).to_have_count(6)
         expect(page.locator("spectrum-plot canvas")).to_be_visible()
         expect(page.get_by_role("img", name="orbit at the bearing")).to_be_visible()
@@ -168,6 +175,9 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         lines = f"event: start\ndata: {{}}\n\nevent: health\ndata: {json.dumps(told)}\n\n"
         route.fulfill(body=lines, content_type="text/event-stream")
 
+    growing = report["levels"][0] | {"channel": "DE-H"}
+    sensor = {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "H", "unit": "m/s2"}
+    file = {"description": "", "rotor": None, "operation": None, "sensors": [sensor]}
     with looking(browser, url) as page:
         page.route("**/api/v1/events", instead)
         page.goto(f"{url}/#/machines/demo/lab")
@@ -184,6 +194,14 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         ):
             expect(view).to_contain_text(text)
         expect(page.locator(".banner")).to_contain_text("No connection to the monitor since")  # the stream has ended
+    told["report"] = report | {"parameters": [], "verdict": None, "levels": [growing]}
+    told["alarms"] = [told["alarms"][0] | {"name": "level:DE-H", "severity": "danger"}]
+    with looking(browser, url) as page:
+        page.route("**/api/v1/events", instead)
+        page.route("**/configuration", lambda route: route.fulfill(json={"file": file}))
+        page.goto(f"{url}/#/machines/demo/lab")
+        expect(page.locator("rotor-drawing .sensor.danger")).to_contain_text("DE-H ◆ danger")
+        expect(page.locator("rotor-drawing svg")).to_contain_text(re.compile(r"[\d.]+ (mm/s|m/s²) rms"))
 
 
 def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:

@@ -3,7 +3,7 @@ import { clock, local, ticks } from "../monitor/figures.js";
 
 /** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number}} Line */
 /** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
-/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, xUnit?: string, shaded?: [number, number] | null, height: number}} Drawing */
+/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, xUnit?: string, shaded?: {from: number, to: number, text?: string}[], height: number}} Drawing */
 
 /** @type {Promise<any> | undefined} */
 let library;
@@ -85,7 +85,7 @@ class LineChart extends HTMLElement {
       series: [{ label: drawing.time ? "time" : drawing.xUnit, value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : drawing.time ? clock(value * 1e9) : value.toFixed(1)) }, ...lines],
       bands: drawing.band ? [{ series: drawing.band.map((at) => at + 1), fill: this.#colour("band") }] : [],
       scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
-      axes: [drawing.time ? { ...axis, space: 75, values: (/** @type {any} */ _, /** @type {number[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, label: drawing.unit, labelSize: 16 }],
+      axes: [drawing.time ? { ...axis, space: 75, values: (/** @type {any} */ _, /** @type {number[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16 }],
       tzDate: (/** @type {number} */ seconds) => (local() ? new Date(seconds * 1e3) : uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC")),
       cursor: { drag: { x: true, y: false } },
       hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)] },
@@ -96,16 +96,27 @@ class LineChart extends HTMLElement {
   #range(low, high) {
     const seen = [...(this.#drawing?.include ?? []), low, high].filter((each) => Number.isFinite(each));
     const [bottom, top] = [Math.min(...seen), Math.max(...seen)];
-    const rim = 0.06 * (top - bottom || Math.abs(top) || 1);
+    const rim = 0.14 * (top - bottom || Math.abs(top) || 1);
     return [bottom === 0 ? 0 : bottom - rim, top + rim];
   }
 
   /** @param {any} plot */
   #shade(plot) {
-    if (!this.#drawing?.shaded) return;
-    const [from, to] = this.#drawing.shaded.map((each) => plot.valToPos(each, "x", true));
-    plot.ctx.fillStyle = this.#colour("shade");
-    plot.ctx.fillRect(from, plot.bbox.top, to - from, plot.bbox.height);
+    const { ctx, bbox } = plot;
+    ctx.save();
+    ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.textAlign = "left";
+    ctx.beginPath();
+    ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+    ctx.clip();
+    for (const { from, to, text } of this.#drawing?.shaded ?? []) {
+      const [left, right] = [from, to].map((each) => plot.valToPos(each, "x", true));
+      ctx.fillStyle = this.#colour("shade");
+      ctx.fillRect(left, bbox.top, right - left, bbox.height);
+      ctx.fillStyle = this.#colour("ink-2");
+      if (text && ctx.measureText(text).width < right - left) ctx.fillText(text, left + 3 * devicePixelRatio, bbox.top + bbox.height - 5 * devicePixelRatio);
+    }
+    ctx.restore();
   }
 
   /** @param {any} plot */
@@ -113,10 +124,12 @@ class LineChart extends HTMLElement {
     const { ctx, bbox } = plot;
     ctx.save();
     ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    ctx.textAlign = "left";
     ctx.lineWidth = 1.5 * devicePixelRatio;
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
+    let row = 0;
     for (const mark of this.#drawing?.marks ?? []) {
       const place = plot.valToPos(mark.at, mark.axis, true);
       const upright = mark.axis === "x";
@@ -127,7 +140,7 @@ class LineChart extends HTMLElement {
       ctx.lineTo(upright ? place : bbox.left + bbox.width, upright ? bbox.top + bbox.height : place);
       ctx.stroke();
       const gap = 3 * devicePixelRatio;
-      if (mark.text) ctx.fillText(mark.text, upright ? place + gap : bbox.left + gap, upright ? bbox.top + 4 * gap : place - gap);
+      if (mark.text) ctx.fillText(mark.text, upright ? place + gap : bbox.left + gap, upright ? bbox.top + 4 * gap * (1 + (row++ % 3)) : place - gap);
     }
     ctx.restore();
   }

@@ -7,6 +7,8 @@ class LevelTrend extends ReadingTrend {
   title = "Levels over time";
 
   async trended() {
+    // Whatever changed, every level may show it.
+    const changed = (this.health?.report?.verdict?.changed ?? []).map((one) => ({ ...one, text: `${one.name} changed` }));
     return (this.health?.report?.levels ?? []).map((one) => {
       const measure = one.limits.find((limit) => limit.state !== "normal")?.measure ?? (one.velocity === null ? "overall" : "velocity");
       const limit = one.limits.find((each) => each.measure === measure);
@@ -20,6 +22,7 @@ class LevelTrend extends ReadingTrend {
         alert: [...there(limit?.alert), ...there(limit?.fall)],
         danger: there(limit?.danger),
         zero: true,
+        changed,
       };
     });
   }

@@ -10,11 +10,16 @@ import "./level-trend.js";
 import "./orbit-plot.js";
 import "./parameter-table.js";
 import "./parameter-trend.js";
+import "./plot-fold.js";
+import "./rotor-drawing.js";
 import "./spectrum-plot.js";
 import "../elements/state-mark.js";
 
 const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all there is"]]);
 const RAW = ["health", "reports", "alarms", "alarms/events", "detectable", "configuration"];
+
+/** What is loaded only when it is opened: element and heading. */
+const FOLDED = [["machine-facts", "Machine file"]];
 
 /** Everything that is known of one machine. */
 class MachineView extends MachineElement {
@@ -69,8 +74,7 @@ class MachineView extends MachineElement {
     );
     lay(
       this,
-      this.#head,
-      html("alarm-list", { place }),
+      html("div", { class: "top" }, this.#head, html("rotor-drawing", { place }), html("alarm-list", { place })),
       html("parameter-table", { place }),
       html("level-table", { place }),
       html("label", { class: "range" }, "Trends: ", range),
@@ -79,6 +83,7 @@ class MachineView extends MachineElement {
       html("spectrum-plot", { place }),
       html("data-quality", { place }),
       html("alarm-history", { place }),
+      ...FOLDED.map(([shows, heading]) => html("plot-fold", { place, shows, heading })),
       html("p", { class: "note" }, "As the API tells it: ", ...RAW.flatMap((part, at) => [at ? ", " : "", html("a", { href: `${pathOf(place)}/${part}` }, part)])),
     );
   }

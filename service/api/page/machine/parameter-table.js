@@ -1,11 +1,11 @@
 import { interval, percent, within, Z95 } from "../monitor/figures.js";
 import { html, table } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
+import { parameterReadings } from "./parameter-readings.js";
 import "../elements/state-mark.js";
 
-/** @typedef {import("../monitor/records.js").Parameter} Parameter */
 /** @typedef {import("../monitor/records.js").Opinion} Opinion */
-/** @typedef {import("../monitor/records.js").Verdict} Verdict */
+/** @typedef {import("./parameter-readings.js").Reading} Reading */
 
 /** What another diagnostician reads of a parameter, and whether that agrees. @param {Opinion} opinion @param {string} name */
 function other(opinion, name) {
@@ -15,11 +15,9 @@ function other(opinion, name) {
   return html("span", { class: "number" }, within(said.relative_change, Z95 * said.standard_error), apart && html("strong", {}, " disagrees"));
 }
 
-/** Change and interval, or why there is none. @param {Parameter} parameter @param {Verdict} verdict */
-function reading(parameter, verdict) {
-  const read = verdict.current.some((one) => one.name === parameter.name);
-  if (!verdict.settled && parameter.relative_change !== null && !read) return ["too little data since the change", ""];
-  if (parameter.relative_change === null || !parameter.interval_95) return [`not evaluable: ${parameter.reason}`, ""];
+/** Change and interval, or why there is none. @param {Reading} reading */
+function said({ read, why, parameter }) {
+  if (!read || !parameter.interval_95) return [why, ""];
   return [html("b", { class: "number" }, percent(parameter.relative_change)), html("span", { class: "number" }, interval(parameter.interval_95))];
 }
 
@@ -30,16 +28,13 @@ class ParameterTable extends MachineElement {
     const verdict = report?.verdict;
     this.hidden = !report || !verdict || !report.parameters.some((one) => one.relative_change !== null);
     if (this.hidden || !report || !verdict) return this.replaceChildren();
-    const readings = new Map((verdict.settled ? [] : verdict.current).map((one) => [one.name, one]));
-    const rows = report.parameters.map((stated) => {
-      const alarm = this.health?.alarms.find((one) => one.name === stated.name && one.raised);
-      const seen = report.detectable.find((one) => one.name === stated.name);
-      const parameter = readings.get(stated.name) ?? stated;
+    const rows = parameterReadings(this.health).map((reading) => {
+      const { stated, parameter, seen, severity } = reading;
       const name = html("div", {}, html("b", {}, stated.text), html("small", {}, ` ${stated.name}`), parameter.vector && html("div", { class: "note" }, parameter.vector.text));
       const least = html("span", { class: "number" }, seen ? `${percent(seen.loss)} / ${percent(seen.gain)}` : "");
       return {
-        attributes: { class: alarm?.severity },
-        cells: [name, alarm ? html("state-mark", { state: alarm.severity }) : "", ...reading(parameter, verdict), least, ...report.opinions.map((opinion) => other(opinion, stated.name))],
+        attributes: { class: severity || null },
+        cells: [name, severity ? html("state-mark", { state: severity }) : "", ...said(reading), least, ...report.opinions.map((opinion) => other(opinion, stated.name))],
       };
     });
     const heads = ["parameter", "alarm", "change", "95 % interval", "seen from", ...report.opinions.map((one) => one.by)];

@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
-import { Z95 } from "../monitor/figures.js";
+import { stretch, Z95 } from "../monitor/figures.js";
 import "../elements/line-chart.js";
 
 const [POINTS, REFRESH_S, EVENTS] = [240, 15, 200];
@@ -9,7 +9,7 @@ const GAP = 2.5;
 
 /** @typedef {import("../monitor/records.js").Bucket} Bucket */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
-/** @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, alert: number[], danger: number[], zero: boolean}} Trended */
+/** @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, alert: number[], danger: number[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
 
 /** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */
 export class ReadingTrend extends MachineElement {
@@ -21,10 +21,11 @@ export class ReadingTrend extends MachineElement {
   #charts = new Map();
   #figures = html("div", { class: "charts" });
   #message = html("p", { class: "message" });
+  #when = html("p", { class: "note" });
 
   connectedCallback() {
     super.connectedCallback();
-    this.replaceChildren(html("h2", {}, this.title), this.#message, this.#figures);
+    this.replaceChildren(html("h2", {}, this.title), this.#when, this.#message, this.#figures);
     this.follow("alarm", ({ detail }) => `${detail.site}/${detail.machine}` === this.place && this.load());
     this.keepLoading(REFRESH_S);
   }
@@ -61,6 +62,8 @@ export class ReadingTrend extends MachineElement {
     ]);
     const happened = events.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
     for (const one of shown) this.#draw(one, readings.buckets.filter((/** @type {Bucket} */ bucket) => bucket.name === one.name), happened);
+    const ends = readings.buckets.map((/** @type {Bucket} */ bucket) => bucket.start_ns + bucket.length_ns);
+    if (ends.length) this.#when.textContent = `${stretch(Math.min(...readings.buckets.map((/** @type {Bucket} */ bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for several their mean; the band holds their 95 % intervals.`;
     this.#message.textContent = readings.buckets.length ? "" : "Nothing has been read yet.";
   }
 
@@ -78,14 +81,18 @@ export class ReadingTrend extends MachineElement {
       this.#figures.append(html("figure", {}, html("figcaption", {}, one.title), chart));
     }
     if (!buckets.length) return;
+    /** @type {number[]} */
     const x = [];
     /** @type {(number | null)[][]} */
     const [mean, low, high] = [[], [], []];
+    /** @type {{from: number, to: number, text: string}[]} */
+    const gaps = [];
     const step = Math.min(...buckets.slice(1).map((each, at) => each.start_ns - buckets[at].start_ns), Infinity);
     let before = buckets[0].start_ns;
     for (const bucket of buckets) {
       if (bucket.start_ns - before > GAP * step) {
         x.push((before + step) / 1e9);
+        gaps.push({ from: (before + step) / 1e9, to: bucket.start_ns / 1e9, text: "no data" });
         for (const line of [mean, low, high]) line.push(null);
       }
       before = bucket.start_ns;
@@ -97,7 +104,9 @@ export class ReadingTrend extends MachineElement {
     }
     const reached = Math.max(...[...low, ...high].map((each) => Math.abs(each ?? 0)));
     const near = (/** @type {number[]} */ limits) => limits.filter((each) => Math.abs(each) < 2.5 * reached || Math.abs(each) <= 10);
+    const changes = one.changed.filter((each) => each.since_ns / 1e9 >= x[0]);
     const marks = [
+      ...changes.map((each) => ({ at: each.since_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: "ink", text: each.text })),
       ...one.alert.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "alert-line", text: "alert", dash: [6, 4] })),
       ...one.danger.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "danger-line", text: "danger" })),
       ...events
@@ -110,6 +119,7 @@ export class ReadingTrend extends MachineElement {
       band: [2, 1],
       marks,
       time: true,
+      shaded: [...gaps, ...changes.flatMap(({ between_ns: moment }) => (moment ? [{ from: moment[0] / 1e9, to: moment[1] / 1e9 }] : []))],
       include: [...near(one.alert), ...near(one.danger), ...(one.zero ? [0] : [])],
       unit: one.unit,
       height: 170,

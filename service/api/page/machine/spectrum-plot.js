@@ -25,7 +25,7 @@ export function spectrumDrawing(found, shown) {
     log: true,
     unit: printed(shown.unit),
     xUnit: "frequency, Hz",
-    shaded: found.left_out_hz,
+    shaded: found.left_out_hz ? [{ from: found.left_out_hz[0], to: found.left_out_hz[1] }] : [],
     height: 280,
   };
 }

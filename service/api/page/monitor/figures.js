@@ -58,6 +58,12 @@ export function clock(ns) {
   return `${format({ dateStyle: "short", timeStyle: "medium" }).format(ns / 1e6)}${local() ? "" : " UTC"}`;
 }
 
+/** From when to when, the date once. @param {number} start_ns @param {number} end_ns */
+export function stretch(start_ns, end_ns) {
+  const [from, to] = [clock(start_ns), clock(end_ns)];
+  return `${from.replace(" UTC", "")} to ${from.slice(0, 10) === to.slice(0, 10) ? to.slice(11) : to}`;
+}
+
 /**
  * Times along an axis: date or time of day, as fine as the axis is divided.
  * @param {number[]} seconds

@@ -1,0 +1,37 @@
+import { html } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { machineFile } from "./machine-file.js";
+
+/** Values with their places in the file, `window.length_s` for instance; what is not given is left out. @param {unknown} value @param {string} name @returns {[string, string][]} */
+function facts(value, name) {
+  if (value === null || value === "" || (Array.isArray(value) && !value.length)) return [];
+  if (typeof value !== "object") return [[name, String(value)]];
+  if (Array.isArray(value) && value.every((one) => typeof one !== "object")) return [[name, value.join(", ")]];
+  return Object.entries(value).flatMap(([key, one]) => {
+    const part = Array.isArray(value) ? /** @type {any} */ (one).name ?? key : key;
+    return facts(one, name ? `${name}.${part}` : part);
+  });
+}
+
+/** The machine file as it is in use, line by line. */
+class MachineFacts extends MachineElement {
+  connectedCallback() {
+    super.connectedCallback();
+    this.load();
+  }
+
+  async ask() {
+    const file = await machineFile(this.place, this.health?.machine_hash);
+    this.replaceChildren(
+      html("p", { class: "note" }, `The machine file as it is in use, what it leaves out filled in; units are in the names. Identity ${this.health?.machine_hash}.`),
+      html("dl", { class: "facts" }, ...facts(file, "").flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])),
+    );
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    this.replaceChildren(html("p", { class: "note" }, why));
+  }
+}
+
+customElements.define("machine-facts", MachineFacts);

@@ -1,0 +1,27 @@
+/** @typedef {import("../monitor/records.js").Parameter} Parameter */
+/** @typedef {{stated: Parameter, parameter: Parameter, read: boolean, why: string, seen: import("../monitor/records.js").Detectable | undefined, severity: string}} Reading */
+
+/**
+ * What is read of each parameter now: while the window straddles a change, of the machine since then.
+ * @param {import("../monitor/records.js").Health | undefined} health
+ * @returns {Reading[]}
+ */
+export function parameterReadings(health) {
+  const report = health?.report;
+  const verdict = report?.verdict;
+  if (!health || !report || !verdict) return [];
+  const current = new Map((verdict.settled ? report.parameters : verdict.current).map((one) => [one.name, one]));
+  return report.parameters.map((stated) => {
+    const parameter = current.get(stated.name) ?? stated;
+    const known = parameter.relative_change !== null && parameter.interval_95 !== null;
+    const late = known && !current.has(stated.name);
+    return {
+      stated,
+      parameter,
+      read: known && !late,
+      why: late ? "too little data since the change" : known ? "" : `not evaluable: ${parameter.reason}`,
+      seen: report.detectable.find((one) => one.name === stated.name),
+      severity: health.alarms.find((one) => one.name === stated.name && one.raised)?.severity ?? "",
+    };
+  });
+}
