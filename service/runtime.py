@@ -38,6 +38,7 @@ from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.metrics.requests import RequestCounts, RequestMeter
 from service.delivery.webhooks.webhooks import Webhooks
+from service.history.holdings import Holdings
 from service.history.records import StoreError
 from service.history.shared import AuditLog
 from service.history.store import Store
@@ -98,6 +99,11 @@ class Runtime:
         """Who asked for what."""
         return self.store.audit
 
+    @property
+    def holdings(self) -> Holdings:
+        """How far back the history goes."""
+        return self.store.holdings
+
     def machines(self) -> tuple[MachineWorker, ...]:
         """Every monitored machine."""
         return tuple(self._workers)
@@ -126,6 +132,7 @@ class Runtime:
                 last_worker_error=worker.last_error,
                 worker_busy_s=round(pulse.busy_s, 1),
                 trouble=worker.trouble,
+                queue_blocks=len(worker.inbox),
                 history_waiting=worker.history.waiting,
                 recording="off" if (recorder := self.recorder_status(worker)) is None else recorder.text,
             )

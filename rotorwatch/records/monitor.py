@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
+from rotorwatch.records.fields import EXAMPLE_NS, REQUEST, Name, Record, Site
 from rotorwatch.records.health import State
 
 
@@ -31,6 +31,7 @@ class MachineReadiness(Record):
         "evaluated for two hops, or the history refuses what happens; empty if it is",
         examples=[""],
     )
+    queue_blocks: int = Field(default=0, description="blocks that have arrived and wait for evaluation", examples=[0])
     history_waiting: int = Field(description="steps that are not in the history yet", examples=[0])
     recording: str = Field(
         description="off, idle (nothing has arrived), recording, or failing: why. Monitoring goes on all the same",
@@ -61,6 +62,97 @@ class CallerRights(Record):
         description="read, operate, configure: those that the token has the way it was given, as a password read alone",
         examples=[("read", "operate")],
     )
+
+
+ScopeName = Literal["read", "operate", "configure"]
+
+
+class TokenEntry(Record):
+    """A token, without its secret, which nobody has but its user."""
+
+    token_id: str = Field(description="its public part, after rw_", examples=["3fK09aZqT1xB"])
+    name: str = Field(description="who uses it, as the audit log says", examples=["control room"])
+    scopes: tuple[ScopeName, ...] = Field(description="what it is good for", examples=[("read", "operate")])
+    state: Literal["valid", "expired", "revoked"] = Field(description="whether it can be used", examples=["valid"])
+    created_ns: int = Field(description="when it was created, this computer's time", examples=[EXAMPLE_NS])
+    expires_ns: int | None = Field(
+        description="until when it holds; null: until it is revoked", examples=[EXAMPLE_NS + 90 * 86_400 * 10**9]
+    )
+    revoked_ns: int | None = Field(description="when it was revoked; null if it was not", examples=[None])
+    last_used_ns: int | None = Field(
+        description="when a request last came with it; null if none has since the monitor started",
+        examples=[EXAMPLE_NS],
+    )
+
+
+class TokenList(Record):
+    """Every token there ever was."""
+
+    needed: bool = Field(
+        description="whether callers need one; false where the API is open to everybody on this computer",
+        examples=[True],
+    )
+    tokens: tuple[TokenEntry, ...] = Field(description="oldest first")
+
+
+class TokenRequest(BaseModel):
+    """A token to be created."""
+
+    model_config = REQUEST
+
+    name: str = Field(
+        min_length=1,
+        max_length=64,
+        description="who will use it, as the audit log shall say: printable, and of no other valid token",
+        examples=["control room"],
+    )
+    scopes: tuple[ScopeName, ...] = Field(
+        min_length=1,
+        max_length=3,
+        description="what it is to be good for; only what the caller's own is good for",
+        examples=[("read", "operate")],
+    )
+    days: int | None = Field(
+        default=None, ge=1, le=3650, description="how long it holds; until it is revoked if left out", examples=[90]
+    )
+
+
+class TokenCreated(Record):
+    """A new token."""
+
+    token: TokenEntry
+    text: str = Field(
+        description="the token itself, this once: only a hash of it is kept",
+        examples=["rw_3fK09aZqT1xB_0123456789abcdefghijklmnopqrstuvwxyzABCDEFG"],
+    )
+
+
+class HistorySpan(Record):
+    """How far back the history of one machine goes, data time."""
+
+    site: Site
+    machine: Name
+    oldest_event_ns: int | None = Field(description="oldest alarm event; null without any", examples=[EXAMPLE_NS])
+    oldest_report_ns: int | None = Field(
+        description="end of the oldest window whose report is kept", examples=[EXAMPLE_NS]
+    )
+    oldest_reading_ns: int | None = Field(
+        description="oldest reading, of a window or of a bucket that old windows were reduced to", examples=[EXAMPLE_NS]
+    )
+
+
+class HistoryStatus(Record):
+    """What is kept, where, and for how long."""
+
+    database: str = Field(
+        description="its address, without a password; or that it is in memory",
+        examples=["sqlite:////var/lib/history.sqlite"],
+    )
+    size_bytes: int = Field(description="how large the database is", examples=[48_300_032])
+    reports_days: float = Field(description="how long full reports are kept", examples=[14.0])
+    readings_days: float = Field(description="how long the readings of single windows are kept", examples=[90.0])
+    buckets_days: float = Field(description="how long what they are reduced to is kept", examples=[3650.0])
+    machines: tuple[HistorySpan, ...] = Field(description="machine by machine, by name")
 
 
 class Problem(BaseModel):

@@ -37,7 +37,7 @@ from service.access.rates import MovingWindow, StreamSeats, TooManyStreamsError
 from service.access.requirement import Requirement, requires
 from service.access.routes import PAGE_FILES, PROBE_PATHS, PUBLIC_PATHS, declared_scopes, unguarded_routes
 from service.access.scopes import ANONYMOUS, NOBODY, Caller, Scope
-from service.access.tokens import PresentedToken, parse_token, token_is_valid
+from service.access.tokens import PresentedToken, parse_token, token_is_valid, token_state
 from service.history.records import TokenRecord
 from service.history.shared import AuditLog, TokenStore
 from service.settings.access import AccessSettings
@@ -80,6 +80,8 @@ class Guard:
         Dependency of an event stream that needs ``read``: holds one of the caller's streams until its end.
     gate
         Dependency of the application as a whole.
+    last_used_ns
+        When each token that was used since the start was used last, by its public part.
     """
 
     def __init__(
@@ -101,8 +103,9 @@ class Guard:
         self.configure: Any = requires(Scope.CONFIGURE)
         self.stream: Any = Depends(self._stream_dependency())
         self.gate: Any = Depends(self.pass_gate)
-        self._tokens = tokens
-        self._clock_ns = clock_ns
+        self.tokens = tokens
+        self.clock_ns = clock_ns
+        self.last_used_ns: dict[str, int] = {}
         self._host = host.lower()
         self._requests = MovingWindow(limits.requests_per_minute, clock=monotonic)
         self._failures = MovingWindow(limits.failures_per_minute, clock=monotonic)
@@ -198,10 +201,8 @@ class Guard:
         """Whether a caller's token still holds, for streams that stay open for long; may wait for a database."""
         if not caller.token_id:
             return True
-        record = self._tokens.find(caller.token_id)
-        if record is None or record.revoked_ns is not None:
-            return False
-        return record.expires_ns is None or self._clock_ns() < record.expires_ns
+        record = self.tokens.find(caller.token_id)
+        return record is not None and token_state(record, self.clock_ns()) == "valid"
 
     def _stream_dependency(self) -> Callable[[Caller], AsyncIterator[Caller]]:
         async def stream(caller: Annotated[Caller, self.read]) -> AsyncIterator[Caller]:
@@ -225,7 +226,7 @@ class Guard:
         if wait_s := self._failures.wait(identity):
             raise _too_many("too many attempts with this wrong token", wait_s)
         record = None if presented is None else await self._looked_up(presented, request.method)
-        valid = token_is_valid(record, presented, self._clock_ns())
+        valid = token_is_valid(record, presented, self.clock_ns())
         if record is None or presented is None or not valid:
             if presented is not None:
                 self._known.pop(presented.secret_hash, None)
@@ -234,6 +235,7 @@ class Guard:
             if wait_s := self._failures.hit(network_of(address)):
                 raise _too_many("too many attempts with a wrong token from this address", wait_s)
             return None
+        self.last_used_ns[record.token_id] = self.clock_ns()
         granted = frozenset(scope for scope in Scope if scope.value in record.scopes)
         return Caller(record.name, granted, address, record.token_id)
 
@@ -241,7 +243,7 @@ class Guard:
         now_s = self._monotonic()
         known = self._known.get(presented.secret_hash)
         try:
-            record = await run_in_threadpool(self._tokens.find, presented.token_id)
+            record = await run_in_threadpool(self.tokens.find, presented.token_id)
         except RotorwatchError as error:
             # Just when the database fails, operators want to look at their machines.
             if known is not None and method in SAFE_METHODS and now_s - known.looked_up_s <= _WITHOUT_DATABASE_S:
@@ -251,7 +253,7 @@ class Guard:
             raise HTTPException(
                 503, "tokens cannot be looked up in the history: nothing was done; the log says why"
             ) from error
-        if record is not None and token_is_valid(record, presented, self._clock_ns()):
+        if record is not None and token_is_valid(record, presented, self.clock_ns()):
             self._known[presented.secret_hash] = _Known(record, now_s)
             self._known.move_to_end(presented.secret_hash)
             if len(self._known) > _KNOWN_TOKENS:

@@ -7,6 +7,7 @@ import secrets
 import string
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Literal
 
 from models.errors import MachineFileError
 from service.access.scopes import ANONYMOUS, Scope
@@ -22,6 +23,10 @@ _ANY_SECRET = re.compile(f"rw_([0-9A-Za-z]{{{_ID_LENGTH}}})_[0-9A-Za-z]+")  # on
 _LONGEST_NAME = 64
 _DAY_NS = 86_400 * 10**9
 _NO_HASH = bytes(hashlib.sha256().digest_size)
+
+
+class NameTakenError(MachineFileError):
+    """A valid token has the name already."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +94,25 @@ def new_token(name: str, scopes: Iterable[Scope], *, now_ns: int, days: int | No
     return record, f"rw_{token_id}_{secret}"
 
 
+def check_name_is_free(name: str, there: Iterable[TokenRecord], now_ns: int) -> None:
+    """Refuse a name that the audit log could not tell from another one.
+
+    Raises
+    ------
+    NameTakenError
+        If one of the tokens that are there is valid and has the name.
+    """
+    if any(one.name == name and token_state(one, now_ns) == "valid" for one in there):
+        raise NameTakenError(f"a token of {name!r} is valid already: take another name, or revoke it first")
+
+
+def token_state(record: TokenRecord, now_ns: int) -> Literal["valid", "expired", "revoked"]:
+    """Whether a token can be used, and why not."""
+    if record.revoked_ns is not None:
+        return "revoked"
+    return "valid" if record.expires_ns is None or now_ns < record.expires_ns else "expired"
+
+
 def parse_token(text: str) -> PresentedToken | None:
     """Take a token apart; None if it is not one."""
     found = _TOKEN.fullmatch(text)
@@ -104,7 +128,7 @@ def token_is_valid(record: TokenRecord | None, presented: PresentedToken | None,
     same = hmac.compare_digest(stored, b"" if presented is None else presented.secret_hash)
     if record is None or presented is None or record.token_id != presented.token_id:
         return False
-    return same and record.revoked_ns is None and (record.expires_ns is None or now_ns < record.expires_ns)
+    return same and token_state(record, now_ns) == "valid"
 
 
 def masked(text: str) -> str:

@@ -25,6 +25,7 @@ from service.api.routes.replays import add_replay_routes
 from service.api.routes.service import add_service_routes
 from service.api.routes.session import add_session_routes
 from service.api.routes.snapshots import add_snapshot_routes
+from service.api.routes.tokens import add_token_routes
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
@@ -95,6 +96,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_replay_routes(app, service.replays, guard)
     add_service_routes(app, service, guard)
     add_session_routes(app, guard)
+    add_token_routes(app, guard)
     _add_readiness_routes(app, service, guard)
     add_docs_routes(app, guard)
     add_page_routes(app)

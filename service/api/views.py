@@ -13,6 +13,7 @@ from service.api.routes.replays import ReplayDesk
 from service.delivery.event_feed import EventFeed
 from service.delivery.metrics.collector import Metrics
 from service.delivery.webhooks.webhooks import Webhooks
+from service.history.holdings import Holdings
 from service.history.shared import AuditLog
 from service.recordings.catalogue import Catalogue
 from service.stream.worker import MachineWorker
@@ -68,6 +69,10 @@ class ServiceView(Protocol):
     @property
     def audit(self) -> AuditLog:
         """Who asked for what."""
+
+    @property
+    def holdings(self) -> Holdings:
+        """How far back the history goes."""
 
     @property
     def catalogue(self) -> Catalogue | None:

@@ -56,7 +56,7 @@ def create(
     [cyan]rotorwatch token create "control room" --scope read --scope operate --days 90 --config plant.toml[/cyan]
     """
     from service.access.scopes import Scope  # noqa: PLC0415  # keeps --help quick
-    from service.access.tokens import new_token  # noqa: PLC0415
+    from service.access.tokens import check_name_is_free, new_token  # noqa: PLC0415
 
     unknown = set(scope or ()) - set(Scope)
     if unknown:
@@ -64,8 +64,7 @@ def create(
     now_ns = time.time_ns()
     record, text = new_token(name, [Scope(one) for one in scope or ()], now_ns=now_ns, days=days)
     with _opened(config) as store:
-        if any(one.name == name and _state(one, now_ns) == "valid" for one in store.tokens.all()):
-            raise MachineFileError(f"a token of {name!r} is valid already: take another name, or revoke it first")
+        check_name_is_free(name, store.tokens.all(), now_ns)
         _write(store, "create-token", f"{record.token_id}, {name}, {' '.join(record.scopes)}")
         store.tokens.add(record)
     until = "until it is revoked" if record.expires_ns is None else f"until {_utc(record.expires_ns)}"
@@ -257,11 +256,10 @@ def _write(store: "Store", action: str, reason: str) -> None:
 
 
 def _state(record: "TokenRecord", now_ns: int) -> str:
-    if record.revoked_ns is not None:
-        return f"revoked {_utc(record.revoked_ns)}"
-    if record.expires_ns is not None and record.expires_ns <= now_ns:
-        return "expired"
-    return "valid"
+    from service.access.tokens import token_state  # noqa: PLC0415  # keeps --help quick
+
+    state = token_state(record, now_ns)
+    return state if record.revoked_ns is None else f"{state} {_utc(record.revoked_ns)}"
 
 
 def _utc(time_ns: int) -> str:

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from sqlalchemy import text
 
 from service.history.database import Database
+from service.history.holdings import Holdings
 from service.history.machine import MachineStore
 from service.history.records import Dropped, Retention, StoreError
 from service.history.reduction import Reduction
@@ -74,6 +75,7 @@ class Store:
         self._writer = Writer(self._database, retry_s, waiting_reports, self._bucket_ns)
         self._reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
+        self.holdings = Holdings(self._database, retention)
         self.alarms = AlarmLog(self._database)
         self.tokens = TokenStore(self._database)
         self.audit = AuditLog(self._database)

@@ -244,3 +244,23 @@ def test_retention_is_bounded(fields: dict[str, float]) -> None:
     with pytest.raises(ValidationError):
         Retention.model_validate(fields)
     assert all(field.description for field in Retention.model_fields.values())
+
+
+def test_it_is_told_how_far_back_the_history_goes(store: Store, clock: Clock) -> None:
+    lab, idle = store.machine("demo", "lab"), store.machine("demo", "idle")
+    assert idle.last_sequence() == -1
+    empty = store.holdings.read()
+    assert [one.machine for one in empty.machines] == ["idle", "lab"]
+    assert all(one.oldest_reading_ns is None for one in empty.machines)
+    first, reported = T0 + HOP, T0 + 20 * DAY
+    reading, report = StoredReading(first, "parameter", "e", 1.0, None), StoredReport(0, reported, "healthy", 1.0, "{}")
+    assert lab.commit(Step(readings=(reading,), events=(alarm_event(0),)))
+    assert lab.commit(Step(reports=(report,)))
+    found = store.holdings.read()
+    told = found.machines[1]
+    assert (told.oldest_event_ns, told.oldest_report_ns) == (T0, reported)
+    assert told.oldest_reading_ns is not None
+    assert first - RETENTION.bucket_s * NS < told.oldest_reading_ns <= first
+    assert found.machines[0] == empty.machines[0]
+    assert (found.reports_days, found.readings_days, found.buckets_days) == (14.0, 90.0, 1000.0)
+    assert found.size_bytes >= empty.size_bytes > 10_000

@@ -6,13 +6,18 @@ import { UNSEEN } from "./monitor/states.js";
 import "./plant/plant-view.js";
 import "./sign-in.js";
 
-/** Views by the first part of the address after `#/`; what is not needed for the plant is loaded when it is asked for. @type {Record<string, () => Promise<unknown>>} */
-const VIEWS = { machines: () => import("./machine/machine-view.js"), alarms: () => import("./alarms/alarms-view.js") };
+/** Views by the first part of the address after `#/`; what is not needed for the plant is loaded when it is asked for. @type {Record<string, [string, () => Promise<unknown>]>} */
+const VIEWS = {
+  machines: ["machine-view", () => import("./machine/machine-view.js")],
+  alarms: ["alarms-view", () => import("./alarms/alarms-view.js")],
+  administration: ["administration-view", () => import("./administration/administration-view.js")],
+};
 
 /** The page: what is always there, and the view that the address names. */
 class RotorwatchPage extends HTMLElement {
   #banner = html("p", { class: "banner", role: "alert", hidden: true });
   #alarms = html("a", { href: "#/alarms" }, "Alarms");
+  #administration = html("a", { href: "#/administration", hidden: true }, "Administration");
   #who = html("span", { class: "note" });
   #leave = html("button", { type: "button", hidden: true, click: () => this.#signOut() }, "Sign out");
   #times = html("button", { type: "button", click: () => this.#switch() });
@@ -20,7 +25,7 @@ class RotorwatchPage extends HTMLElement {
 
   connectedCallback() {
     this.replaceChildren(
-      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms), this.#who, this.#leave, this.#times),
+      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms, this.#administration), this.#who, this.#leave, this.#times),
       this.#banner,
       this.#main,
       html("footer", {}, "Monitoring, not machine protection. ", html("a", { href: "/docs" }, "HTTP API"), ", ", html("a", { href: "/openapi.json" }, "its description"), ", ", html("a", { href: "/readyz" }, "readiness")),
@@ -37,14 +42,15 @@ class RotorwatchPage extends HTMLElement {
   /** @param {boolean} moved */
   async #go(moved) {
     const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/").map(decodeURIComponent);
+    const [tag, load] = VIEWS[name] ?? ["plant-view", async () => {}];
     try {
-      await VIEWS[name]?.();
+      await load();
     } catch {
       this.#main.replaceChildren(html("p", {}, "The monitor serves another page by now: load this one again."));
       return;
     }
     if (monitor.stranger) return this.#main.replaceChildren(html("sign-in"));
-    const view = name === "machines" ? html("machine-view", { place: rest.join("/") }) : html(name === "alarms" ? "alarms-view" : "plant-view");
+    const view = html(tag, { place: rest.join("/") || null });
     for (const link of this.querySelectorAll("nav a")) {
       if (link.getAttribute("href") === (location.hash || "#/")) link.setAttribute("aria-current", "page");
       else link.removeAttribute("aria-current");
@@ -58,6 +64,7 @@ class RotorwatchPage extends HTMLElement {
   #caller() {
     this.#who.textContent = monitor.caller?.name ?? "";
     this.#leave.hidden = !monitor.caller || monitor.caller.name === "anonymous";
+    this.#administration.hidden = !monitor.may("configure");
     this.#banner.hidden = true;
     if (monitor.stranger || this.querySelector("sign-in")) this.#go(true);
     this.#count();

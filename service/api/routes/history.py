@@ -12,6 +12,7 @@ from pydantic_core import PydanticCustomError
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
 from rotorwatch.records.history import AlarmEventList, AuditList, AuditRecord, ReadingList, ReportList
+from rotorwatch.records.monitor import HistoryStatus
 from service.access.guard import Guard
 from service.access.problems import responses
 from service.api.views import (
@@ -161,6 +162,11 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         found = service.audit.entries(before, limit, machine=machine, actor=actor)
         entries = tuple(AuditRecord(**asdict(one)) for one in found)
         return AuditList(entries=entries, next_before=found[-1].number if len(found) == limit else None)
+
+    @app.get("/api/v1/history", tags=["service"], dependencies=[guard.configure], responses=responses(HistoryStatus))
+    def history() -> HistoryStatus:
+        """How large the history is, how far back it goes, and for how long things are kept."""
+        return service.holdings.read()
 
 
 def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:

@@ -75,6 +75,12 @@ export function ticks(seconds, step_s) {
   return seconds.map((each, at) => (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === 0 ? `\n${day.format(each * 1e3)}` : ""));
 }
 
+/** How large a file or a database is. @param {number} bytes */
+export function size(bytes) {
+  const [power, unit] = bytes < 1e6 ? [1e3, "kB"] : bytes < 1e9 ? [1e6, "MB"] : [1e9, "GB"];
+  return `${figure(bytes / power)} ${unit}`;
+}
+
 /** How long, roughly. @param {number} seconds */
 export function lasting(seconds) {
   if (seconds < 100) return `${seconds.toFixed(0)} s`;

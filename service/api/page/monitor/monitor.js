@@ -3,15 +3,16 @@
 /** @typedef {import("./records.js").Health} Health */
 /** @typedef {import("./records.js").Alarm} Alarm */
 
-const API = "/api/v1";
+export const API = "/api/v1";
 const AGAIN_MS = 5_000;
 
 /** An answer that says what was wrong. */
 export class Refused extends Error {
-  /** @param {number} status @param {string} detail */
-  constructor(status, detail) {
+  /** @param {number} status @param {string} detail @param {any} [body] */
+  constructor(status, detail, body = {}) {
     super(detail);
     this.status = status;
+    this.body = body;
   }
 }
 
@@ -95,8 +96,13 @@ export class Monitor extends EventTarget {
       throw new Refused(0, `the monitor does not answer (${error.message})`);
     });
     const body = await answer.json().catch(() => ({}));
-    if (!answer.ok) throw new Refused(answer.status, body.detail ?? answer.statusText);
+    if (!answer.ok) throw new Refused(answer.status, body.detail ?? answer.statusText, body);
     return body;
+  }
+
+  /** Ask for something to be done. @param {string} path @param {unknown} [order] @returns {Promise<any>} */
+  order(path, order = {}) {
+    return this.ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(order) });
   }
 
   /**

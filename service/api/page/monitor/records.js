@@ -20,5 +20,10 @@
  * @typedef {{speed_rad_s: number | null, orbits: PlaceOrbit[], revolutions: number, pulses_s: number[], reason: string, path_reason: string}} Orbits
  * @typedef {{channel: string, quantity: string, unit: string, measured: (number | null)[], nominal: (number | null)[] | null, estimated: (number | null)[] | null, rms: number | null}} Density
  * @typedef {{frequencies_hz: number[], rotation_hz: number | null, left_out_hz: [number, number] | null, densities: Density[], theory: {nominal_reason: string, estimated_reason: string}, reason: string, interval_95: [number, number] | null}} Spectra
+ * @typedef {{token_id: string, name: string, scopes: string[], state: string, created_ns: number, expires_ns: number | null, revoked_ns: number | null, last_used_ns: number | null}} TokenEntry
+ * @typedef {{number: number, at_ns: number, actor: string, address: string, method: string, path: string, status: number, action: string, machine: string, alarm: string, reason: string}} AuditRecord
+ * @typedef {{name: string, target: string, machines: string[], kinds: string[], severities: string[], annunciated_only: boolean, state: string, pending: number, delivered: number, failed_attempts: number, last_delivered_ns: number | null, last_error: string, last_error_ns: number | null}} WebhookStatus
+ * @typedef {{database: string, size_bytes: number, reports_days: number, readings_days: number, buckets_days: number, machines: {site: string, machine: string, oldest_event_ns: number | null, oldest_report_ns: number | null, oldest_reading_ns: number | null}[]}} HistoryStatus
+ * @typedef {{ready: boolean, reasons: string[], failing_webhooks: string[], machines: {site: string, machine: string, state: string, worker_alive: boolean, worker_errors: number, last_worker_error: string, worker_busy_s: number, queue_blocks: number, history_waiting: number, recording: string, trouble: string}[]}} Readiness
  */
 export {};

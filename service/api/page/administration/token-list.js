@@ -1,0 +1,140 @@
+import { html, lay, table } from "../elements/markup.js";
+import { clock } from "../monitor/figures.js";
+import { LiveElement } from "../elements/live-element.js";
+import { API, monitor } from "../monitor/monitor.js";
+
+const [REFRESH_S, DAYS] = [30, 90];
+const TOKENS = `${API}/tokens`;
+const SCOPES = /** @type {[string, string][]} */ ([["read", "look"], ["operate", "acknowledge, shelve and reset alarms, start replays"], ["configure", "take alarms out of service, administer"]]);
+
+/** @typedef {import("../monitor/records.js").TokenEntry} TokenEntry */
+
+/** Who may use the service: tokens, a form for a new one, and the end of each. */
+class TokenTable extends LiveElement {
+  #open = html("p", { hidden: true }, "The API is open on this computer: everybody who can log in here may do everything, without a token. Tokens may be made for the day it is not.");
+  #message = html("p", { class: "message", role: "status" });
+  #made = html("div", { class: "made", hidden: true });
+  #rows = html("div");
+  #name = /** @type {HTMLInputElement} */ (html("input", { required: true, maxlength: 64, autocomplete: "off" }));
+  #days = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 1, max: 3650, value: DAYS }));
+  /** @type {HTMLInputElement[]} */
+  #scopes = [];
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.#scopes = SCOPES.map(([scope]) => /** @type {HTMLInputElement} */ (html("input", { type: "checkbox", value: scope, checked: scope === "read" && monitor.may(scope), disabled: !monitor.may(scope) })));
+    const boxes = SCOPES.map(([scope, text], at) => html("label", { class: "check" }, this.#scopes[at], html("span", {}, html("b", {}, scope), html("small", {}, ` ${text}${monitor.may(scope) ? "" : "; yours has not this scope"}`))));
+    this.replaceChildren(
+      this.#open,
+      this.#message,
+      this.#made,
+      this.#rows,
+      html(
+        "form",
+        { class: "new-token", submit: (event) => this.#create(event) },
+        html("h2", {}, "New token"),
+        html("label", {}, "Name, as the audit log shall say", this.#name),
+        html("label", {}, "Valid for, days (empty: until revoked)", this.#days),
+        html("fieldset", {}, html("legend", {}, "Scopes; none includes another"), ...boxes),
+        html("button", { type: "submit", class: "main" }, "Create token"),
+      ),
+    );
+    this.keepLoading(REFRESH_S);
+  }
+
+  async ask() {
+    const found = await monitor.ask(TOKENS);
+    this.#open.hidden = found.needed;
+    const order = ["valid", "expired", "revoked"];
+    const sorted = /** @type {TokenEntry[]} */ (found.tokens).sort((one, other) => order.indexOf(one.state) - order.indexOf(other.state) || other.created_ns - one.created_ns);
+    const rows = sorted.map((one) => {
+      const own = one.state === "valid" && one.name === monitor.caller?.name;
+      return {
+        cells: [
+          html("div", {}, html("b", {}, one.name), own && " (yours)", html("small", {}, ` ${one.token_id}`)),
+          html("span", {}, one.scopes.join(", ")),
+          html("span", {}, one.state === "revoked" ? `revoked ${clock(one.revoked_ns)}` : one.state),
+          html("time", { class: "number" }, clock(one.created_ns)),
+          html("time", { class: "number" }, one.expires_ns === null ? "never" : clock(one.expires_ns)),
+          html("time", { class: "number" }, one.last_used_ns === null ? "not since the monitor started" : clock(one.last_used_ns)),
+          html("div", { class: "actions" }, one.state === "valid" && html("button", { type: "button", "aria-label": `Revoke the token of ${one.name}`, click: () => this.#revoke(one, own) }, "Revoke …")),
+        ],
+      };
+    });
+    lay(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "Access tokens") : html("p", { class: "note" }, "There is no token."));
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    this.#message.textContent = why;
+  }
+
+  /** @param {Event} event */
+  async #create(event) {
+    event.preventDefault();
+    const scopes = this.#scopes.filter((one) => one.checked).map((one) => one.value);
+    const days = this.#days.value ? Number(this.#days.value) : null;
+    try {
+      const { token, text } = await monitor.order(TOKENS, { name: this.#name.value.trim(), scopes, days });
+      this.#message.textContent = "";
+      this.#name.value = "";
+      this.#show(token, text);
+      await this.load();
+    } catch (error) {
+      this.#made.hidden = true;
+      this.refused(`Not created. ${error instanceof Error ? error.message : String(error)}`);
+    }
+  }
+
+  /** The text of a new token, until whoever made it says it is safe. @param {TokenEntry} token @param {string} text */
+  #show(token, text) {
+    const shown = /** @type {HTMLInputElement} */ (html("input", { readonly: true, value: text, "aria-label": "New token", class: "number", spellcheck: "false" }));
+    const hide = () => {
+      this.#made.hidden = true;
+      this.#made.replaceChildren();
+    };
+    const copy = html("button", { type: "button", click: () => navigator.clipboard?.writeText(text).then(() => { copy.textContent = "Copied"; }, () => shown.select()) }, "Copy");
+    this.#made.hidden = false;
+    lay(
+      this.#made,
+      html("p", { role: "status" }, html("b", {}, `The token of ${token.name}. It is shown this once: keep it where only its user can read it.`)),
+      html("div", { class: "tools" }, shown, navigator.clipboard ? copy : null, html("button", { type: "button", click: hide }, "Hide")),
+    );
+    shown.focus();
+    shown.select();
+  }
+
+  /** @param {TokenEntry} token @param {boolean} own */
+  #revoke(token, own) {
+    const dialog = /** @type {HTMLDialogElement} */ (
+      html(
+        "dialog",
+        { "aria-labelledby": "revoke", close: () => this.#revoked(dialog, token) },
+        html(
+          "form",
+          { method: "dialog" },
+          html("h2", { id: "revoke" }, `Revoke the token of ${token.name}?`),
+          html("p", {}, own ? "It is the one you are signed in with: you are signed out at once." : "Its next request is refused. It cannot be given back; a new one can be created."),
+          html("div", { class: "actions" }, html("button", { value: "do", class: "main" }, "Revoke"), html("button", { type: "button", click: () => dialog.close() }, "Cancel")),
+        ),
+      )
+    );
+    document.body.append(dialog);
+    dialog.showModal();
+  }
+
+  /** @param {HTMLDialogElement} dialog @param {TokenEntry} token */
+  async #revoked(dialog, token) {
+    dialog.remove();
+    if (dialog.returnValue !== "do") return;
+    try {
+      await monitor.ask(`${TOKENS}/${token.token_id}`, { method: "DELETE" });
+      this.#message.textContent = `The token of ${token.name} is revoked.`;
+      await this.load();
+    } catch (error) {
+      this.refused(`Not revoked. ${error instanceof Error ? error.message : String(error)}`);
+    }
+  }
+}
+
+customElements.define("token-list", TokenTable);

@@ -1,0 +1,40 @@
+import { html, lay, table } from "../elements/markup.js";
+import { clock } from "../monitor/figures.js";
+import { LiveElement } from "../elements/live-element.js";
+import { API, monitor } from "../monitor/monitor.js";
+
+const REFRESH_S = 15;
+
+/** @typedef {import("../monitor/records.js").WebhookStatus} WebhookStatus */
+
+/** Programs that are told of alarms, when they last took an event, and what went wrong last. */
+class WebhookTable extends LiveElement {
+  connectedCallback() {
+    super.connectedCallback();
+    this.keepLoading(REFRESH_S);
+  }
+
+  async ask() {
+    const found = /** @type {WebhookStatus[]} */ ((await monitor.ask(`${API}/webhooks`)).webhooks);
+    const rows = found.map((one) => ({
+      cells: [
+        html("div", {}, html("b", {}, one.name), html("div", { class: "note" }, one.target)),
+        one.state === "working" ? html("span", {}, one.state) : html("strong", {}, one.state),
+        html("span", {}, [one.machines.join(", "), one.kinds.join(", ") || "every kind", one.severities.join(", ") || "every severity", one.annunciated_only && "not what is silenced"].filter(Boolean).join("; ")),
+        html("span", { class: "number" }, one.delivered),
+        html("span", { class: "number" }, one.pending),
+        html("time", { class: "number" }, one.last_delivered_ns === null ? "never" : clock(one.last_delivered_ns)),
+        html("span", {}, one.last_error ? `${clock(one.last_error_ns)}: ${one.last_error} (${one.failed_attempts} failed in all)` : "none"),
+      ],
+    }));
+    const heads = ["webhook", "state", "is told of", "delivered", "pending", "last delivery", "last error"];
+    lay(this, rows.length ? table(heads, rows, "Webhooks, since the monitor started") : html("div", {}, html("h2", {}, "Webhooks"), html("p", { class: "note" }, "The settings name no webhook: nobody is told of alarms over HTTP.")));
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    lay(this, html("p", { class: "message", role: "status" }, why));
+  }
+}
+
+customElements.define("webhook-list", WebhookTable);

@@ -1,0 +1,89 @@
+"""Tokens over HTTP: which there are, a new one, the end of one. ``rotorwatch token`` does the same in a terminal."""
+
+import threading
+from typing import Annotated, Any
+
+from fastapi import Body, FastAPI, HTTPException, Path, Request
+
+from models.errors import MachineFileError
+from rotorwatch.records.example import example
+from rotorwatch.records.monitor import TokenCreated, TokenEntry, TokenList, TokenRequest
+from service.access.audit import AuditNote
+from service.access.guard import Guard
+from service.access.problems import responses
+from service.access.scopes import Caller, Scope
+from service.access.tokens import NameTakenError, check_name_is_free, masked, new_token, token_state
+from service.history.records import TokenRecord
+
+_PLACE = "/api/v1/tokens"
+_ID = Annotated[str, Path(description="public part of the token", examples=["3fK09aZqT1xB"])]
+_SHOWN: Any = {"example": {"summary": "for the control room", "value": example(TokenRequest)}}
+
+
+def add_token_routes(app: FastAPI, guard: Guard) -> None:
+    """Add the routes."""
+    one_at_a_time = threading.Lock()  # two that come at once do not get the same name
+
+    @app.get(_PLACE, tags=["service"], dependencies=[guard.configure], responses=responses(TokenList))
+    def tokens() -> TokenList:
+        """Every token there ever was, without its secret; an application in the open says that none is needed."""
+        found = tuple(_entry(guard, record) for record in guard.tokens.all())
+        return TokenList(needed=not guard.access.open_on_loopback, tokens=found)
+
+    @app.post(
+        _PLACE,
+        status_code=201,
+        tags=["service"],
+        responses=responses(TokenCreated, 400, 409, 413, 415, 422, status_code=201),
+    )
+    def create_token(
+        request: Request,
+        caller: Annotated[Caller, guard.configure],
+        wish: Annotated[TokenRequest, Body(openapi_examples=_SHOWN)],
+    ) -> TokenCreated:
+        """Create a token; its text is in the answer, this once, and only a hash of it is kept."""
+        scopes = frozenset(Scope(one) for one in wish.scopes)
+        said = f"{wish.name}, {' '.join(one for one in Scope if one in scopes)}"
+        request.state.audit = AuditNote("create-token", reason=said)
+        if beyond := [str(one) for one in Scope if one in scopes - caller.scopes]:
+            text = f"{caller.name} has not the scope {', '.join(beyond)}, and so cannot give it to a token"
+            request.state.audit = AuditNote("create-token", reason=f"{said}: {text}")
+            raise HTTPException(403, text)
+        now_ns = guard.clock_ns()
+        try:
+            record, text = new_token(wish.name, scopes, now_ns=now_ns, days=wish.days)
+            with one_at_a_time:
+                check_name_is_free(wish.name, guard.tokens.all(), now_ns)
+                guard.tokens.add(record)
+        except NameTakenError as error:
+            raise HTTPException(409, str(error)) from error
+        except MachineFileError as error:
+            raise HTTPException(422, str(error)) from error
+        request.state.audit = AuditNote("create-token", reason=f"{record.token_id}, {said}")
+        return TokenCreated(token=_entry(guard, record), text=text)
+
+    @app.delete(
+        f"{_PLACE}/{{token_id}}", tags=["service"], dependencies=[guard.configure], responses=responses(TokenEntry, 404)
+    )
+    def revoke_token(request: Request, token_id: _ID) -> TokenEntry:
+        """Revoke a token: it is refused from the next request on; one that is revoked already stays as it is."""
+        request.state.audit = AuditNote("revoke-token", reason=token_id)
+        guard.tokens.revoke(token_id, guard.clock_ns())
+        record = guard.tokens.find(token_id)
+        if record is None:
+            raise HTTPException(404, f"no token {masked(token_id)[:80]}; expected the 12 characters after rw_")
+        request.state.audit = AuditNote("revoke-token", reason=f"{record.token_id}, {record.name}")
+        return _entry(guard, record)
+
+
+def _entry(guard: Guard, record: TokenRecord) -> TokenEntry:
+    return TokenEntry(
+        token_id=record.token_id,
+        name=record.name,
+        scopes=tuple(scope.value for scope in Scope if scope in record.scopes),
+        state=token_state(record, guard.clock_ns()),
+        created_ns=record.created_ns,
+        expires_ns=record.expires_ns,
+        revoked_ns=record.revoked_ns,
+        last_used_ns=guard.last_used_ns.get(record.token_id),
+    )
