@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -425,6 +425,15 @@ def _between(hops: tuple[HopMoments, ...], beta: FloatArray, number: int, part: 
 
 def _adjoin(earlier: HopMoments, later: HopMoments) -> bool:
     return abs(later.start_ns - earlier.end_ns) < (earlier.end_ns - earlier.start_ns) // 4
+
+
+_Number = TypeVar("_Number", np.float64, np.complex128)
+
+
+def through(matrix: FloatArray, rows: npt.NDArray[_Number]) -> npt.NDArray[_Number]:
+    """Rows seen through a matrix, ``rows @ matrix.T``, in one large product: many small ones take longer."""
+    seen = rows.reshape(-1, rows.shape[-1]) @ matrix.T
+    return np.asarray(seen.reshape(*rows.shape[:-1], matrix.shape[0]), dtype=rows.dtype)
 
 
 def relative_vectors(vectors: ComplexArray) -> tuple[ComplexArray, int]:

@@ -25,6 +25,7 @@ from models.diagnosis.moments import (
     regression,
     relative_vectors,
     rotation_of,
+    through,
 )
 from models.diagnosis.recall import Piece, Recall, digest_of, pieces_of
 from models.diagnosis.waveform import Waveform, combined_waveform, stacked_waveform
@@ -140,10 +141,10 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     else:
         beta = regression(total[0], n)
         remove = np.hstack([np.eye(n), -beta])
-        hop_correlation = (remove @ products @ remove.T) / plan.hop
+        seen = through(remove, through(remove, products).swapaxes(-1, -2))  # from both sides, the other one first
+        hop_correlation = seen.swapaxes(-1, -2) / plan.hop
         correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
-        # One product of large matrices: as many as there are segments take longer.
-        cleaned = (segments.reshape(-1, segments.shape[2]) @ remove.T).reshape(*segments.shape[:2], n)
+        cleaned = through(remove, segments)
         if plan.angle_column is not None:
             synchronous = _synchronous(beta)
     if plan.angle_column is not None:

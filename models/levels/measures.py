@@ -48,8 +48,8 @@ COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
-_REGRESSORS = 1 + 2 * len(ORDERS)
-"""The mean, and cosine and sine of each order."""
+_REGRESSORS = 2 * len(ORDERS)
+"""Cosine and sine of each order; the mean stands for itself."""
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
@@ -301,17 +301,19 @@ def _orders(every: _SingleArray, angle_rad: FloatArray | None) -> _ComplexArray:
         half = half.astype(np.float32)
     else:  # orders are nearly alike then: what tells them apart needs the digits
         every = every.astype(np.float64)
-    regressors, cos, sin = every[:_REGRESSORS], every[1:_REGRESSORS:2], every[2:_REGRESSORS:2]
-    regressors[0] = 1
+    regressors, cos, sin = every[:_REGRESSORS], every[:_REGRESSORS:2], every[1:_REGRESSORS:2]
     np.cos(half, out=cos[0])
     np.sin(half, out=sin[0])
     for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):  # cos and sin of a sum of angles
         cos[row] = cos[first] * cos[second] - sin[first] * sin[second]
         sin[row] = sin[first] * cos[second] + cos[first] * sin[second]
-    # Many are tapered, so that other lines stay out.
-    products = ((regressors * _taper(half.size) if many else regressors) @ every.T).astype(np.float64)
+    # Many are tapered, so that other lines stay out. With a row for the mean the product would take twice as long.
+    weights = _taper(half.size) if many else np.ones_like(half)
+    products = np.empty((1 + _REGRESSORS, 1 + every.shape[0]))
+    products[0] = weights.sum(), *(every @ weights)
+    products[1:, 0], products[1:, 1:] = products[0, 1 : 1 + _REGRESSORS], (every @ (regressors * weights).T).T
     try:
-        solved = np.linalg.solve(products[:, :_REGRESSORS], products[:, _REGRESSORS:])
+        solved = np.linalg.solve(products[:, : 1 + _REGRESSORS], products[:, 1 + _REGRESSORS :])
     except np.linalg.LinAlgError:  # a shaft that stands still
         return nothing
     return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)

@@ -15,7 +15,7 @@ from scipy.special import log_ndtr, ndtri
 from models.diagnosis.likelihood.motions import Mismatch
 from models.diagnosis.likelihood.scoring import Maximum, Weights, Whitened, inverse_factor
 from models.diagnosis.likelihood.spectral_model import COLUMNS, ROWS, STRUCTURAL, SpectralModel, packed, twice_packed
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.moments import ComplexArray, through
 from models.diagnosis.readings import beyond
 from models.machine import Machine
 from models.physics.rotor import PARAMETER_TEXT, Q_shaft, impossible
@@ -141,13 +141,12 @@ def _alternatives(machine: Machine, model: SpectralModel, found: Maximum) -> tup
     """Names and packed slopes of everything tried, shape (n_alternatives, n_groups, n²)."""
     point, L_inverse = found.whitened.point, found.whitened.L_inverse
     whitened: ComplexArray = L_inverse[:, None] @ point.G
-    response: ComplexArray = whitened @ point.C
-    names, slopes = [], []
+    response = through(point.C, whitened)
     coloured = point.S @ L_inverse.conj().swapaxes(1, 2)
-    for state, (number, share) in model.motions.shares(model.centre).items():
-        outer = share[:, None, None] * L_inverse[:, :, number, None] * coloured[:, None, number, :]
-        names.append(f"gain of {state}")
-        slopes.append(twice_packed(outer))
+    shares = model.motions.shares(model.centre)
+    names = [f"gain of {state}" for state in shares]
+    outer = L_inverse.transpose(2, 0, 1)[..., None] * coloured.swapaxes(0, 1)[:, :, None]  # of every motion
+    slopes = list(twice_packed(np.array([share[:, None, None] * outer[number] for number, share in shares.values()])))
     w2 = (2 * np.pi * model.groups.nodes_hz) ** 2
     rotor, sides = machine.rotor, model.sides(point, whitened, response)
     for (name, first), mass in zip(_MASSES.items(), (rotor.m1_kg, rotor.m2_kg, rotor.I2_kg_m2), strict=True):

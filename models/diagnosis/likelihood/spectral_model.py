@@ -26,9 +26,10 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import eval_legendre
 
 from models.diagnosis.likelihood.motions import BinGroups, Motions
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.moments import ComplexArray, through
 from models.machine import Machine
 from models.physics.excitation import low_pass, low_pass_slopes
 from models.physics.rotor import M_matrix, P_matrix, Q_matrix, Q_shaft
@@ -109,7 +110,7 @@ class SpectralModel:
         self._noise_shape = np.log1p((groups.centre_hz / (2 / 3 * high)) ** 2)
         # Over the root of frequency the polynomials resolve a low-pass at the lower and a hump at the upper end alike.
         x = 2 * (np.sqrt(groups.centre_hz) - np.sqrt(low)) / (np.sqrt(high) - np.sqrt(low)) - 1
-        self._b = np.polynomial.legendre.legvander(x, self.shapes)[:, 1:]
+        self._b = eval_legendre(np.arange(1, self.shapes + 1), x[:, None])
         self._w = 2 * np.pi * groups.nodes_hz
         # Neighbouring groups share nodes, and all are filled up to one number: half of them where damping is light.
         self._distinct_w, self._place = np.unique(self._w, return_inverse=True)
@@ -174,7 +175,7 @@ class SpectralModel:
         seen = H[:, :, self.motions.dofs] * self._factor[..., None]
         G = seen * unit * np.sqrt(gain)[:, :, None, None]
         C = self.levels(theta) if C is None else C
-        S = _summed((G.reshape(-1, 6) @ C).reshape(G.shape), G)
+        S = _summed(through(C, G), G)
         diagonal = np.arange(self.n)
         S[:, diagonal, diagonal] += self.noise(theta)
         return ModelPoint(theta, S, G, H * unit, colour, C, speed_rad_s)
@@ -213,7 +214,7 @@ class SpectralModel:
         """
         theta = point.theta
         whitened = L_inverse[:, None] @ point.G
-        response = whitened @ point.C
+        response = through(point.C, whitened)
         sides = self.sides(point, whitened, response)
         if out is None:
             out = np.empty((self.size, self._w.shape[0], self.n * self.n))
@@ -270,12 +271,12 @@ class Sides:
         dofs : slice
             Degrees of freedom whose rows and columns change.
         change : ndarray, shape (n_dofs, n_dofs), optional
-            The diagonal alone, by one, without it.
+            Symmetric; the diagonal alone, by one, without it.
         """
         n_groups, _, n, _ = self.left.shape
         moved = self.left[..., dofs] * factor[..., None, None]
         if change is not None:
-            moved = (moved.reshape(-1, change.shape[0]) @ change).reshape(moved.shape)
+            moved = through(change, moved)
         left, right = (side.transpose(0, 2, 1, 3).reshape(n_groups, n, -1) for side in (moved, self.right[..., dofs]))
         return twice_packed(np.asarray(left @ right.swapaxes(1, 2)))
 

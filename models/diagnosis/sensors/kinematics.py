@@ -98,16 +98,6 @@ def _others(states: tuple[str, ...], pair: MotionPair) -> list[int]:
     return [column for place, column in first.items() if place != own]
 
 
-def shared(bands: Banded) -> float:
-    """How much of the motion two sensors share at the best gain, polarity and delay, rotation included, 0 to 1."""
-    z, v, cross = _even(bands)
-    return _part(z, v, _turned(bands.w, cross)[1]) if z > 0 and v > 0 else 0.0
-
-
-def _part(z: float, v: float, aligned: float) -> float:
-    return min(1.0, abs(aligned) / math.sqrt(z * v))
-
-
 def same(bands: Banded) -> float:
     """How much of the motion two sensors show alike: same time, same size, same sense; 1 if all, below 0 if opposed."""
     z, v, cross = _even(bands)
@@ -124,7 +114,8 @@ def _turned(w: FloatArray, cross: ComplexArray) -> tuple[float, float]:
     """Delay that brings the cross-powers into line, and their sum then; it is negative where one is reversed."""
     reach = round(LONGEST_DELAY_S / _DELAY_STEP_S)
     delays = _DELAY_STEP_S * np.arange(-reach, reach + 1)
-    sums = np.real(np.exp(1j * np.outer(delays, w)) @ cross)
+    turns = np.cumprod(np.broadcast_to(np.exp(1j * _DELAY_STEP_S * w), (reach, w.size)), axis=0)
+    sums = np.real(np.concatenate([turns[::-1].conj() @ cross, [cross.sum()], turns @ cross]))
     good = np.flatnonzero(np.abs(sums) >= _AS_GOOD * np.abs(sums).max())
     best = int(good[np.argmin(np.abs(delays[good]))])
     # Climb from there: the first one that is as good lies on the slope of its peak.
@@ -155,12 +146,12 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
     level, other, cross = _even(bands)
     delay_s, total = _turned(bands.w, cross)
     start = _Start(1 if total >= 0 else -1, float(np.log(max(abs(total) / level, _FLOOR))), delay_s)
-    in_common = _part(level, other, total)
+    shared = min(1.0, abs(total) / (math.sqrt(level) * math.sqrt(other)))
     alone = _fitted(pair, start, bands.w, h, variance, bias)
     rotation = _rotation(window, pair)
     line = None if rotation is None else _line(rotation, window, bands, incoherent)
     if line is None:
-        return replace(alone, shared=in_common)
+        return replace(alone, shared=shared)
     speed, ratio, spread = line
     found = _fitted(
         pair, start, np.append(bands.w, speed), np.append(h, ratio), np.append(variance, spread), np.append(bias, 0.0)
@@ -168,7 +159,7 @@ def read_pair(window: WindowStatistics, pair: MotionPair, bands: Banded | None =
     runout = abs(found.log_gain - alone.log_gain) > max(_LINE_FITS * alone.log_gain_error, _RUNOUT)
     if runout and alone.log_gain_error < _RUNOUT:
         found = alone
-    return replace(found, shared=in_common)
+    return replace(found, shared=shared)
 
 
 @dataclass(frozen=True, slots=True)
