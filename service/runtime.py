@@ -46,6 +46,7 @@ from service.recordings.catalogue import Catalogue
 from service.recordings.recent import recent_messages, recorded_files
 from service.recordings.recorder import MachineRecorder, RecorderStatus
 from service.settings.service import ServiceSettings
+from service.stream.evidence import EvidenceCollector
 from service.stream.liveness import Pulse
 from service.stream.transport import Link, MachineCallbacks, MachineLink, MachineTap
 from service.stream.worker import MachineWorker
@@ -299,6 +300,7 @@ class _Supervisor:
         self._feed = feed
         self._stop = threading.Event()
         self._published: dict[int, Health] = {}
+        self._evidence = [EvidenceCollector(worker) for worker, _, _ in watched]
         self._thread = threading.Thread(target=self._run, name="supervisor", daemon=True)
 
     def start(self) -> None:
@@ -329,6 +331,7 @@ class _Supervisor:
         if before is not None and _news(before) == _news(health):
             return
         self._published[number] = health
+        self._evidence[number].look(health)
         link.publish_health(health.model_dump_json())
         self._feed.health(health)
         if before is None or before.state != health.state:

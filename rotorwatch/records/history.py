@@ -3,8 +3,9 @@
 from pydantic import Field
 
 from rotorwatch.records.alarms import AlarmCloudEvent
-from rotorwatch.records.fields import EXAMPLE_NS, Record
+from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
 from rotorwatch.records.health import MEASURES, Report
+from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 
 
 class ReportList(Record):
@@ -26,6 +27,33 @@ class AlarmEventList(Record):
     )
     next_after: int | None = Field(
         description="pass it as `after` to go on from here, now or later; null without `after`", examples=[None]
+    )
+
+
+class Picture(Record):
+    """A machine at one window: what was said of it, its spectra and its orbits."""
+
+    report: Report
+    spectra: SpectrumSnapshot
+    orbits: OrbitSnapshot
+
+
+class AlarmEvidence(Record):
+    """What one occurrence of an alarm rests on, and what the machine was like before."""
+
+    site: Site
+    machine: Name
+    name: str = Field(description="of the alarm", examples=["k_by"])
+    occurrence: int = Field(description="which time its condition began", examples=[1])
+    before: Picture | None = Field(
+        description="the latest that was kept while nothing was wrong, one an hour; null if there is none",
+        examples=[None],
+    )
+    raised: Picture = Field(description="the window that it was raised with")
+    settled: Picture | None = Field(
+        description="the first window without data from before the change; null if it has not come, or the alarm "
+        "cleared before",
+        examples=[None],
     )
 
 

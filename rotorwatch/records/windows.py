@@ -124,6 +124,16 @@ class Candidate(Record):
     probability: float = Field(description="that it is among those that changed", examples=[0.97])
 
 
+class Alternative(Record):
+    """A set of parameters that may have changed, beside others that were weighed."""
+
+    names: tuple[ParameterName, ...] = Field(description="the set; empty: nothing changed", examples=[("c_by",)])
+    probability: float = Field(description="that these changed and nothing else", examples=[0.0004])
+    explained: float = Field(
+        description="share of what all parameters together explain that this set explains by itself", examples=[0.08]
+    )
+
+
 class Verdict(Record):
     """What has changed, from stretches of data of all lengths that end with this hop; alarms are decided on it."""
 
@@ -141,6 +151,12 @@ class Verdict(Record):
     )
     candidates: tuple[Candidate, ...] = Field(
         default=(), description="parameters that may have changed, the most probable first; those below 5 % left out"
+    )
+    alternatives: tuple[Alternative, ...] = Field(
+        default=(),
+        exclude_if=lambda value: not value,
+        description="sets that were weighed, the most probable first: the likeliest, each parameter by itself, none; "
+        "left out while nothing is seen",
     )
     low_confidence: bool = Field(
         description="take what is said of parameters with reserve: outside the model, or several sets explain the data",

@@ -5,7 +5,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
-from sqlalchemy import Connection, func, select
+import zstandard
+from sqlalchemy import Connection, delete, func, select
 from sqlalchemy.sql.base import ReadOnlyColumnCollection
 from sqlalchemy.sql.elements import ColumnElement
 
@@ -14,12 +15,13 @@ from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
 from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport, StoreError
 from service.history.shared import EVENT
-from service.history.tables import alarm_events, checkpoint_parts, checkpoints, reports, series, windows
+from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evidence, reports, series, windows
 from service.history.trend import trend
 from service.history.windows import READING, unpacked
 from service.history.writer import Writer
 
 _AT_ONCE = 1000  # windows
+_MOST_EVIDENCE = 500  # occurrences of a machine's alarms
 _HEAD = [checkpoints.c[name] for name in CheckpointHead.__dataclass_fields__]
 
 
@@ -123,6 +125,27 @@ class MachineStore:
             alarms = unpack(head.alarms)
         kept = CheckpointHead(**head._asdict() | {"alarms": alarms})
         return Checkpoint(kept, tuple((row.name, row.data) for row in rows))
+
+    def evidence(self, alarm: str, occurrence: int | None = None) -> str | None:
+        """What an occurrence of an alarm rests on, or its latest one; None if nothing was kept."""
+        kept = evidence.c
+        query = select(kept.text).where(kept.machine_id == self._claim.machine_id, kept.alarm == alarm)
+        if occurrence is not None:
+            query = query.where(kept.occurrence == occurrence)
+        rows = self._database.rows(query.order_by(kept.occurrence.desc()).limit(1))
+        return zstandard.decompress(rows[0].text).decode() if rows else None
+
+    def keep_evidence(self, alarm: str, occurrence: int, text: str) -> None:
+        """Keep what an occurrence of an alarm rests on, in place of what was kept of it; the oldest of many go."""
+        kept, own = evidence.c, evidence.c.machine_id == self._claim.machine_id
+        values = {"recorded_ns": self._now_ns(), "text": zstandard.compress(text.encode())}
+        key = {"machine_id": self._claim.machine_id, "alarm": alarm, "occurrence": occurrence}
+        made = self._database.insert(evidence).values(**key, **values)
+        made = made.on_conflict_do_update(index_elements=list(key), set_=values)
+        newest = select(kept.recorded_ns).where(own).order_by(kept.recorded_ns.desc()).limit(1).offset(_MOST_EVIDENCE)
+        with self._database.writing() as connection:
+            connection.execute(made)
+            connection.execute(delete(evidence).where(own, kept.recorded_ns <= newest.scalar_subquery()))
 
     def events(  # noqa: PLR0913  # each narrows the query
         self,

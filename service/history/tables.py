@@ -7,6 +7,7 @@
              --< windows                           each with its readings in one value: see `windows.py`
              --< buckets                           the same of many windows, reduced, and kept longer
              --< series                            what the numbers in both stand for
+             --< evidence                          what alarms rest on
              --- checkpoints --< checkpoint_parts  where a monitor goes on from
     tokens    audit_log    webhook_cursors
 """
@@ -19,7 +20,7 @@ from sqlalchemy.types import TypeEngine
 
 from service.history.records import StoreError
 
-REVISION = "0004"
+REVISION = "0005"
 """The migration that ends with these tables."""
 MIGRATING = (0x726F746F, 0)  # PostgreSQL's advisory lock; second numbers from 1 are machines
 
@@ -111,6 +112,17 @@ buckets = sa.Table(
     *_filled(LargeBinary, "readings"),
     sa.PrimaryKeyConstraint("machine_id", "start_ns", "length_ns"),
     sa.Index(None, "recorded_ns"),
+)
+
+evidence = sa.Table(
+    "evidence",
+    metadata,
+    _machine_id(),
+    *_filled(Text, "alarm"),
+    *_filled(BigInteger, "occurrence", "recorded_ns"),
+    *_filled(LargeBinary, "text"),
+    sa.PrimaryKeyConstraint("machine_id", "alarm", "occurrence"),
+    sa.Index(None, "machine_id", "recorded_ns"),
 )
 
 checkpoints = sa.Table(

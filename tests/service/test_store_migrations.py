@@ -41,7 +41,7 @@ def test_tables_change_with_their_revision() -> None:
     metadata.create_all(engine, checkfirst=False)
     words = " ".join(str(statement.compile(dialect=engine.dialect)) for statement in made).split()
     digest = hashlib.sha256(" ".join(words).encode()).hexdigest()
-    assert (REVISION, digest) == ("0004", "87ada45e91216035e7973d1e6780759de43416f57e35bbf0240b831d2f746905")
+    assert (REVISION, digest) == ("0005", "13f485abccd4a3bf596a894b7f8f295facc7f6a1eb3e74b19529c3388ee19897")
 
 
 def test_tables_of_an_older_version_are_migrated_and_keep_what_they_hold(
@@ -50,19 +50,19 @@ def test_tables_of_an_older_version_are_migrated_and_keep_what_they_hold(
     with opened(url) as store:
         assert store.machine("demo", "lab").commit(Step(readings=(StoredReading(1, "parameter", "e", 0.1, None),)))
     folder = Path(shutil.copytree(migrations.FOLDER, tmp_path / "migrations"))
-    (folder / "versions" / "r0005_colour.py").write_text(
+    (folder / "versions" / "r0006_colour.py").write_text(
         "from alembic import op\n"
-        "revision, down_revision = '0005', '0004'\n"
+        "revision, down_revision = '0006', '0005'\n"
         "def upgrade(): op.execute(\"ALTER TABLE tokens ADD COLUMN colour TEXT DEFAULT 'red'\")\n"
     )
     monkeypatch.setattr(migrations, "FOLDER", folder)
-    monkeypatch.setattr("service.history.tables.REVISION", "0005")
+    monkeypatch.setattr("service.history.tables.REVISION", "0006")
     with opened(url) as store:
         assert [one.value for one in store.machine("demo", "lab").readings(quantity="parameter", name="e")] == [0.1]
     engine = engine_for(url)
     with engine.connect() as connection:
         assert "colour" in {column["name"] for column in inspect(connection).get_columns("tokens")}
-        assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == ["0005"]
+        assert connection.scalars(text("SELECT version_num FROM alembic_version")).all() == ["0006"]
     engine.dispose()
     opened_and_closed(url)  # which is nothing then
 

@@ -23,7 +23,9 @@ from models.diagnosis.verdict.calibration import Thresholds, window_thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch_of
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
-from rotorwatch.records.windows import Parameter
+from rotorwatch.records.windows import Alternative, Parameter
+
+_LIKELIEST = 4  # sets that are told whatever they hold
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,7 @@ class Isolation:
     # sensor is at fault. The verdict on the parameters is then of low confidence.
     outside: bool = False
     outside_confidence: float | None = None  # of that, see `outside_confidence`; None where there is no such test
+    alternatives: tuple[Alternative, ...] = ()  # sets that were weighed, the most probable first
 
     @property
     def low_confidence(self) -> bool:
@@ -106,6 +109,23 @@ def isolate(stretch: Stretch, thresholds: Thresholds, by: str = "likelihood") ->
         readings=restricted(stretch, changed, by),
         outside=outside,
         outside_confidence=confidence,
+        alternatives=_alternatives(sets, known, weight, explained) if changed else (),
+    )
+
+
+def _alternatives(
+    sets: tuple[tuple[int, ...], ...], known: tuple[int, ...], weight: FloatArray, explained: FloatArray
+) -> tuple[Alternative, ...]:
+    """The likeliest sets, each parameter by itself, and none: what a reader would ask for."""
+    likeliest = np.argsort(-weight)[:_LIKELIEST].tolist()
+    simple = [number for number, one in enumerate(sets) if len(one) < 2]
+    return tuple(
+        Alternative(
+            names=tuple(PARAMETERS[known[i]] for i in sets[number]),
+            probability=min(1.0, float(weight[number])),
+            explained=min(1.0, max(0.0, float(explained[number] / explained[-1]))),
+        )
+        for number in sorted({*likeliest, *simple}, key=lambda number: -weight[number])
     )
 
 

@@ -193,6 +193,7 @@ class SequentialTest:
             detected=detected,
             confidence=isolation.confidence,
             candidates=() if unexplained else _candidates(isolation),
+            alternatives=() if unexplained else isolation.alternatives,
             low_confidence=isolation.low_confidence,
             outside_model=isolation.outside,
             outside_confidence=isolation.outside_confidence,

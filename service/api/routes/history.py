@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Annotated, Any
 
-from fastapi import FastAPI, HTTPException, Query
+from fastapi import FastAPI, HTTPException, Path, Query
 from fastapi.responses import Response
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
-from rotorwatch.records.history import AlarmEventList, AuditList, AuditRecord, ReadingList, ReportList
+from rotorwatch.records.history import AlarmEventList, AlarmEvidence, AuditList, AuditRecord, ReadingList, ReportList
 from rotorwatch.records.monitor import HistoryStatus
 from service.access.guard import Guard
 from service.access.problems import responses
@@ -104,6 +104,27 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             next_before=last if after is None and more else None,
             next_after=None if after is None else last,
         )
+
+    @app.get(
+        f"{PLACE}/alarms/{{name}}/evidence",
+        responses=responses(AlarmEvidence, 404, 422),
+        response_model=AlarmEvidence,
+        **common,
+    )
+    def evidence(
+        site: SiteName,
+        machine: MachineName,
+        name: Annotated[AlarmName, Path(description="of the alarm", examples=["k_by"])],
+        occurrence: Annotated[
+            int | None, Query(ge=1, le=_LARGEST, description="which time its condition began; left out, the latest")
+        ] = None,
+    ) -> Response:
+        """What an alarm rests on: report, spectra and orbits before it, when it was raised, and after the change."""
+        text = found_machine(service, site, machine).history.evidence(name, occurrence)
+        if text is None:
+            which = "" if occurrence is None else f"occurrence {occurrence} of "
+            raise HTTPException(404, f"nothing was kept of {which}{name}: it was not raised on a window, or long ago")
+        return Response(text, media_type="application/json")
 
     @app.get(f"{PLACE}/reports", responses=responses(ReportList, 404, 422), response_model=ReportList, **common)
     def reports(

@@ -1,0 +1,13 @@
+"""A table for what alarms rest on."""
+
+from alembic import op
+
+from service.history.tables import evidence
+
+revision = "0005"
+down_revision = "0004"
+
+
+def upgrade() -> None:
+    """Add the table, which begins empty."""
+    evidence.create(op.get_bind())
