@@ -35,7 +35,7 @@ FLAGS = [
 ]
 PATIENCE_MS = 120_000.0
 FAULT_AT, SEEN_AT = 400, 700
-VIEWS = {"plant": "", "machine": "machines/demo/lab", "alarms": "alarms"}
+VIEWS = {"plant": "", "machine": "machines/demo/lab", "alarms": "alarms", "why": "why/demo/lab/k_by"}
 SCREENSHOTS = os.environ.get("ROTORWATCH_SCREENSHOTS")
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 

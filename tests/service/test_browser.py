@@ -126,10 +126,23 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
 
         seen = second.locator("alarm-list tr", has_text="k_by")
         expect(seen).to_contain_text("unacknowledged")
-        page.locator("alarm-list tr", has_text="k_by").get_by_role("button", name="Acknowledge").click()
+        page.locator("alarm-list tr", has_text="k_by").get_by_role("link", name="Why?").click()
+        why = page.locator("why-view")
+        expect(why.get_by_role("heading", level=1)).to_have_text("bearing stiffness, horizontal")
+        expect(why.locator(".verdict")).to_contain_text(
+            re.compile(
+                r"^bearing stiffness, horizontal changed by −3\d\.\d % ± \d\.\d % since 2026-01-01 00:00:[34]\d UTC"
+            )
+        )
+        weighed = why.locator("table", has_text="What else was considered").locator("tbody tr")
+        expect(weighed.first).to_contain_text(re.compile("^bearing stiffness, horizontal.*%"))
+        expect(weighed.filter(has_text="nothing changed")).to_contain_text("< 0.1 %")
+        expect(why.locator("before-after svg.orbit")).to_have_count(2)
+        expect(why.locator("canvas")).to_have_count(2)
+        why.get_by_role("button", name="Acknowledge").click()
         expect(seen.get_by_role("button", name="Acknowledge")).to_have_count(0)
         assert http.get(f"{PLACE}/alarms/k_by").json()["state"] == "acknowledged"
-        expect(page.locator("alarm-history")).to_contain_text("acknowledged")
+        expect(why.locator("alarm-list")).to_contain_text("acknowledged")
 
         plant.cut.set()
         page.goto(f"{url}/#/")

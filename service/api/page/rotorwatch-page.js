@@ -10,6 +10,7 @@ import "./sign-in.js";
 const VIEWS = {
   machines: ["machine-view", () => import("./machine/machine-view.js")],
   alarms: ["alarms-view", () => import("./alarms/alarms-view.js")],
+  why: ["why-view", () => import("./alarms/why-view.js")],
   administration: ["administration-view", () => import("./administration/administration-view.js")],
 };
 

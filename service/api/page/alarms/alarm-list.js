@@ -18,6 +18,9 @@ function known(alarm) {
   return [size, alarm.note].filter(Boolean).join("; ");
 }
 
+/** Where it is said what an alarm rests on. @param {string} place @param {{name: string, occurrence: number}} alarm */
+export const whyOf = (place, { name, occurrence }) => `#/why/${place}/${encodeURIComponent(name)}/${occurrence}`;
+
 /** What can be done to an alarm as it is: the order, the button, and the scope that takes. @param {Alarm} alarm @returns {[string, string, string, boolean][]} */
 function operations(alarm) {
   const silenced = ["shelved", "out-of-service"].includes(alarm.state);
@@ -33,7 +36,7 @@ function operations(alarm) {
   return all.filter(([, , scope, possible]) => possible && monitor.may(scope));
 }
 
-/** Alarms that are not normal, with what can be done to them: `<alarm-list place="site/machine">`, or of all machines. */
+/** Alarms that are not normal, with what can be done to them: of all machines, of one `place="site/machine"`, or one `alarm="k_by"` of that. */
 class AlarmList extends HTMLElement {
   #gone = new AbortController();
   #said = "";
@@ -57,10 +60,10 @@ class AlarmList extends HTMLElement {
 
   /** @returns {Placed[]} */
   #alarms() {
-    const only = this.getAttribute("place");
+    const [only, name] = [this.getAttribute("place"), this.getAttribute("alarm")];
     return [...monitor.machines]
       .filter(([place]) => !only || place === only)
-      .flatMap(([place, { health }]) => health.alarms.map((alarm) => ({ place, alarm })))
+      .flatMap(([place, { health }]) => health.alarms.filter((alarm) => !name || alarm.name === name).map((alarm) => ({ place, alarm })))
       .sort((one, other) => byUrgency(one.alarm, other.alarm));
   }
 
@@ -73,7 +76,7 @@ class AlarmList extends HTMLElement {
     const focused = document.activeElement instanceof HTMLElement ? document.activeElement.dataset.order : undefined;
     const rows = all.map((one) => this.#row(one));
     const heads = ["alarm", "state", "since", "what is known", "actions"];
-    this.#rows.replaceChildren(rows.length ? table(heads, rows, "Alarms that are not normal") : html("p", { class: "note" }, "No alarm is raised, and none waits to be acknowledged."));
+    this.#rows.replaceChildren(rows.length ? table(heads, rows, this.hasAttribute("alarm") ? "Now" : "Alarms that are not normal") : html("p", { class: "note" }, this.hasAttribute("alarm") ? "The alarm is normal now." : "No alarm is raised, and none waits to be acknowledged."));
     if (focused) /** @type {HTMLElement | null} */ (this.#rows.querySelector(`[data-order="${CSS.escape(focused)}"]`))?.focus();
   }
 
@@ -86,7 +89,7 @@ class AlarmList extends HTMLElement {
     return {
       attributes: { class: [alarm.raised && alarm.severity, UNSEEN.has(alarm.state) && "unseen"].filter(Boolean).join(" ") || null },
       cells: [
-        html("div", {}, machine, html("b", {}, alarm.text), html("small", {}, ` ${alarm.name}`)),
+        html("div", {}, machine, html("b", {}, alarm.text), html("small", {}, ` ${alarm.name}`), !this.hasAttribute("alarm") && alarm.evidence && html("a", { href: whyOf(place, alarm) }, "Why?")),
         html("div", { class: "states" }, alarm.raised && html("state-mark", { state: alarm.severity }), html("span", {}, alarm.pending ? "pending" : alarm.state)),
         html("time", { class: "number" }, clock(alarm.raised_ns ?? alarm.since_ns)),
         html("span", {}, known(alarm)),

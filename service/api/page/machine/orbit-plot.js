@@ -27,8 +27,8 @@ function marked({ path }, pulses_s) {
   });
 }
 
-/** One place: samples, ellipses and marks. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
-export function orbitFigure(orbit, pulses_s) {
+/** One place: samples, ellipses and marks. @param {PlaceOrbit} orbit @param {number[]} pulses_s @param {{measured: string, nominal: string}} [called] */
+export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured", nominal: "as nominal" }) {
   const { path, ellipse, nominal, estimated, location, unit } = orbit;
   const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);
   const scale = (0.46 * SIZE) / round(reach);
@@ -41,7 +41,7 @@ export function orbitFigure(orbit, pulses_s) {
     return [svg("line", { class: "grid", x1: -half, x2: half, y1: at, y2: at }), svg("line", { class: "grid", y1: -half, y2: half, x1: at, x2: at })];
   });
   const said = ellipse ? `${figure(2 * ellipse.semi_major)} × ${figure(2 * ellipse.semi_minor)} ${printed(unit)} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
-  const keys = [path && ["path", "samples"], ellipse && ["measured", "1× measured"], nominal && ["nominal", "as nominal"], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
+  const keys = [path && ["path", "samples"], ellipse && ["measured", called.measured], nominal && ["nominal", called.nominal], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
   return html(
     "figure",
     {},
