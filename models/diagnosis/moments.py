@@ -436,6 +436,13 @@ def through(matrix: FloatArray, rows: npt.NDArray[_Number]) -> npt.NDArray[_Numb
     return np.asarray(seen.reshape(*rows.shape[:-1], matrix.shape[0]), dtype=rows.dtype)
 
 
+def divided(values: ComplexArray, by: int | FloatArray) -> ComplexArray:
+    """Divide by real numbers, in place and contiguous: part by part, which takes a fifth of a complex division."""
+    parts = values.view(np.float64)
+    parts /= by
+    return values
+
+
 def relative_vectors(vectors: ComplexArray) -> tuple[ComplexArray, int]:
     """Turn each hop's vectors so that the channel with the clearest line is at angle zero.
 

@@ -20,6 +20,7 @@ from models.diagnosis.moments import (
     Plan,
     Rotation,
     SpeedSource,
+    divided,
     hop_coefficients,
     hop_moments,
     regression,
@@ -141,8 +142,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     else:
         beta = regression(total[0], n)
         remove = np.hstack([np.eye(n), -beta])
-        seen = through(remove, through(remove, products).swapaxes(-1, -2))  # from both sides, the other one first
-        hop_correlation = seen.swapaxes(-1, -2) / plan.hop
+        hop_correlation = remove @ through(remove, products) / plan.hop
         correlation = (remove @ total @ remove.T) / (len(hops) * plan.hop)
         cleaned = through(remove, segments)
         if plan.angle_column is not None:
@@ -150,6 +150,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
     if plan.angle_column is not None:
         hop_synchronous = _synchronous(regression(products[:, 0], n))
     by_bin = np.ascontiguousarray(cleaned.transpose(1, 0, 2))
+    spectrum = np.asarray(by_bin.transpose(0, 2, 1) @ by_bin.conj(), dtype=np.complex128)
     speed_rad_s, speed_range = _speeds(rotation, hops, plan)
     found = WindowStatistics(
         states=plan.mounted,
@@ -160,7 +161,7 @@ def window_statistics(plan: Plan, hops: tuple[HopMoments, ...], *, lagged: bool 
         lags_s=plan.lags_s[:n_lags],
         correlation=correlation,
         hop_correlation=hop_correlation,
-        spectrum=by_bin.transpose(0, 2, 1) @ by_bin.conj() / segments.shape[0],
+        spectrum=divided(spectrum, segments.shape[0]),
         frequencies_hz=plan.frequencies_hz,
         synchronous=synchronous,
         hop_synchronous=hop_synchronous,

@@ -191,17 +191,18 @@ class Linearised:
         """
         model, point = self.model, self._point
         rest = self._whitened(observed - point.S)
-        gradient = self._pulled(self._gradient(rest), point, share)
+        gradient = self._gradient(rest)
         covariance = self._inverse(share)
-        step = covariance @ gradient
+        step = covariance @ self._pulled(gradient, point, share)
         diagnosed = slice(model.cutoff_at)
         structural = covariance[diagnosed, diagnosed]
         if np.any(np.abs(step[diagnosed]) > _NEWS * np.sqrt(np.diag(structural))):
             return None
         theta = point.theta.copy()
         theta[diagnosed] += step[diagnosed]
-        left = rest - np.tensordot(step, self.derivatives.slopes, axes=1)
-        total = share * float(self.weights.averages @ np.sum(left**2, axis=1))
+        # Σ ν |rest - slopes · step|², with what is known of the slopes already.
+        left = np.sum(rest**2, axis=1) @ self.weights.averages
+        total = share * float(left - (2 * gradient - self.derivatives.information @ step) @ step)
         usual = model.n**2 * float(np.trace(model.groups.shared))
         scatter = model.n * float(np.sqrt(2 * np.sum(model.groups.shared**2)))
         if total > _EXCESS_MARGIN * usual + _LEAST_EXCESS_Z * scatter:

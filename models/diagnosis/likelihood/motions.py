@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from models.diagnosis.moments import ComplexArray
+from models.diagnosis.moments import ComplexArray, divided
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
 from models.physics.rotor import COORDINATES, STATE_INDEX, system_A
@@ -68,7 +68,7 @@ class BinGroups:
         places = np.array(self.edges).ravel()
         # Every other sum is that of the bins between two groups; the end of the last may be the end of the band.
         sums = np.add.reduceat(spectrum, places[: -1 if places[-1] == spectrum.shape[0] else None], axis=0)[::2]
-        return np.asarray(sums / self.bins[:, None, None], dtype=np.complex128)
+        return divided(np.ascontiguousarray(sums), self.bins[:, None, None])
 
     def same_as(self, other: "BinGroups") -> bool:
         """Whether other groups hold the same bins at the same frequencies."""
@@ -287,10 +287,9 @@ class Motions:
             to_z = np.stack([np.ones_like(root), -1j * r[:, at]], axis=1) / root[:, None]
             to_d = np.stack([-1j * r[:, at], np.ones_like(root)], axis=1) / root[:, None]
             regressor = 1j * r[:, at] / root**2
-            zz, dz, dd = (
-                np.einsum("fi,fij,fj->f", left, pair, right.conj())
-                for left, right in ((to_z, to_z), (to_d, to_z), (to_d, to_d))
-            )
+            both = np.stack([to_z, to_d], axis=1)
+            seen = both @ pair @ both.conj().swapaxes(1, 2)
+            zz, dz, dd = seen[:, 0, 0], seen[:, 1, 0], seen[:, 1, 1]
             power = np.abs(regressor) ** 2 * zz.real
             total = averages @ power
             delta = float(averages @ (dz * regressor.conj()).real / total)

@@ -249,7 +249,7 @@ class SpectralModel:
             L⁻¹G and L⁻¹GC.
         """
         unit = self.force_unit * point.colour[:, None, None, :]
-        return Sides(whitened / unit, response.conj() @ point.H.swapaxes(2, 3))
+        return Sides(whitened * (1 / unit), response.conj() @ point.H.swapaxes(2, 3))
 
 
 @dataclass(frozen=True, slots=True)

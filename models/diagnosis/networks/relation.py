@@ -37,7 +37,9 @@ class Network:
 
     def __call__(self, inputs: FloatArray) -> FloatArray:
         """Output for each row of inputs, shape (…, n_rows)."""
-        hidden = np.tanh(inputs / self.input_scale @ self.W1 + self.b1)
+        hidden = inputs / self.input_scale @ self.W1
+        hidden += self.b1
+        np.tanh(hidden, out=hidden)
         return np.asarray(hidden @ self.W2 + self.b2[0], dtype=np.float64)
 
 
