@@ -11,7 +11,7 @@ from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.orbit import in_planes
 from service.analysis.past import Past
-from service.analysis.recorded import Recorded, begins_again
+from service.analysis.recorded import Sampled, begins_again
 from service.analysis.revolutions import newest_revolutions
 
 _MOST_POINTS = 400
@@ -60,7 +60,7 @@ def past_centreline(data: Past, pairs: Sequence[tuple[Channel, Channel]]) -> Cen
     )
 
 
-def read_centreline(data: Recorded, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:
+def read_centreline(data: Sampled, pairs: Sequence[tuple[Channel, Channel]], each_s: float) -> Centreline:
     """Means over every so many seconds; in long recordings over longer ones.
 
     Raises

@@ -1,5 +1,7 @@
 """What the history of a monitor holds of one machine: reports, each with the levels of its window."""
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,7 @@ from service.settings.service import load_settings
 
 _TIMEOUT_S = 5.0
 _MOST = 2000
+_LATEST_NS = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +36,26 @@ class Past(Described):
     def descriptor(self) -> ChannelDescriptor:
         """Names and units of the channels, as the machine file has them now."""
         return self.machine.descriptor
+
+    @classmethod
+    def of(cls, machine: MachineFile, log: ReportLog, since_ns: int | None, until_ns: int | None, most: int) -> "Past":
+        """Read the history of a machine that is being monitored, without its alarms.
+
+        Parameters
+        ----------
+        most : int
+            Every so many reports, if there are more.
+
+        Raises
+        ------
+        RotorwatchError
+            If there are no reports.
+        """
+        reports = _parsed(log.texts(since_ns or 0, _LATEST_NS if until_ns is None else until_ns, most))
+        name = f"{machine.site}/{machine.name}"
+        if not reports:
+            raise RotorwatchError(f"{name}: no reports in this stretch of time")
+        return cls(machine, name, "the history", reports, ())
 
     @classmethod
     def find(cls, settings: Path, key: str | None, between: tuple[str | None, str | None]) -> "Past":
@@ -71,10 +94,9 @@ class Past(Described):
                 for text, other, option in zip(between, (first, last + 1), ("--from", "--to"), strict=True)
             )
             alarms = AlarmLog(database).since(machine.site, machine.name, 0)
-            found = [_parsed(text) for text in log.texts(since, until, _MOST)]
+            reports = _parsed(log.texts(since, until, _MOST))
         finally:
             database.stop()
-        reports = tuple(report for report in found if report is not None)
         if not reports:
             raise RotorwatchError(f"{settings}: no reports of {name} in this stretch of time")
         return cls(
@@ -82,8 +104,9 @@ class Past(Described):
         )
 
 
-def _parsed(text: str) -> Report | None:
-    try:
-        return Report.model_validate_json(text)
-    except ValidationError:
-        return None  # of another version of the program
+def _parsed(texts: Iterable[str]) -> tuple[Report, ...]:
+    found = []
+    for text in texts:
+        with suppress(ValidationError):  # of another version of the program
+            found.append(Report.model_validate_json(text))
+    return tuple(found)

@@ -79,7 +79,30 @@ class Described(ABC):
         return found
 
 
-class Recorded(Described):
+class Sampled(Described):
+    """Samples of one machine over a stretch of time."""
+
+    from_ns: int
+    to_ns: int
+
+    @abstractmethod
+    def stretches(
+        self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
+    ) -> Iterator[Excerpt]:
+        """Samples of some channels, cut at gaps and after `longest_s`; what is left before a gap is shorter.
+
+        Parameters
+        ----------
+        longest_s : float, optional
+            Length of a stretch, s; without it only gaps cut.
+        """
+
+    @abstractmethod
+    def latest(self, channels: Sequence[Channel], length_s: float) -> list[Excerpt]:
+        """The newest `length_s` of data, in pieces if there are gaps."""
+
+
+class Recorded(Sampled):
     """Recorded data of one machine.
 
     Parameters
@@ -160,14 +183,9 @@ class Recorded(Described):
     def stretches(
         self, channels: Sequence[Channel], longest_s: float | None = None, from_ns: int | None = None
     ) -> Iterator[Excerpt]:
-        """Samples of some channels, cut at gaps and after `longest_s`; what is left before a gap is shorter.
+        """Samples of some channels, see `Sampled`.
 
         Blocks that cannot be decoded, have other channels or a sample that is not finite are left out, which is a gap.
-
-        Parameters
-        ----------
-        longest_s : float, optional
-            Length of a stretch, s; without it only gaps cut.
         """
         names = [channel.name for channel in self.descriptor.channels]
         columns = [names.index(channel.name) for channel in channels]

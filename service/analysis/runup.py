@@ -10,7 +10,7 @@ from models.levels.measures import ORDERS
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
 from service.analysis.past import Past
-from service.analysis.recorded import Recorded
+from service.analysis.recorded import Sampled
 from service.analysis.spectrum import shown_as, steady, unit_shown
 from service.analysis.vectors import estimated_vectors, read_vectors
 
@@ -86,7 +86,7 @@ def past_run_up(data: Past, channels: tuple[Channel, ...], order: int) -> RunUp:
 
 
 def read_run_up(
-    data: Recorded,
+    data: Sampled,
     channels: tuple[Channel, ...],
     order: int,
     revolutions: int,

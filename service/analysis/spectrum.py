@@ -11,7 +11,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.signals.block import FloatArray
 from models.signals.channels import Channel, Quantity
 from service.analysis.orbit import in_planes
-from service.analysis.recorded import Recorded, begins_again
+from service.analysis.recorded import Sampled, begins_again
 from service.analysis.revolutions import Excerpt
 
 _MOST_SPECTRA = 400
@@ -161,7 +161,7 @@ def steady(speed_rad_s: FloatArray) -> str:
 
 
 def read_spectrum(
-    data: Recorded, channels: tuple[Channel, ...], window_s: float, resolution_hz: float, scaling: Scaling
+    data: Sampled, channels: tuple[Channel, ...], window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Spectrum:
     """Spectra of the latest `window_s` of a recorded stream; segments never reach across a gap.
 
@@ -192,7 +192,7 @@ def read_spectrum(
     )
 
 
-def _used(data: Recorded, channels: Sequence[Channel], window_s: float, segment: int) -> tuple[list[Excerpt], float]:
+def _used(data: Sampled, channels: Sequence[Channel], window_s: float, segment: int) -> tuple[list[Excerpt], float]:
     """Stretches of the latest `window_s` that hold a segment, and their mean speed."""
     found = data.latest(channels, window_s)
     used = [stretch for stretch in found if stretch.samples.shape[0] >= segment]
@@ -209,7 +209,7 @@ def _used(data: Recorded, channels: Sequence[Channel], window_s: float, segment:
 
 
 def read_full_spectrum(
-    data: Recorded, pairs: Sequence[tuple[Channel, Channel]], window_s: float, resolution_hz: float, *, orders: bool
+    data: Sampled, pairs: Sequence[tuple[Channel, Channel]], window_s: float, resolution_hz: float, *, orders: bool
 ) -> FullSpectrum:
     """Full spectra of the latest `window_s` that were recorded; segments never reach across a gap.
 
@@ -273,7 +273,7 @@ def _at_equal_angles(stretch: Excerpt, each: int) -> Excerpt:
 
 
 def read_waterfall(
-    data: Recorded, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
+    data: Sampled, channel: Channel, window_s: float, resolution_hz: float, scaling: Scaling
 ) -> Waterfall:
     """Spectra of one channel over a recorded data, one per window; in long recordings over longer windows.
 
@@ -376,7 +376,7 @@ def _values(power: FloatArray, channel: Channel, scaling: Scaling) -> FloatArray
     return factor * (np.sqrt(power) if scaling == "amplitude" else power)
 
 
-def _segment(data: Recorded, window_s: float, resolution_hz: float) -> int:
+def _segment(data: Sampled, window_s: float, resolution_hz: float) -> int:
     """Samples of a segment, even."""
     rate_hz = data.descriptor.rate_hz
     segment = 2 * round(rate_hz / resolution_hz / 2)

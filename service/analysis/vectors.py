@@ -12,7 +12,7 @@ from models.errors import MachineFileError, RotorwatchError
 from models.levels.measures import ORDERS, hop_levels, level_plan
 from models.signals.block import FloatArray
 from models.signals.channels import Channel
-from service.analysis.recorded import Recorded, begins_again
+from service.analysis.recorded import Sampled, begins_again
 from service.analysis.revolutions import Excerpt, pulses
 
 _LONGEST_S = 20.0
@@ -68,7 +68,7 @@ def vectors_of(excerpt: Excerpt, channels: Sequence[Channel], revolutions: int) 
     )
 
 
-def read_vectors(data: Recorded, channels: Sequence[Channel], revolutions: int) -> Vectors:
+def read_vectors(data: Sampled, channels: Sequence[Channel], revolutions: int) -> Vectors:
     """Vectors of everything that was recorded, each of so many revolutions.
 
     Raises
@@ -92,7 +92,7 @@ def read_vectors(data: Recorded, channels: Sequence[Channel], revolutions: int) 
     return found
 
 
-def estimated_vectors(data: Recorded, channels: Sequence[Channel], between_rad_s: tuple[float, float]) -> Vectors:
+def estimated_vectors(data: Sampled, channels: Sequence[Channel], between_rad_s: tuple[float, float]) -> Vectors:
     """Vectors against an angle that is found in the vibration itself: their phase means nothing.
 
     Only where the strongest line between two speeds stands out clearly, and follows from the one before or goes on in

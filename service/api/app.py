@@ -20,6 +20,7 @@ from service.api.routes.events import add_event_routes
 from service.api.routes.history import add_history_routes
 from service.api.routes.operations import add_operation_routes
 from service.api.routes.page import add_page_routes
+from service.api.routes.plots import add_plot_routes
 from service.api.routes.recordings import add_recording_routes
 from service.api.routes.replays import add_replay_routes
 from service.api.routes.service import add_service_routes
@@ -37,7 +38,10 @@ _TAGS = [
     {"name": "machines", "description": "What is monitored, and how it stands."},
     {"name": "alarms", "description": "What needs attention, and what operators do about it."},
     {"name": "history", "description": "What has happened and was read, and who asked for what."},
-    {"name": "snapshots", "description": "What the monitor holds now: correlations, spectra, orbits."},
+    {
+        "name": "snapshots",
+        "description": "What the monitor holds now: correlations, spectra, orbits; and the values of plots.",
+    },
     {"name": "events", "description": "What happens, as it happens."},
     {"name": "recordings", "description": "Recorded streams."},
     {"name": "replays", "description": "Recordings sent through a monitor of their own, apart from what is live."},
@@ -91,6 +95,7 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     add_history_routes(app, service, guard)
     add_operation_routes(app, service, guard)
     add_snapshot_routes(app, service, guard)
+    add_plot_routes(app, service, guard)
     add_event_routes(app, service, guard)
     add_recording_routes(app, service.catalogue, guard)
     add_replay_routes(app, service.replays, guard)

@@ -14,7 +14,7 @@ from rotorwatch.records.history import Reading, ReadingBucket
 from service.history.claim import Claim, pack, unpack
 from service.history.database import Database
 from service.history.records import Checkpoint, CheckpointHead, Step, StoredEvent, StoredReport, StoreError
-from service.history.shared import EVENT
+from service.history.shared import EVENT, ReportLog
 from service.history.tables import alarm_events, checkpoint_parts, checkpoints, evidence, reports, series, windows
 from service.history.trend import trend
 from service.history.windows import READING, unpacked
@@ -68,6 +68,11 @@ class MachineStore:
     def news(self) -> str:
         """What happened to the file then."""
         return self._database.news
+
+    @property
+    def report_log(self) -> ReportLog:
+        """The reports as others read them, who do not write."""
+        return ReportLog(self._database, *self.title.split("/"))
 
     def go_on_from(self, sequence: int) -> None:
         """Number the next alarm event after this one, where the log of a file that was begun anew has fewer."""

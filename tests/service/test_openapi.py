@@ -58,6 +58,9 @@ DEPENDENT = {
     "GET /api/v1/machines/{site}/{machine}/correlations",
     "GET /api/v1/machines/{site}/{machine}/readings",
     "GET /api/v1/machines/{site}/{machine}/spectra",
+    "GET /api/v1/machines/{site}/{machine}/vectors",
+    "GET /api/v1/machines/{site}/{machine}/waterfalls",
+    "GET /api/v1/machines/{site}/{machine}/waveforms",
     "POST /api/v1/replays",
     "POST /api/v1/tokens",
 }

@@ -1,0 +1,188 @@
+"""Values of the plots of a machine: its newest samples, and what was over time or speed.
+
+They come from the newest samples a monitor holds, from its history, or from recordings; `source` says which. Phase is
+the lag from the phase reference's mark to the positive peak, as API 670 and ISO 13373-2 have it. Numbers have six
+significant digits; null stands for what is not known.
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
+
+_Series = tuple[float | None, ...]
+
+_Source = Annotated[
+    Literal["newest samples", "history", "recordings"],
+    Field(description="where the values come from", examples=["newest samples"]),
+]
+
+_Reason = Annotated[str, Field(description="why there is nothing, or less than asked for; else empty", examples=[""])]
+
+_StartNs = Annotated[
+    int | None, Field(description="time of the oldest data in it; null without", examples=[EXAMPLE_NS - 400_000_000])
+]
+
+_EndNs = Annotated[int | None, Field(description="end of the newest data in it", examples=[EXAMPLE_NS])]
+
+_Speed = Annotated[
+    float | None,
+    Field(description="mean speed, negative where the shaft turns from z to y; null if not known", examples=[138.23]),
+]
+
+_Speeds = Annotated[
+    _Series,
+    Field(description="speed of each, negative where the shaft turns from z to y", examples=[(62.8, 94.2, 138.23)]),
+]
+
+_Times = Annotated[
+    tuple[int, ...],
+    Field(description="time of each", examples=[(EXAMPLE_NS - 2_000_000_000, EXAMPLE_NS - 1_000_000_000, EXAMPLE_NS)]),
+]
+
+_Location = Annotated[str, Field(description="place of two displacements", examples=["bearing"])]
+
+
+class ChannelWaveform(Record):
+    """The newest samples of one channel about their mean; n_samples values."""
+
+    channel: str = Field(description="name of the channel", examples=["y1"])
+    unit: str = Field(description="unit of the values", examples=["µm"])
+    mean: float | None = Field(description="mean that was taken away", examples=[0.12])
+    values: _Series = Field(description="samples less their mean", examples=[(3.2, 4.1)])
+
+
+class WaveformSnapshot(Record):
+    """The newest whole revolutions, channel by channel."""
+
+    site: Site
+    machine: Name
+    source: _Source
+    start_ns: _StartNs = None
+    end_ns: _EndNs = None
+    speed_rad_s: _Speed = None
+    revolutions: int = Field(default=0, description="whole revolutions; 0 where none can be told", examples=[8])
+    times_s: tuple[float, ...] = Field(
+        default=(), description="time of each sample after `start_ns`", examples=[(0.0, 0.0005)]
+    )
+    pulses_s: tuple[float, ...] = Field(
+        default=(),
+        description="when the shaft angle was 0, after `start_ns`; empty without a phase reference",
+        examples=[(0.0, 0.0455)],
+    )
+    waveforms: tuple[ChannelWaveform, ...] = Field(default=(), description="channel by channel")
+    reason: _Reason = ""
+
+
+class PlaceSpectrum(Record):
+    """Circles that the shaft's motion at one place adds up to; n_lines values."""
+
+    location: _Location
+    channels: tuple[str, ...] = Field(description="the two channels", examples=[("y1", "z1")])
+    unit: str = Field(description="unit of the diameters", examples=["µm p-p"])
+    values: _Series = Field(description="diameter of the circle of each line", examples=[(0.8, 0.3, 7.4)])
+
+
+class FullSpectrumSnapshot(Record):
+    """Full spectra: what goes round with the rotation, and what against it."""
+
+    site: Site
+    machine: Name
+    source: _Source
+    start_ns: _StartNs = None
+    end_ns: _EndNs = None
+    speed_rad_s: _Speed = None
+    frequencies_hz: tuple[float, ...] = Field(
+        default=(),
+        description="n_lines values; positive is forward precession, or from y to z where the rotation is not known",
+        examples=[(-22.0, 0.0, 22.0)],
+    )
+    resolution_hz: float | None = Field(default=None, description="distance of the lines; null without", examples=[1.0])
+    averages: int = Field(default=0, description="half-overlapping Hann segments that were averaged", examples=[19])
+    places: tuple[PlaceSpectrum, ...] = Field(default=(), description="place by place")
+    reason: _Reason = ""
+
+
+class WaterfallRow(Record):
+    """One spectrum of a waterfall; n_bins values."""
+
+    start_ns: int | None = Field(
+        description="oldest data in it; null over speed", examples=[EXAMPLE_NS - 1_000_000_000]
+    )
+    end_ns: int | None = Field(description="end of the newest; null over speed", examples=[EXAMPLE_NS])
+    speed_rad_s: _Speed = None
+    values: _Series = Field(description="amplitudes in `unit`", examples=[(0.8, 7.4)])
+
+
+class WaterfallSnapshot(Record):
+    """Spectra of one channel over time or speed."""
+
+    site: Site
+    machine: Name
+    source: _Source
+    start_ns: _StartNs = None
+    end_ns: _EndNs = None
+    channel: str = Field(default="", description="name of the channel; empty without one", examples=["y1"])
+    unit: str = Field(default="", description="unit of the amplitudes", examples=["µm p-p"])
+    over: Literal["time", "speed"] = Field(description="what the rows go over", examples=["time"])
+    frequencies_hz: tuple[float, ...] = Field(default=(), description="n_bins values", examples=[(20.0, 22.0)])
+    resolution_hz: float | None = Field(default=None, description="distance of the lines; null without", examples=[2.0])
+    rows: tuple[WaterfallRow, ...] = Field(default=(), description="the oldest, or slowest, first")
+    reason: _Reason = ""
+
+
+class ChannelVectors(Record):
+    """Vectors of one channel at an order of running speed; n values."""
+
+    channel: str = Field(description="name of the channel", examples=["y1"])
+    unit: str = Field(description="unit of the amplitudes", examples=["µm p-p"])
+    amplitude: _Series = Field(description="amplitude", examples=[(4.1, 9.8, 16.2)])
+    phase_lag_deg: _Series = Field(description="phase lag, 0 to 360°", examples=[(12.0, 15.5, 21.3)])
+
+
+class VectorSeries(Record):
+    """Vectors at an order of running speed over time and speed: what Bode and polar plots show."""
+
+    site: Site
+    machine: Name
+    source: _Source
+    order: int = Field(description="multiple of running speed", examples=[1])
+    revolutions: int | None = Field(
+        default=None, description="that each vector is of; null where it is of a window of the monitor", examples=[None]
+    )
+    slow_roll_rpm: float | None = Field(
+        default=None,
+        description="the mean vector up to this speed was taken away; null if nothing was",
+        examples=[None],
+    )
+    times_ns: _Times = ()
+    speeds_rad_s: _Speeds = ()
+    channels: tuple[ChannelVectors, ...] = Field(default=(), description="channel by channel")
+    steady: str = Field(
+        default="",
+        description="that the speeds are nearly the same, so that a Bode plot shows little; else empty",
+        examples=[""],
+    )
+    reason: _Reason = ""
+
+
+class PlaceCentreline(Record):
+    """Mean positions of the shaft at one place; n values."""
+
+    location: _Location
+    channels: tuple[str, ...] = Field(description="the two channels", examples=[("y1", "z1")])
+    y_um: _Series = Field(description="position along y, µm", examples=[(0.0, 1.1, 2.3)])
+    z_um: _Series = Field(description="position along z, µm", examples=[(0.0, 4.2, 8.9)])
+
+
+class CentrelineSeries(Record):
+    """Where the shaft was on average, over time and speed (API 670: average shaft centreline)."""
+
+    site: Site
+    machine: Name
+    source: _Source
+    times_ns: _Times = ()
+    speeds_rad_s: _Speeds = ()
+    places: tuple[PlaceCentreline, ...] = Field(default=(), description="place by place")
+    reason: _Reason = ""

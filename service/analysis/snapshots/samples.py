@@ -1,0 +1,184 @@
+"""Values of the plots of samples: waveforms, full spectra, and spectra over time or speed."""
+
+from typing import Literal, TypedDict
+
+import numpy as np
+
+from models.errors import RotorwatchError
+from models.signals.block import FloatArray
+from models.signals.channels import Channel
+from rotorwatch.records.plots import (
+    ChannelWaveform,
+    FullSpectrumSnapshot,
+    PlaceSpectrum,
+    WaterfallRow,
+    WaterfallSnapshot,
+    WaveformSnapshot,
+)
+from service.analysis.orbit import recorded_pairs
+from service.analysis.recorded import Described, Recorded, Sampled
+from service.analysis.revolutions import Excerpt, newest_revolutions
+from service.analysis.snapshots.channels import figures
+from service.analysis.spectrum import lowest_hz, read_full_spectrum, read_waterfall, shown_as, steady, unit_shown
+
+_MOST_SAMPLES = 20_000
+_SOON_S = 10.0
+_WITHOUT_SPEED_S = 0.5
+_FULL_S, _FULL_HZ = 10.0, 1.0
+_MOST_ROWS, _MOST_LINES = 60, 400
+_ROW_S = 0.5
+_UM = "µm p-p"
+
+Source = Literal["newest samples", "history", "recordings"]
+
+
+def source_of(data: Sampled) -> Source:
+    """What values made of some samples come from."""
+    return "recordings" if isinstance(data, Recorded) else "newest samples"
+
+
+def waveform_snapshot(
+    data: Sampled, channels: tuple[Channel, ...], revolutions: int, speed_rad_s: float | None
+) -> WaveformSnapshot:
+    """The newest whole revolutions of some channels, with the phase reference's pulses.
+
+    Parameters
+    ----------
+    speed_rad_s : float or None
+        Mean speed: how long revolutions are where there is no shaft angle.
+    """
+    excerpt = data.latest(channels, _SOON_S)[-1]
+    found = newest_revolutions(excerpt, revolutions, speed_rad_s, _MOST_SAMPLES)
+    shown = found.excerpt or _newest(excerpt)
+    speed = figures([shown.speed_rad_s if np.isfinite(shown.speed_rad_s) else speed_rad_s or np.nan])[0]
+    return WaveformSnapshot(
+        **whose(data, source_of(data)),
+        start_ns=shown.start_ns,
+        end_ns=shown.end_ns,
+        speed_rad_s=speed,
+        revolutions=found.count,
+        times_s=_known(np.arange(shown.samples.shape[0]) / shown.rate_hz),
+        pulses_s=_known(found.pulses / shown.rate_hz),
+        waveforms=tuple(
+            ChannelWaveform(
+                channel=channel.name,
+                unit=unit_shown(channel)[0],
+                mean=figures([unit_shown(channel)[1] * column.mean()])[0],
+                values=figures(unit_shown(channel)[1] * (column - column.mean())),
+            )
+            for channel, column in zip(channels, shown.samples.T, strict=True)
+        ),
+        reason=found.reason,
+    )
+
+
+def full_spectrum_snapshot(data: Sampled) -> FullSpectrumSnapshot:
+    """Full spectra of the newest seconds at every place where displacements are measured in both directions.
+
+    Raises
+    ------
+    RotorwatchError
+        If there is no such place, or too few samples.
+    """
+    resolution_hz = min(_FULL_HZ, data.descriptor.rate_hz / 16)
+    found = read_full_spectrum(data, recorded_pairs(data), _FULL_S, resolution_hz, orders=False)
+    lines = np.abs(found.lines) <= found.useful
+    clear = np.abs(found.lines) >= lowest_hz(found.resolution) * (1 - 1e-9)
+    values = np.where(clear, found.values_um, np.nan)[:, lines]
+    group = -(-values.shape[1] // (2 * _MOST_LINES))
+    return FullSpectrumSnapshot(
+        **whose(data, source_of(data)),
+        start_ns=found.start_ns,
+        end_ns=found.end_ns,
+        speed_rad_s=figures([found.speed_rad_s])[0],
+        frequencies_hz=_known(_grouped(found.lines[lines], group).mean(axis=-1)),
+        resolution_hz=found.resolution * group,
+        averages=found.averages,
+        places=tuple(
+            PlaceSpectrum(
+                location=pair[0].location,
+                channels=tuple(one.name for one in pair),
+                unit=_UM,
+                values=figures(_highest(row, group)),
+            )
+            for pair, row in zip(found.pairs, values, strict=True)
+        ),
+    )
+
+
+def waterfall_snapshot(data: Sampled, channel: Channel, over: Literal["time", "speed"]) -> WaterfallSnapshot:
+    """Amplitude spectra of one channel, one after the other; where there are many lines the largest of neighbours.
+
+    Raises
+    ------
+    RotorwatchError
+        If there are too few samples, or over speed if that is not known or does not change.
+    """
+    rate_hz = data.descriptor.rate_hz
+    if over == "speed" and not data.has_angle:
+        raise RotorwatchError("spectra over speed need the shaft angle (keyphasor), which is not measured")
+    row_s = max(_ROW_S, (data.to_ns - data.from_ns) / 1e9 / _MOST_ROWS, 16 / rate_hz)
+    found = read_waterfall(data, channel, row_s, max(1 / row_s, 1.0 if row_s > 1 else 0.0), "amplitude")
+    if over == "speed":
+        if text := steady(found.speed_rad_s):
+            raise RotorwatchError(f"spectra over speed need a run-up or coast-down: {text}")
+        edges, mean = found.over_speed()
+        times = [(None, None)] * len(mean)
+        speeds, values = (edges[1:] + edges[:-1]) / 2, mean
+    else:
+        times = list(zip(found.start_ns.tolist(), found.end_ns.tolist(), strict=True))
+        speeds, values = found.speed_rad_s, found.values
+    lines = (found.frequencies_hz >= lowest_hz(found.resolution_hz)) & (found.frequencies_hz <= found.useful_hz)
+    group = -(-int(lines.sum()) // _MOST_LINES) or 1
+    return WaterfallSnapshot(
+        **whose(data, source_of(data)),
+        start_ns=int(found.start_ns[0]),
+        end_ns=int(found.end_ns[-1]),
+        channel=channel.name,
+        unit=shown_as(channel, "amplitude")[0],
+        over=over,
+        frequencies_hz=_known(_grouped(found.frequencies_hz[lines], group).mean(axis=-1)),
+        resolution_hz=found.resolution_hz * group,
+        rows=tuple(
+            WaterfallRow(
+                start_ns=start_ns,
+                end_ns=end_ns,
+                speed_rad_s=figures([speed])[0],
+                values=figures(_highest(row[lines], group)),
+            )
+            for (start_ns, end_ns), speed, row in zip(times, speeds, values, strict=True)
+            if np.isfinite(row).all()
+        ),
+    )
+
+
+class Whose(TypedDict):
+    """First fields of values of a plot."""
+
+    site: str
+    machine: str
+    source: Source
+
+
+def whose(data: Described, source: Source) -> Whose:
+    """Whose values they are, and what they come from."""
+    site, machine = data.name.split("/")
+    return {"site": site, "machine": machine, "source": source}
+
+
+def _newest(excerpt: Excerpt) -> Excerpt:
+    size = excerpt.samples.shape[0]
+    return excerpt.part(max(0, size - min(_MOST_SAMPLES, round(_WITHOUT_SPEED_S * excerpt.rate_hz))), size)
+
+
+def _known(values: FloatArray) -> tuple[float, ...]:
+    return tuple(one for one in figures(values) if one is not None)
+
+
+def _grouped(values: FloatArray, group: int) -> FloatArray:
+    """Groups of neighbours, shape (n_groups, group); what is left at the end makes none."""
+    return values[: values.size // group * group].reshape(-1, group)
+
+
+def _highest(values: FloatArray, group: int) -> FloatArray:
+    return np.asarray(_grouped(values, group).max(axis=-1), dtype=np.float64)
