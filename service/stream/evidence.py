@@ -3,6 +3,7 @@
 An alarm can then be understood long after its window is gone. Nothing of this decides anything.
 """
 
+from models.alarm_names import alarm_kind
 from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.history import AlarmEvidence, Picture
@@ -33,9 +34,7 @@ class EvidenceCollector:
         try:
             if self._looked_ns is None and (text := self._worker.history.evidence(_BEFORE)):
                 self._before = Picture.model_validate_json(text)
-            raised = {
-                (alarm.name, alarm.occurrence): alarm for alarm in health.alarms if alarm.raised and alarm.evidence
-            }
+            raised = {(one.name, one.occurrence): one for one in health.alarms if _rests_on_a_window(one)}
             self._standing = {key: kept for key, kept in self._standing.items() if key in raised}
             for (name, occurrence), alarm in raised.items():
                 self._keep(name, occurrence, alarm, report)
@@ -74,6 +73,10 @@ class EvidenceCollector:
     def _picture(self, report: Report) -> Picture:
         latest, snapshots = self._worker.latest, self._worker.snapshots
         return Picture(report=report, spectra=snapshots.spectra(latest), orbits=snapshots.orbits(latest))
+
+
+def _rests_on_a_window(alarm: Alarm) -> bool:
+    return alarm.raised and alarm.evidence is not None and alarm_kind(alarm.name).about == "machine"
 
 
 def _is_calm(health: Health, report: Report) -> bool:

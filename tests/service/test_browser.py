@@ -239,6 +239,18 @@ def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
         expect(row).to_contain_text("I was first")
         row.get_by_role("button", name="Unshelve").click()
         expect(row.get_by_role("button", name="Unshelve")).to_have_count(0)
+        page.unroute("**/shelve")
+        page.get_by_label("Order").select_option("first-out")
+        expect(page.locator("alarm-list tbody tr")).to_have_text([re.compile("k_by"), re.compile("stream-lost")])
+        assert page.locator("alarm-list").get_by_role("link", name="Why?").count() == 1  # no window lost the stream
+        for box in page.locator("alarm-list").get_by_role("checkbox").all():
+            box.check()
+        kept(page, "alarms-chosen")
+        page.get_by_role("button", name="Shelve … (2)").click()
+        page.get_by_label("Reason").fill("the whole plant is down")
+        page.get_by_role("dialog").get_by_role("button", name="Shelve").click()
+        told = re.compile("bearing stiffness.*: shelve done.* stream.*: shelve done")
+        expect(page.locator("alarm-list [role=status]")).to_contain_text(told)
         page.route("**/caller", lambda route: route.fulfill(json={"name": "viewer", "scopes": ["read"]}))
         page.reload()
         expect(row).to_be_visible()

@@ -2,7 +2,7 @@ import { clock } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { whyOf } from "./alarm-list.js";
+import { why } from "./alarm-list.js";
 import "../elements/state-mark.js";
 
 const PAGE = 50;
@@ -47,7 +47,7 @@ class AlarmHistory extends MachineElement {
       cells: [
         html("time", { class: "number" }, clock(one.time_ns)),
         html("span", {}, one.kind),
-        html("span", {}, one.text, " ", one.evidence && one.kind === "raised" && html("a", { href: whyOf(this.place, one) }, "Why?")),
+        html("span", {}, one.text, " ", one.kind === "raised" && why(this.place, one)),
         html("span", {}, one.actor || "monitor"),
         html("span", {}, one.reason || one.note),
       ],

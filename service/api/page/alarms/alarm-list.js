@@ -1,7 +1,7 @@
 import { clock, interval, percent } from "../monitor/figures.js";
-import { html, table } from "../elements/markup.js";
+import { html, lay, table } from "../elements/markup.js";
 import { monitor, Refused } from "../monitor/monitor.js";
-import { byUrgency, UNSEEN } from "../monitor/states.js";
+import { byUrgency, ofMachine, UNSEEN } from "../monitor/states.js";
 import { ordered } from "./alarm-order.js";
 import "../elements/state-mark.js";
 
@@ -18,8 +18,14 @@ function known(alarm) {
   return [size, alarm.note].filter(Boolean).join("; ");
 }
 
-/** Where it is said what an alarm rests on. @param {string} place @param {{name: string, occurrence: number}} alarm */
-export const whyOf = (place, { name, occurrence }) => `#/why/${place}/${encodeURIComponent(name)}/${occurrence}`;
+/** @param {Placed} one */
+const keyOf = ({ place, alarm }) => `${place} ${alarm.name}`;
+
+/** When its condition began. @param {Alarm} alarm */
+const came = (alarm) => alarm.raised_ns ?? alarm.since_ns;
+
+/** To what an alarm rests on; nothing for those that no window decides. @param {string} place @param {{name: string, occurrence: number, evidence: unknown}} alarm */
+export const why = (place, { name, occurrence, evidence }) => evidence && ofMachine({ name }) ? html("a", { href: `#/why/${place}/${encodeURIComponent(name)}/${occurrence}` }, "Why?") : null;
 
 /** What can be done to an alarm as it is: the order, the button, and the scope that takes. @param {Alarm} alarm @returns {[string, string, string, boolean][]} */
 function operations(alarm) {
@@ -42,6 +48,10 @@ class AlarmList extends HTMLElement {
   #said = "";
   #message = html("p", { role: "status", class: "message" });
   #rows = html("div");
+  #order = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Order", change: () => this.#show() }, html("option", { value: "" }, "most urgent first"), html("option", { value: "first-out" }, "first out: in the order they came")));
+  #together = html("div", { class: "tools" });
+  /** @type {Set<string>} alarms that something is to be done to together */
+  #chosen = new Set();
 
   connectedCallback() {
     this.#gone = new AbortController();
@@ -49,7 +59,7 @@ class AlarmList extends HTMLElement {
     const heard = { signal: this.#gone.signal };
     monitor.addEventListener(place ? `health:${place}` : "health", () => this.#show(), heard);
     monitor.addEventListener("connection", () => this.#show(), heard);
-    this.replaceChildren(this.#message, this.#rows);
+    lay(this, this.#message, !this.hasAttribute("alarm") && this.#together, this.#rows);
     this.#said = "";
     this.#show();
   }
@@ -64,15 +74,16 @@ class AlarmList extends HTMLElement {
     return [...monitor.machines]
       .filter(([place]) => !only || place === only)
       .flatMap(([place, { health }]) => health.alarms.filter((alarm) => !name || alarm.name === name).map((alarm) => ({ place, alarm })))
-      .sort((one, other) => byUrgency(one.alarm, other.alarm));
+      .sort((one, other) => (this.#order.value ? came(one.alarm) - came(other.alarm) : byUrgency(one.alarm, other.alarm)));
   }
 
   /** Only if something has changed: whoever is about to press a button shall not miss it. */
   #show() {
     const all = this.#alarms();
-    const said = JSON.stringify([all.map(({ place, alarm }) => [place, { ...alarm, evidence: null }]), monitor.caller?.scopes]);
+    const said = JSON.stringify([all.map(({ place, alarm }) => [place, { ...alarm, evidence: null }]), monitor.caller?.scopes, this.#order.value, [...this.#chosen]]);
     if (said === this.#said) return;
     this.#said = said;
+    this.#offer(all);
     const focused = document.activeElement instanceof HTMLElement ? document.activeElement.dataset.order : undefined;
     const rows = all.map((one) => this.#row(one));
     const heads = ["alarm", "state", "since", "what is known", "actions"];
@@ -80,16 +91,39 @@ class AlarmList extends HTMLElement {
     if (focused) /** @type {HTMLElement | null} */ (this.#rows.querySelector(`[data-order="${CSS.escape(focused)}"]`))?.focus();
   }
 
+  /** What can be done to those that are chosen. @param {Placed[]} all */
+  #offer(all) {
+    const chosen = all.filter((one) => this.#chosen.has(keyOf(one)));
+    const orders = new Map(chosen.flatMap(({ alarm }) => operations(alarm).map(([kind, text]) => [kind, text])));
+    lay(
+      this.#together,
+      all.length > 1 && this.#order,
+      ...[...orders].map(([kind, text]) => {
+        const able = chosen.filter(({ alarm }) => operations(alarm).some(([one]) => one === kind));
+        return html("button", { type: "button", "data-order": `chosen ${kind}`, click: () => this.#operate(able, kind) }, `${text} (${able.length})`);
+      }),
+    );
+  }
+
   /** @param {Placed} one */
-  #row({ place, alarm }) {
+  #row(one) {
+    const { place, alarm } = one;
+    const key = keyOf(one);
+    const choose = (/** @type {Event} */ { target }) => {
+      if (/** @type {HTMLInputElement} */ (target).checked) this.#chosen.add(key);
+      else this.#chosen.delete(key);
+      this.#show();
+    };
+    const several = !this.hasAttribute("alarm") && operations(alarm).length > 0;
+    const box = several && html("input", { type: "checkbox", "aria-label": `choose ${place}: ${alarm.text}`, checked: this.#chosen.has(key), "data-order": `choose ${key}`, change: choose });
     const machine = this.hasAttribute("place") ? null : html("a", { href: `#/machines/${place}` }, place);
     const buttons = operations(alarm).map(([kind, text]) =>
-      html("button", { type: "button", "data-order": `${place} ${alarm.name} ${kind}`, click: () => this.#operate(place, alarm, kind) }, text),
+      html("button", { type: "button", "data-order": `${place} ${alarm.name} ${kind}`, click: () => this.#operate([one], kind) }, text),
     );
     return {
       attributes: { class: [alarm.raised && alarm.severity, UNSEEN.has(alarm.state) && "unseen"].filter(Boolean).join(" ") || null },
       cells: [
-        html("div", {}, machine, html("b", {}, alarm.text), html("small", {}, ` ${alarm.name}`), !this.hasAttribute("alarm") && alarm.evidence && html("a", { href: whyOf(place, alarm) }, "Why?")),
+        html("div", {}, box, machine, html("b", {}, alarm.text), html("small", {}, ` ${alarm.name}`), !this.hasAttribute("alarm") && why(place, alarm)),
         html("div", { class: "states" }, alarm.raised && html("state-mark", { state: alarm.severity }), html("span", {}, alarm.pending ? "pending" : alarm.state)),
         html("time", { class: "number" }, clock(alarm.raised_ns ?? alarm.since_ns)),
         html("span", {}, known(alarm)),
@@ -98,16 +132,23 @@ class AlarmList extends HTMLElement {
     };
   }
 
-  /** @param {string} place @param {Alarm} alarm @param {string} kind */
-  async #operate(place, alarm, kind) {
-    const order = await ordered(kind, `${place}: ${alarm.text}`);
+  /** One after the other, each only if it still is as it is shown. @param {Placed[]} all @param {string} kind */
+  async #operate(all, kind) {
+    const order = await ordered(kind, all.map(({ place, alarm }) => `${place}: ${alarm.text}`).join("; "));
     if (!order) return;
-    try {
-      await monitor.operate(place, alarm, kind, order);
-      this.#message.textContent = `${place}: ${alarm.text}: ${kind} done.`;
-    } catch (error) {
-      this.#message.textContent = `Not done. ${error instanceof Refused ? error.message : String(error)}`;
+    const said = [];
+    for (const one of all) {
+      const what = `${one.place}: ${one.alarm.text}`;
+      try {
+        await monitor.operate(one.place, one.alarm, kind, order);
+        said.push(`${what}: ${kind} done.`);
+        this.#chosen.delete(keyOf(one));
+      } catch (error) {
+        said.push(`${what}: Not done. ${error instanceof Refused ? error.message : String(error)}`);
+      }
     }
+    this.#message.textContent = said.join(" ");
+    this.#show();
   }
 }
 

@@ -30,6 +30,9 @@ export const urgency = (state) => Object.keys(STATES).indexOf(state);
 /** Of alarms that somebody has to look at. */
 export const UNSEEN = new Set(["unacknowledged", "returned", "latched-unacknowledged"]);
 
+/** Whether an alarm says that something is wrong with the machine, not with its data or the monitor. @param {{name: string}} alarm */
+export const ofMachine = ({ name }) => !/^(stream|data|monitor)-/.test(name);
+
 /** Whether an alarm stands: operators are to see it. @param {Alarm} alarm */
 export const stands = (alarm) => alarm.raised || UNSEEN.has(alarm.state) || alarm.state.startsWith("latched");
 
@@ -104,7 +107,7 @@ function parameters(health) {
  */
 export function worst(health) {
   // Missing data hides nothing of the machine: what an alarm says of it comes before what one says of the data.
-  const rank = (/** @type {Alarm} */ one) => (/^(stream|data|monitor)-/.test(one.name) ? 2 : 0) + (one.severity === "danger" ? 0 : 1);
+  const rank = (/** @type {Alarm} */ one) => (ofMachine(one) ? 0 : 2) + (one.severity === "danger" ? 0 : 1);
   const alarm = health.alarms.filter((one) => one.raised).sort(byUrgency).sort((one, other) => rank(one) - rank(other))[0];
   const found = [...parameters(health), ...levels(health)].sort((one, other) => other.nearness - one.nearness);
   if (!alarm) return found[0] ?? null;
