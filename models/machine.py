@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, ValidationError, model_validator
 from models.alarm_names import ALARMS, LEVEL, is_alarm
 from models.errors import MachineFileError
 from models.levels.settings import LevelSettings
-from models.mistakes import checked, did_you_mean, read_toml
+from models.mistakes import changed, checked, did_you_mean, read_toml
 from models.physics.rotor import PARAMETERS, KnownRotor, RotorParameters
 from models.signals.channels import Channel, ChannelDescriptor, Quantity, Sensor
 from models.signals.keys import MachineKeys
@@ -471,8 +471,10 @@ def load_machine(name_or_path: str | Path) -> Machine:
     return checked(Machine, read_toml(path), path)
 
 
-def load_machine_file(name_or_path: str | Path) -> MachineFile:
+def load_machine_file(name_or_path: str | Path, changes: str = "") -> MachineFile:
     """Load a machine file, whatever is known of the machine; a `Machine` if all its parameters are.
+
+    TOML in `changes` goes over the file, see `models.mistakes.changed`.
 
     Raises
     ------
@@ -480,7 +482,7 @@ def load_machine_file(name_or_path: str | Path) -> MachineFile:
         Naming the file, the field, the value found and what was expected.
     """
     path = _path(name_or_path)
-    found = checked(MachineFile, read_toml(path), path)
+    found = checked(MachineFile, changed(read_toml(path), changes), path)
     if found.rotor is None or found.rotor.unknown or found.operation is None or found.condition is None:
         return found
     return Machine.model_validate(found.model_dump())
@@ -492,8 +494,6 @@ def _path(name_or_path: str | Path) -> Path:
         return _SHIPPED / f"{name_or_path}.toml"
     if not path.is_file():
         shipped = sorted(entry.stem for entry in _SHIPPED.glob("*.toml"))
-        known = [*shipped, *(entry.name for entry in path.parent.glob("*.toml"))]
-        raise MachineFileError(
-            f"{path}: no such machine file; shipped machines: {', '.join(shipped)}{did_you_mean(path.name, known)}"
-        )
+        hint = did_you_mean(path.name, [*shipped, *(entry.name for entry in path.parent.glob("*.toml"))])
+        raise MachineFileError(f"{path}: no such machine file; shipped machines: {', '.join(shipped)}{hint}")
     return path

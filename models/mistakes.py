@@ -67,6 +67,37 @@ def read_toml(path: Path) -> dict[str, object]:
         raise MachineFileError(f"{path}: {_unreadable(str(error), data.decode())}") from error
 
 
+def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
+    """The fields of a file with others over them: tables are gone into, everything else takes the place of what was.
+
+    Parameters
+    ----------
+    changes : str
+        TOML.
+
+    Raises
+    ------
+    MachineFileError
+        If it is not TOML.
+
+    Examples
+    --------
+    >>> changed({"alarms": {"gap_s": 1.0, "on_delay_s": 10.0}}, "alarms.on_delay_s = 60.0")
+    {'alarms': {'gap_s': 1.0, 'on_delay_s': 60.0}}
+    """
+
+    def over(below: object, above: object) -> object:
+        if not isinstance(below, dict) or not isinstance(above, dict):
+            return above
+        return below | {name: over(below.get(name), one) for name, one in above.items()}
+
+    try:
+        given = tomllib.loads(changes)
+    except tomllib.TOMLDecodeError as error:
+        raise MachineFileError(f"changes: {_unreadable(str(error), changes)}") from error
+    return {**fields, **{name: over(fields.get(name), one) for name, one in given.items()}}
+
+
 def checked(model: type[_Model], fields: object, place: object) -> _Model:
     """The fields of a file as the record they describe.
 

@@ -20,6 +20,13 @@ class RecordingEntry(Record):
     )
     kept_because: str = Field(description="which alarm keeps it beyond its time; empty if none", examples=[""])
     problem: str = Field(description="why it cannot be read; empty if it can", examples=[""])
+    data_start_ns: int | None = Field(
+        default=None,
+        description="time of the earliest data, which a replay may begin from; null if incomplete or damaged, and in a "
+        "list unless asked for with `data_times`",
+        examples=[1767225600000000000],
+    )
+    data_end_ns: int | None = Field(default=None, description="end of the latest data", examples=[1767225900000000000])
 
 
 class RecordingDetail(RecordingEntry):
@@ -28,11 +35,6 @@ class RecordingDetail(RecordingEntry):
     keys: dict[str, int] = Field(
         description="messages by key; empty if incomplete or damaged", examples=[{"rotorwatch/demo/lab/stream": 3000}]
     )
-    data_start_ns: int | None = Field(
-        description="time of the earliest data, which a replay may begin from; null if incomplete or damaged",
-        examples=[1767225600000000000],
-    )
-    data_end_ns: int | None = Field(description="end of the latest data", examples=[1767225900000000000])
 
 
 class RecordingList(Record):

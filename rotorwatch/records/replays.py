@@ -1,6 +1,6 @@
 """Replays: how one is asked for, how far one is, what it found."""
 
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -19,6 +19,14 @@ class ReplayProgress(Record):
     alarms: int = Field(description="alarm events so far; 0 if the replay only publishes", examples=[1])
     pass_number: int = Field(description="which repetition this is, from 1", examples=[1])
     paused: bool = Field(description="whether the replay is paused", examples=[False])
+
+
+class ParameterLimits(Record):
+    """Limits of a parameter's relative change, either sign."""
+
+    raise_above: float = Field(description="alert when it is larger", examples=[0.1])
+    clear_below: float = Field(description="back to normal when it is smaller", examples=[0.06])
+    danger_above: float = Field(description="danger when it is larger", examples=[0.4])
 
 
 class OfflineSummary(Record):
@@ -43,6 +51,11 @@ class OfflineSummary(Record):
     times_real_time: float = Field(description="data_s over elapsed_s", examples=[50.0])
     descriptor_differences: tuple[str, ...] = Field(
         description="how the recorded channel descriptor differs from the machine file", examples=[[]]
+    )
+    limits: dict[str, ParameterLimits] = Field(
+        default={},
+        description="limits that held, by parameter; those of levels are in the reports",
+        examples=[{"k_by": {"raise_above": 0.1, "clear_below": 0.06, "danger_above": 0.4}}],
     )
     stopped: bool = Field(description="whether it was stopped before the end", examples=[False])
     sha256: str = Field(description="SHA-256 of all result lines, each with its line end", examples=["9f86d081"])
@@ -82,6 +95,12 @@ class ReplayRequest(BaseModel):
         description="offline: other trained networks, as a shipped name; needs `machine`",
         examples=["lab"],
     )
+    changes: tuple[Annotated[str, Field(max_length=500)], ...] = Field(
+        default=(),
+        max_length=100,
+        description="offline: lines that hold instead of the machine file's, FIELD=VALUE as in TOML",
+        examples=[["alarms.parameters.k_by.raise_above=0.2", "alarms.on_delay_s=60.0"]],
+    )
     from_ns: int | None = Field(
         default=None, ge=0, description="only data from this time on", examples=[1767225600000000000]
     )
@@ -107,6 +126,9 @@ class ReplayJob(Record):
     machine: str | None = Field(
         description="machine file and, after @, trained networks it is evaluated with; null: by the recorded name",
         examples=["lab@lab"],
+    )
+    changes: tuple[str, ...] = Field(
+        default=(), description="lines that hold instead of the machine file's", examples=[["alarms.on_delay_s=60.0"]]
     )
     from_ns: int | None = Field(description="as requested", examples=[1767225600000000000])
     to_ns: int | None = Field(description="as requested", examples=[1767225900000000000])

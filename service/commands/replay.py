@@ -65,6 +65,14 @@ def replay(
             "out, the shipped machine with the recorded site and name, with its networks.",
         ),
     ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="FIELD=VALUE",
+            help="Offline: a line that holds instead of the machine file's, as alarms.on_delay_s=60. Repeatable.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Offline: write the lines here, not to the terminal.")
     ] = None,
@@ -124,6 +132,7 @@ def replay(
 
     What it would have said with other limits, of a whole day:
     [cyan]rotorwatch replay day/*.mcap --offline --machine stricter.toml@lab --out stricter.jsonl[/cyan]
+    [cyan]rotorwatch replay day/*.mcap --offline --set alarms.parameters.k_by.raise_above=0.2 --out calmer.jsonl[/cyan]
 
     Ten times faster onto the network, for a monitor beside the live one:
     [cyan]rotorwatch run --namespace replay/monday --listen tcp/127.0.0.1:7450 --http-port 8081[/cyan]
@@ -142,12 +151,13 @@ def replay(
         raise MachineFileError(str(error)) from error  # a file that cannot be used is exit code 2
     machines = source.machines if key is None else (source.machine(key),)
     from_ns, to_ns = source.between(from_, to, *machines)
-    _check_options(offline, {"--machine": machine, "--out": out, "--overwrite": overwrite},
+    _check_options(offline, {"--machine": machine, "--set": set_, "--out": out, "--overwrite": overwrite},
                    {"--prefix": prefix, "--connect": connect, "--listen": listen, "--all": everything})  # fmt: skip
     wishes = Control()
     with _stoppable(wishes), orders(wishes, lines=control, keyboard=not offline and progress == "auto"):
         if offline:
-            request = _Offline(source.machine(key), machine, from_ns, to_ns, out, overwrite, progress)
+            changes = "\n".join(set_ or ())
+            request = _Offline(source.machine(key), machine, changes, from_ns, to_ns, out, overwrite, progress)
             _evaluate(source, request, wishes)
             return
         from service.stream.replay_link import NetworkPlan, replay_to_network  # noqa: PLC0415
@@ -173,6 +183,7 @@ def replay(
 class _Offline:
     keys: "MachineKeys"
     machine: str | None
+    changes: str
     from_ns: int
     to_ns: int
     out: Path | None
@@ -189,7 +200,7 @@ def _evaluate(source: "RecordingSource", request: _Offline, control: "Control") 
     as_json = request.progress == "json"
     if as_json and request.out is None:
         raise MachineFileError("--progress json writes to standard output: name a file for the results with --out")
-    installed = choose_machine(request.keys, request.machine)
+    installed = choose_machine(request.keys, request.machine, request.changes)
     with _lines(request.out, request.overwrite) as write:
         run = OfflineReplay(
             source, request.keys, installed, write, from_ns=request.from_ns, to_ns=request.to_ns

@@ -54,6 +54,28 @@ def test_what_if_with_another_machine_file(faulty: Path, tmp_path: Path) -> None
     assert "800 blocks accepted, refused: none" in found.stderr
 
 
+def test_what_if_with_lines_instead_of_the_machine_files(faulty: Path, tmp_path: Path) -> None:
+    calm = "alarms.parameters.c_bz = {raise_above = 0.8, danger_above = 0.9}"
+    found = run(
+        faulty,
+        "--offline",
+        "--machine",
+        "lab@lab",
+        "--set",
+        calm,
+        "--set",
+        "alarms.on_delay_s=1",
+        "--out",
+        tmp_path / "o",
+    )
+    assert found.returncode == 0, found.stderr
+    assert "0 alarm events, raised at the end: none" in found.stderr
+    for wrong in ("alarms.on_delay_s=", "alarms.on_delay_s=-1", "alarms.delay_s=1"):
+        refused = run(faulty, "--offline", "--set", wrong, "--out", tmp_path / "p")
+        assert refused.returncode == 2
+        assert "delay_s" in refused.stderr or "changes: " in refused.stderr
+
+
 def test_channels_that_do_not_fit_are_said(faulty: Path, tmp_path: Path) -> None:
     file = machine_file(tmp_path, ('unit = "mm/s"', 'unit = "m/s"'))
     found = run(faulty, "--offline", "--machine", file, "--to", "2")

@@ -88,6 +88,9 @@ def test_recordings_are_listed(client: httpx.Client) -> None:
     by_time = get(client, RECORDINGS, RecordingList, since_ns=second.start_ns, until_ns=second.end_ns)
     assert by_time.recordings == (second,)
     assert get(client, RECORDINGS, RecordingList, site="demo", machine="fan").recordings == ()
+    assert first.data_start_ns is None
+    timed = get(client, RECORDINGS, RecordingList, until_ns=START_NS + DAY_NS, latest=1, data_times=True).recordings
+    assert [(one.id, one.data_end_ns) for one in timed] == [(second.id, START_NS + 3603 * 10**9), (part.id, None)]
     detail = get(client, f"{RECORDINGS}/{ID}", RecordingDetail)
     assert detail.keys == {"rotorwatch/demo/lab/descriptor": 1, "rotorwatch/demo/lab/stream": 700}
     quick = get(client, f"{RECORDINGS}/{QUICK}", RecordingDetail)  # recorded in 0.15 s, on another day
@@ -180,6 +183,8 @@ def test_an_offline_replay_over_http_finds_what_it_finds_on_the_command_line(
     assert (len(reports.reports), reports.next_offset) == (summary.windows, None)
     some = get(client, f"{REPLAYS}/{job.id}/reports", ReplayReportList, offset=2, limit=5)
     assert (some.reports, some.next_offset) == (reports.reports[2:7], 7)
+    thin = get(client, f"{REPLAYS}/{job.id}/reports", ReplayReportList, offset=1, limit=2, every=4)
+    assert (thin.reports, thin.next_offset) == (reports.reports[1:6:4], 9)
     (event,) = get(client, f"{REPLAYS}/{job.id}/alarms", ReplayAlarmList).events
     assert event.data.name == "c_bz"
 
@@ -231,6 +236,22 @@ def test_a_stretch_and_another_machine_from_our_own_page(client: httpx.Client, r
     assert failed.summary is None
 
 
+def test_what_would_have_been_raised_with_another_limit(client: httpx.Client) -> None:
+    as_it_was = ended(client, start(client))
+    calm = ["alarms.parameters.c_bz = {raise_above = 0.8, danger_above = 0.9}", "alarms.on_delay_s = 5"]
+    job = start(client, changes=calm)
+    assert job.changes == tuple(calm)
+    found = ended(client, job)
+    assert (found.state, found.error) == ("finished", "")
+    assert as_it_was.summary is not None
+    assert found.summary is not None
+    assert (as_it_was.summary.raised, found.summary.raised) == (("c_bz",), ())
+    assert as_it_was.summary.limits["c_bz"].raise_above == 0.1
+    assert found.summary.limits["c_bz"].raise_above == 0.8
+    assert found.summary.limits["k_by"] == as_it_was.summary.limits["k_by"]
+    assert found.summary.machine_hash != as_it_was.summary.machine_hash
+
+
 @pytest.mark.parametrize(
     ("changes", "status", "detail"),
     [
@@ -242,6 +263,10 @@ def test_a_stretch_and_another_machine_from_our_own_page(client: httpx.Client, r
         ({"mode": "paced", "pace": 0.01}, 422, "pace: "),
         ({"mode": "live"}, 422, "mode: "),
         ({"shell": "rm"}, 422, "shell: "),
+        ({"changes": ["alarms.on_delay_s ="]}, 422, "changes: "),
+        ({"changes": ["alarms.on_delay_s = -1"]}, 422, "on_delay_s"),
+        ({"changes": ["alarms.delay = 1"]}, 422, "delay"),
+        ({"changes": ["alarms.on_delay_s = 1"], "mode": "paced"}, 422, "changes: nothing is evaluated"),
     ],
 )
 def test_wrong_requests_are_refused(client: httpx.Client, changes: dict[str, Any], status: int, detail: str) -> None:

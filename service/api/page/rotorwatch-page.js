@@ -11,6 +11,8 @@ const VIEWS = {
   machines: ["machine-view", () => import("./machine/machine-view.js")],
   alarms: ["alarms-view", () => import("./alarms/alarms-view.js")],
   why: ["why-view", () => import("./alarms/why-view.js")],
+  recordings: ["recordings-view", () => import("./recordings/recordings-view.js")],
+  replays: ["replay-view", () => import("./recordings/replay-view.js")],
   administration: ["administration-view", () => import("./administration/administration-view.js")],
 };
 
@@ -26,7 +28,7 @@ class RotorwatchPage extends HTMLElement {
 
   connectedCallback() {
     this.replaceChildren(
-      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms, this.#administration), this.#who, this.#leave, this.#times),
+      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms, html("a", { href: "#/recordings" }, "Recordings"), this.#administration), this.#who, this.#leave, this.#times),
       this.#banner,
       this.#main,
       html("footer", {}, "Monitoring, not machine protection. ", html("a", { href: "/docs" }, "HTTP API"), ", ", html("a", { href: "/openapi.json" }, "its description"), ", ", html("a", { href: "/readyz" }, "readiness")),

@@ -1,16 +1,21 @@
 """Recordings over HTTP: list, look at, download."""
 
+from functools import cache
+from itertools import groupby
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import FastAPI, HTTPException, Query, Request
 from fastapi.responses import FileResponse
 from starlette.types import Message, Receive, Scope, Send
 
+from models.errors import RecordingError
 from models.signals.recording import summarize_recording
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from service.access.guard import Guard
 from service.access.problems import problem_answer, problem_responses, responses
 from service.recordings.catalogue import Catalogue, Recording
+from service.recordings.replay.data_time import DataSpan
 from service.recordings.replay.source import RecordingSource
 
 _NO_RANGE = {400: "Range: not understood, expected bytes=from-to", 416: "Range: the file is shorter than that"}
@@ -21,6 +26,10 @@ _Site = Annotated[str | None, Query(description="only of this site")]
 _Machine = Annotated[str | None, Query(description="only of this machine")]
 _SinceNs = Annotated[int | None, Query(ge=0, description="only what reaches this time, ns since 1970-01-01 UTC")]
 _UntilNs = Annotated[int | None, Query(ge=0, description="only what begins before this time")]
+_Latest = Annotated[int | None, Query(ge=1, le=10_000, description="at most so many of each machine, the latest")]
+_DataTimes = Annotated[
+    bool, Query(description="say of which data they are, too, which takes a look into each the first time")
+]
 
 
 def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) -> None:
@@ -33,7 +42,12 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         responses=responses(RecordingList, 404, 422),
     )
     def recordings(
-        site: _Site = None, machine: _Machine = None, since_ns: _SinceNs = None, until_ns: _UntilNs = None
+        site: _Site = None,
+        machine: _Machine = None,
+        since_ns: _SinceNs = None,
+        until_ns: _UntilNs = None,
+        latest: _Latest = None,
+        data_times: _DataTimes = False,
     ) -> RecordingList:
         """Recordings, by site, machine and time."""
         listed = _present(index).recordings(site, machine)
@@ -42,7 +56,10 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
             for one in listed
             if (since_ns is None or one.end_ns >= since_ns) and (until_ns is None or one.start_ns < until_ns)
         )
-        return RecordingList(recordings=tuple(kept))
+        chosen = list(kept)
+        if latest is not None:
+            chosen = [one for _, group in groupby(chosen, _place_of) for one in list(group)[-latest:]]
+        return RecordingList(recordings=tuple(map(_with_data_times, chosen) if data_times else chosen))
 
     @app.get(
         "/api/v1/recordings/{site}/{machine}/{name}",
@@ -55,15 +72,7 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         found = found_recording(index, f"{site}/{machine}/{name}")
         readable = found.complete and not found.problem
         keys = summarize_recording(found.path).messages if readable else {}
-        data = RecordingSource([found.path]).span() if keys else None
-        return RecordingDetail.model_validate(
-            {
-                **dict(found),
-                "keys": keys,
-                "data_start_ns": None if data is None else data.start_ns,
-                "data_end_ns": None if data is None else data.end_ns,
-            }
-        )
+        return RecordingDetail.model_validate({**dict(_with_data_times(found)), "keys": keys})
 
     @app.get(
         "/api/v1/recordings/{site}/{machine}/{name}/download",
@@ -82,6 +91,28 @@ def add_recording_routes(app: FastAPI, index: Catalogue | None, guard: Guard) ->
         if not found.complete:
             raise HTTPException(409, f"{found.id} is incomplete: it is being written, or was left by a crash")
         return _RecordingFile(found.path, media_type="application/octet-stream", filename=found.path.name)
+
+
+def _place_of(recording: Recording) -> tuple[str, str]:
+    return recording.site, recording.machine
+
+
+def _with_data_times(recording: Recording) -> Recording:
+    if not recording.messages or recording.problem:
+        return recording
+    span = _data_span(recording.path, recording.size_bytes)
+    if span is None:
+        return recording
+    return recording.model_copy(update={"data_start_ns": span.start_ns, "data_end_ns": span.end_ns})
+
+
+@cache
+def _data_span(path: Path, _size_bytes: int) -> DataSpan | None:
+    """Which data a file holds, read once for as long as it has the same size; None where it is damaged or gone."""
+    try:
+        return RecordingSource([path]).span()
+    except RecordingError:
+        return None
 
 
 class _RecordingFile(FileResponse):

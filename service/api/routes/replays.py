@@ -1,7 +1,7 @@
 """Replays over HTTP: start, watch, steer and stop them, and read what they found."""
 
 import asyncio
-import json
+import re
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,6 +10,9 @@ from fastapi import Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
+from models.errors import MachineFileError
+from models.machine import load_machine_file
+from models.mistakes import changed
 from models.signals.link import LinkSettings, is_loopback
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
@@ -90,12 +93,14 @@ class ReplayDesk:
             raise HTTPException(422, f"recordings: of several machines ({', '.join(machines)}), expected one")
         offline = request.mode == "offline"
         machine = self._machine(request, machines[0]) if offline else None
+        _check_changes(request, machine)
         job = ReplayJob(
             id=(job_id := jobs.new_id()),
             state="running",
             mode=request.mode,
             recordings=request.recordings,
             machine=machine,
+            changes=request.changes,
             from_ns=request.from_ns,
             to_ns=request.to_ns,
             pace=None if offline else request.pace,
@@ -111,6 +116,7 @@ class ReplayDesk:
             arguments += [] if time_ns is None else [option, f"{time_ns}ns"]
         if offline:
             arguments += ["--offline", *(["--machine", machine] if machine else [])]
+            arguments += [f"--set={line}" for line in request.changes]
         else:
             arguments += ["--pace", f"{request.pace:g}", "--prefix", job.prefix]
             arguments += [part for end in _endpoints(self._settings.link) for part in ("--connect", end)]
@@ -152,6 +158,21 @@ class ReplayDesk:
         return self._entries
 
 
+def _check_changes(request: ReplayRequest, machine: str | None) -> None:
+    """Say at once what is wrong with changes; a machine that only the recording knows is looked at by the replay."""
+    if request.changes and request.mode != "offline":
+        raise HTTPException(422, "changes: nothing is evaluated in a paced replay")
+    changes = "\n".join(request.changes)
+    try:
+        if request.changes and machine is not None:
+            load_machine_file(machine.partition("@")[0], changes)
+        else:
+            changed({}, changes)
+    except MachineFileError as error:
+        # Where the file is concerns nobody who asks over HTTP.
+        raise HTTPException(422, re.sub(r"(?m)^[^:\n]*\.toml: ", "changes: ", str(error))) from error
+
+
 def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
     """Add the routes."""
     _add_reading_routes(app, desk, guard)
@@ -160,6 +181,7 @@ def add_replay_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
 
 NothingToSay = Annotated[NoOrder, Body(openapi_examples={"example": {"summary": "nothing to say", "value": {}}})]
 _Offset = Annotated[int, Query(ge=0, description="leave out that many, the oldest")]
+_Every = Annotated[int, Query(ge=1, le=100_000, description="of those that are left only every so many-th, for a plot")]
 _Limit = Annotated[int, Query(ge=1, le=1000, description="at most this many")]
 
 
@@ -177,9 +199,9 @@ def _add_reading_routes(app: FastAPI, desk: ReplayDesk, guard: Guard) -> None:
         return _job(desk, replay_id)
 
     @app.get(f"{_JOB}/reports", responses=responses(ReplayReportList, 404, 422), **common)
-    def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100) -> ReplayReportList:
+    def replay_reports(replay_id: str, offset: _Offset = 0, limit: _Limit = 100, every: _Every = 1) -> ReplayReportList:
         """Window reports of an offline replay; the history of the live machine has none of them."""
-        found, following = _results(desk, replay_id, "/report", offset, limit)
+        found, following = _results(desk, replay_id, "/report", offset, limit, every)
         return ReplayReportList(reports=tuple(Report.model_validate_json(one) for one in found), next_offset=following)
 
     @app.get(f"{_JOB}/alarms", responses=responses(ReplayAlarmList, 404, 422), **common)
@@ -276,17 +298,20 @@ def _order(desk: ReplayDesk, replay_id: str, order: str) -> ReplayJob:
     return _there(None if desk.jobs is None else desk.jobs.order(replay_id, order), replay_id)
 
 
-def _results(desk: ReplayDesk, replay_id: str, topic: str, offset: int, limit: int) -> tuple[list[str], int | None]:
+def _results(
+    desk: ReplayDesk, replay_id: str, topic: str, offset: int, limit: int, every: int = 1
+) -> tuple[list[str], int | None]:
     """Messages of one topic, and where those that follow begin."""
     if _job(desk, replay_id).mode != "offline":
         raise HTTPException(404, "a paced replay only publishes: ask the monitor in its namespace what it found")
     path = None if desk.jobs is None else desk.jobs.results(replay_id)
     found: list[str] = []
     for number, message in enumerate(_messages(path, topic)):
-        if number >= offset + limit:
-            return found, offset + limit
-        if number >= offset:
-            found.append(message)
+        if number < offset or (number - offset) % every:
+            continue
+        if len(found) == limit:
+            return found, number
+        found.append(message)
     return found, None
 
 
@@ -297,9 +322,9 @@ def _messages(path: Path | None, topic: str) -> Iterator[str]:
         for line in lines:
             if not line.endswith("\n"):  # being written
                 return
-            entry: dict[str, Any] = json.loads(line)
-            if str(entry["topic"]).endswith(topic):
-                yield json.dumps(entry["message"])
+            head, _, message = line.partition('", "message": ')  # `result_lines` writes them so
+            if head.endswith(topic):
+                yield message.rstrip("\n")[:-1]
 
 
 async def _events(look: Callable[[], ReplayJob]) -> AsyncIterator[str]:

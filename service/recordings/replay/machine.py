@@ -9,7 +9,7 @@ from models.machine import load_machine_file
 from models.signals.keys import MachineKeys
 
 
-def choose_machine(keys: MachineKeys, wanted: str | None) -> Installed:
+def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> Installed:
     """Load the machine file, and what was trained or commissioned, for a recorded machine.
 
     Parameters
@@ -17,6 +17,8 @@ def choose_machine(keys: MachineKeys, wanted: str | None) -> Installed:
     wanted : str, optional
         ``FILE`` or ``FILE@BUNDLE``, shipped names or paths. Without it, the shipped machine with the recorded site and
         name is taken, with its shipped networks.
+    changes : str
+        TOML that goes over the machine file.
 
     Raises
     ------
@@ -27,11 +29,11 @@ def choose_machine(keys: MachineKeys, wanted: str | None) -> Installed:
     """
     if wanted is not None:
         file, _, name = wanted.partition("@")
-        return install(load_machine_file(file), name or None)
+        return install(load_machine_file(file, changes), name or None)
     for path in _shipped_files():
         machine = load_machine_file(path)
         if (machine.site, machine.name) == (keys.site, keys.machine):
-            return install(machine, path.stem if is_shipped_bundle(path.stem) else None)
+            return install(load_machine_file(path, changes), path.stem if is_shipped_bundle(path.stem) else None)
     shipped = ", ".join(path.stem for path in _shipped_files())
     raise MachineFileError(
         f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({shipped}) has this site "

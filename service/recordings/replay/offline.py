@@ -9,9 +9,10 @@ import time
 from collections.abc import Callable
 
 from models.commissioning.commissioned import Installed
+from models.physics.rotor import PARAMETERS
 from models.signals.keys import MachineKeys
 from models.signals.recording import RecordedMessage
-from rotorwatch.records.replays import OfflineSummary, ReplayProgress
+from rotorwatch.records.replays import OfflineSummary, ParameterLimits, ReplayProgress
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
@@ -163,6 +164,9 @@ class OfflineReplay:
             elapsed_s=round(elapsed_s, 3),
             times_real_time=round(self._data_s / max(elapsed_s, 1e-9), 1),
             descriptor_differences=self._differences,
+            limits={
+                name: ParameterLimits(**self._machine.alarms.for_parameter(name).model_dump()) for name in PARAMETERS
+            },
             stopped=stopped,
             sha256=self._digest.hexdigest(),
         )

@@ -3,6 +3,9 @@ import { LiveElement } from "./live-element.js";
 
 /** An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. */
 export class MachineElement extends LiveElement {
+  /** @type {import("../monitor/records.js").Health | undefined} */
+  #instead;
+
   connectedCallback() {
     super.connectedCallback();
     this.follow(`health:${this.place}`, () => this.show());
@@ -14,9 +17,15 @@ export class MachineElement extends LiveElement {
     return this.getAttribute("place") ?? "";
   }
 
+  /** Show this and nothing that is live: a window of a replay. @param {import("../monitor/records.js").Health} health */
+  feed(health) {
+    this.#instead = health;
+    this.show();
+  }
+
   /** What was heard last; undefined before the first. */
   get health() {
-    return monitor.machines.get(this.place)?.health;
+    return this.#instead ?? monitor.machines.get(this.place)?.health;
   }
 
   /** Lay out what is known. */

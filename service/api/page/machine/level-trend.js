@@ -2,7 +2,7 @@ import { ReadingTrend } from "./reading-trend.js";
 import { levelUnit, measureText } from "../monitor/states.js";
 
 /** The leading level of every channel over time, with its limits. */
-class LevelTrend extends ReadingTrend {
+export class LevelTrend extends ReadingTrend {
   quantity = "level";
   title = "Levels over time";
 

@@ -2,15 +2,20 @@ import { machineFile } from "./machine-file.js";
 import { ReadingTrend } from "./reading-trend.js";
 
 /** Changes of the parameters over time, with their 95 % intervals and the limits of the machine file. */
-class ParameterTrend extends ReadingTrend {
+export class ParameterTrend extends ReadingTrend {
   quantity = "parameter";
   title = "Parameters over time";
+
+  /** Limits of the machine file. @returns {Promise<{limits: any, parameters: Record<string, any>}>} */
+  async limits() {
+    return (await machineFile(this.place, this.health?.machine_hash)).alarms;
+  }
 
   async trended() {
     const read = this.health?.report?.parameters ?? [];
     if (!read.some((one) => one.relative_change !== null)) return [];
     const changed = (this.health?.report?.verdict?.changed ?? []).map((one) => ({ ...one, text: "changed" }));
-    const { limits, parameters } = (await machineFile(this.place, this.health?.machine_hash)).alarms;
+    const { limits, parameters } = await this.limits();
     return read.map(({ name, text }) => {
       const { raise_above: alert, danger_above: danger } = { ...limits, ...parameters[name] };
       return { name, alarm: name, title: `${text} (${name})`, unit: "change, %", scale: 100, alert: [-100 * alert, 100 * alert], danger: [-100 * danger, 100 * danger], zero: true, changed: changed.filter((one) => one.name === name) };

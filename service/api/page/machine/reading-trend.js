@@ -22,6 +22,10 @@ export class ReadingTrend extends MachineElement {
   #figures = html("div", { class: "charts" });
   #message = html("p", { class: "message" });
   #when = html("p", { class: "note" });
+  /** What was read last. @type {{shown: Trended[], buckets: Bucket[], events: AlarmEvent[]}} */
+  #read = { shown: [], buckets: [], events: [] };
+  /** A moment that is marked. @type {number | null} */
+  #moment = null;
 
   connectedCallback() {
     super.connectedCallback();
@@ -53,6 +57,18 @@ export class ReadingTrend extends MachineElement {
     const shown = await this.trended();
     this.hidden = !shown.length;
     if (!shown.length) return;
+    this.#read = { shown, ...(await this.readings(shown)) };
+    this.#show();
+  }
+
+  /** Mark a moment, ns. @param {number} moment */
+  mark(moment) {
+    this.#moment = moment;
+    this.#show();
+  }
+
+  /** Readings and events out of the history. @param {Trended[]} shown @returns {Promise<{buckets: Bucket[], events: AlarmEvent[]}>} */
+  async readings(shown) {
     const since = String(await this.#since(shown));
     const asked = new URLSearchParams({ quantity: this.quantity, points: String(POINTS), since_ns: since });
     for (const one of shown.slice(0, 64)) asked.append("name", one.name);
@@ -60,11 +76,15 @@ export class ReadingTrend extends MachineElement {
       monitor.ask(`${pathOf(this.place)}/readings?${asked}`),
       monitor.ask(`${pathOf(this.place)}/alarms/events?limit=${EVENTS}&since_ns=${since}`),
     ]);
-    const happened = events.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data);
-    for (const one of shown) this.#draw(one, readings.buckets.filter((/** @type {Bucket} */ bucket) => bucket.name === one.name), happened);
-    const ends = readings.buckets.map((/** @type {Bucket} */ bucket) => bucket.start_ns + bucket.length_ns);
-    if (ends.length) this.#when.textContent = `${stretch(Math.min(...readings.buckets.map((/** @type {Bucket} */ bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for several their mean; the band holds their 95 % intervals.`;
-    this.#message.textContent = readings.buckets.length ? "" : "Nothing has been read yet.";
+    return { buckets: readings.buckets, events: events.events.map((/** @type {{data: AlarmEvent}} */ one) => one.data) };
+  }
+
+  #show() {
+    const { shown, buckets, events } = this.#read;
+    for (const one of shown) this.#draw(one, buckets.filter((bucket) => bucket.name === one.name), events);
+    const ends = buckets.map((bucket) => bucket.start_ns + bucket.length_ns);
+    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for several their mean; the band holds their 95 % intervals.`;
+    this.#message.textContent = buckets.length ? "" : "Nothing has been read yet.";
   }
 
   /** @param {string} why */
@@ -106,6 +126,7 @@ export class ReadingTrend extends MachineElement {
     const near = (/** @type {number[]} */ limits) => limits.filter((each) => Math.abs(each) < 2.5 * reached || Math.abs(each) <= 10);
     const changes = one.changed.filter((each) => each.since_ns / 1e9 >= x[0]);
     const marks = [
+      ...(this.#moment === null ? [] : [{ at: this.#moment / 1e9, axis: /** @type {"x"} */ ("x"), colour: "estimated" }]),
       ...changes.map((each) => ({ at: each.since_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: "ink", text: each.text })),
       ...one.alert.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "alert-line", text: "alert", dash: [6, 4] })),
       ...one.danger.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "danger-line", text: "danger" })),

@@ -1,0 +1,76 @@
+import { clock } from "../monitor/figures.js";
+import { html, lay, table } from "../elements/markup.js";
+import { API, monitor, pathOf } from "../monitor/monitor.js";
+import { differences } from "./replay-list.js";
+import "../elements/state-mark.js";
+
+const EVENTS = 1000;
+
+/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+
+/** Alarms as a replay would have raised them, beside those that were raised, or that another replay would have raised. */
+class AlarmComparison extends HTMLElement {
+  #beside = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.#compare() }));
+  #message = html("p", { class: "message", role: "status" });
+  #rows = html("div");
+  #place = "";
+  /** @type {AlarmEvent[]} */
+  #events = [];
+  /** @type {[number, number]} */
+  #span = [0, 0];
+  /** @type {(ns: number) => void} */
+  #go = () => {};
+
+  /** @param {ReplayJob} job @param {AlarmEvent[]} events @param {[number, number]} span @param {(ns: number) => void} go */
+  async show(job, events, span, go) {
+    [this.#events, this.#span, this.#go] = [events, span, go];
+    this.#place = job.recordings[0].split("/").slice(0, 2).join("/");
+    lay(this, html("h2", {}, "What would have been raised"), html("label", {}, "Beside it: ", this.#beside), this.#message, this.#rows);
+    const all = /** @type {ReplayJob[]} */ ((await monitor.ask(`${API}/replays`)).replays);
+    const same = all.filter((one) => one.id !== job.id && one.summary && one.recordings[0].startsWith(`${this.#place}/`));
+    const live = monitor.machines.has(this.#place);
+    lay(
+      this.#beside,
+      live && html("option", { value: "live" }, "what the live monitor raised then"),
+      ...same.map((one) => html("option", { value: one.id }, `replay of ${clock(one.started_ns)}, ${differences(one) || "as recorded"}`)),
+      html("option", { value: "" }, "nothing"),
+    );
+    await this.#compare();
+  }
+
+  async #compare() {
+    const beside = this.#beside.value;
+    const path = beside === "live" ? `${pathOf(this.#place)}/alarms/events?limit=${EVENTS}&since_ns=${this.#span[0]}&until_ns=${this.#span[1] + 1}` : `${API}/replays/${beside}/alarms?limit=${EVENTS}`;
+    try {
+      const found = beside ? (await monitor.ask(path)).events.map((/** @type {{data: AlarmEvent}} */ one) => one.data) : [];
+      this.#message.textContent = "";
+      this.#lay(beside, found);
+    } catch (error) {
+      this.#message.textContent = error instanceof Error ? error.message : String(error);
+    }
+  }
+
+  /** @param {string} beside @param {AlarmEvent[]} others */
+  #lay(beside, others) {
+    const own = ["raised", "escalated", "cleared"]; // what operators do is no affair of a replay
+    const key = (/** @type {AlarmEvent} */ one) => `${one.name} ${one.kind} ${Math.round(one.time_ns / 1e6)}`;
+    const [here, there] = [this.#events, others].map((list) => new Map(list.filter((one) => own.includes(one.kind)).map((one) => [key(one), one])));
+    const other = beside === "live" ? "live" : "the other replay";
+    const all = [...new Map([...there, ...here])].sort(([, one], [, two]) => one.time_ns - two.time_ns);
+    const rows = all.map(([name, one]) => ({
+      attributes: { class: one.kind === "cleared" ? null : one.severity },
+      cells: [
+        html("time", { class: "number" }, clock(one.time_ns)),
+        html("span", {}, one.kind),
+        one.kind === "cleared" ? "" : html("state-mark", { state: one.severity }),
+        html("span", {}, one.text),
+        html("span", {}, !beside ? "this replay" : here.has(name) && there.has(name) ? "both" : html("strong", {}, here.has(name) ? "this replay only" : `${other} only`)),
+        html("div", { class: "actions" }, html("button", { type: "button", "aria-label": `Show the window at ${clock(one.time_ns)}`, click: () => this.#go(one.time_ns) }, "Show window")),
+      ],
+    }));
+    lay(this.#rows, rows.length ? table(["time", "what", "severity", "event", "where", "window"], rows, "") : html("p", {}, beside ? `No alarm was raised, neither in this replay nor ${beside === "live" ? "live" : "in the other one"}.` : "No alarm would have been raised."));
+  }
+}
+
+customElements.define("alarm-comparison", AlarmComparison);

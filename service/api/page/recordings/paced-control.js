@@ -1,0 +1,77 @@
+import { clock, stretch } from "../monitor/figures.js";
+import { html, lay } from "../elements/markup.js";
+import { API, monitor } from "../monitor/monitor.js";
+
+/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+
+/** Pause, resume and seek of a replay that goes onto the network at a pace. */
+class PacedControl extends HTMLElement {
+  #said = html("p", { class: "number" });
+  #pause = html("button", { type: "button", click: () => this.#order(this.#job?.state === "paused" ? "resume" : "pause") });
+  #seek = /** @type {HTMLInputElement} */ (html("input", { type: "range", min: 0, max: 1, step: "any", "aria-label": "Place in the data", input: () => this.#tell(), change: () => this.#order("seek", { to_ns: Math.round(this.#at()) }) }));
+  #place = html("output", { class: "number" });
+  #message = html("p", { class: "message", role: "alert" });
+  #tools = html("div", { class: "scrubber" });
+  /** @type {ReplayJob | null} */
+  #job = null;
+  /** First and last data. @type {[number, number] | null} */
+  #span = null;
+  #held = false;
+
+  connectedCallback() {
+    const step = (/** @type {number} */ by_s, /** @type {string} */ text) => html("button", { type: "button", click: () => this.#order("seek", { by_s }) }, text);
+    lay(this.#tools, this.#pause, step(-10, "− 10 s"), step(10, "+ 10 s"), this.#seek, this.#place);
+    for (const [kind, held] of /** @type {[string, boolean][]} */ ([["pointerdown", true], ["pointerup", false], ["pointercancel", false]])) this.#seek.addEventListener(kind, () => { this.#held = held; });
+    lay(this, this.#said, this.#tools, this.#message);
+  }
+
+  /** @param {ReplayJob} job */
+  async show(job) {
+    const first = !this.#job;
+    this.#job = job;
+    const running = job.state === "running" || job.state === "paused";
+    this.#tools.hidden = !running || !monitor.may("operate");
+    this.#pause.textContent = job.state === "paused" ? "Resume" : "Pause";
+    lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${job.progress.messages} messages are out.` : ".");
+    if (first) await this.#measure(job);
+    if (!this.#held && job.progress && this.#span) {
+      this.#seek.value = String((job.progress.position_ns - this.#span[0]) / (this.#span[1] - this.#span[0]));
+      this.#tell();
+    }
+  }
+
+  /** From when to when the data are. @param {ReplayJob} job */
+  async #measure(job) {
+    try {
+      const all = await Promise.all(job.recordings.slice(0, 50).map((id) => monitor.ask(`${API}/recordings/${id}`)));
+      const from = Math.max(job.from_ns ?? 0, Math.min(...all.map((one) => one.data_start_ns)));
+      this.#span = [from, Math.min(job.to_ns ?? Infinity, Math.max(...all.map((one) => one.data_end_ns)))];
+      this.#seek.setAttribute("aria-label", `Place in the data, ${stretch(...this.#span)}`);
+    } catch (error) {
+      this.#message.textContent = error instanceof Error ? error.message : String(error);
+    }
+  }
+
+  #at() {
+    const [from, to] = this.#span ?? [0, 0];
+    return from + Number(this.#seek.value) * (to - from);
+  }
+
+  #tell() {
+    this.#place.textContent = clock(this.#at());
+    this.#seek.setAttribute("aria-valuetext", clock(this.#at()));
+  }
+
+  /** @param {string} kind @param {unknown} [order] */
+  async #order(kind, order) {
+    this.#held = false;
+    try {
+      await this.show(await monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order));
+      this.#message.textContent = "";
+    } catch (error) {
+      this.#message.textContent = error instanceof Error ? error.message : String(error);
+    }
+  }
+}
+
+customElements.define("paced-control", PacedControl);

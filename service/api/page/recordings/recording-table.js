@@ -1,0 +1,65 @@
+import { clock, lasting, size } from "../monitor/figures.js";
+import { html, lay, table } from "../elements/markup.js";
+import { API } from "../monitor/monitor.js";
+
+const PAGE = 25;
+
+/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("./recordings-view.js").Chosen} Chosen */
+
+/** Recordings, the latest first, to choose from and to download. */
+class RecordingTable extends HTMLElement {
+  #shown = PAGE;
+  /** @type {RecordingEntry[]} */
+  #recordings = [];
+  /** @type {Chosen} */
+  #chosen = { ids: new Set(), stretch: null };
+
+  /** @param {string} _place @param {RecordingEntry[]} recordings @param {AlarmEvent[]} _alarms @param {Chosen} chosen */
+  show(_place, recordings, _alarms, chosen) {
+    [this.#recordings, this.#chosen] = [recordings, chosen];
+    const focused = document.activeElement instanceof HTMLInputElement ? document.activeElement.value : "";
+    this.#lay();
+    if (focused) /** @type {HTMLElement | null} */ (this.querySelector(`input[value="${CSS.escape(focused)}"]`))?.focus();
+  }
+
+  #lay() {
+    const newest = [...this.#recordings].reverse();
+    const rows = newest.slice(0, this.#shown).map((one) => {
+      const [from, to] = [one.data_start_ns, one.data_end_ns];
+      const able = one.complete && !one.problem && one.messages;
+      const name = one.id.split("/").slice(2).join("/");
+      const box = html("input", { type: "checkbox", value: one.id, checked: this.#chosen.ids.has(one.id), disabled: !able, change: (event) => this.#choose(one.id, event.target.checked) });
+      return {
+        cells: [
+          html("label", { class: "check" }, box, html("span", {}, name)),
+          html("time", { class: "number" }, clock(from)),
+          html("span", { class: "number" }, from === null || to === null ? "–" : lasting((to - from) / 1e9)),
+          html("time", { class: "number" }, clock(one.start_ns)),
+          html("span", { class: "number" }, size(one.size_bytes)),
+          html("span", {}, one.problem || (one.complete ? (one.messages ? "complete" : "empty") : "being written, or left by a crash")),
+          html("span", {}, one.kept_because || "no alarm"),
+          one.complete ? html("div", {}, html("a", { href: `${API}/recordings/${one.id}/download`, download: name, "aria-label": `Download ${name}` }, "Download")) : "",
+        ],
+      };
+    });
+    const heads = ["recording", "data from", "length", "recorded from", "size", "state", "kept for", "file"];
+    lay(this, rows.length ? table(heads, rows, "Recordings, the latest first") : null, newest.length > this.#shown ? html("button", { type: "button", click: () => this.#more() }, "Older") : null);
+  }
+
+  #more() {
+    this.#shown += PAGE;
+    this.#lay();
+  }
+
+  /** @param {string} id @param {boolean} wanted */
+  #choose(id, wanted) {
+    const ids = new Set(this.#chosen.ids);
+    if (wanted) ids.add(id);
+    else ids.delete(id);
+    this.dispatchEvent(new CustomEvent("choose", { detail: { ids, stretch: null } }));
+  }
+}
+
+customElements.define("recording-table", RecordingTable);

@@ -1,0 +1,54 @@
+import { clock } from "../monitor/figures.js";
+import { html, lay, table } from "../elements/markup.js";
+import { LiveElement } from "../elements/live-element.js";
+import { API, monitor } from "../monitor/monitor.js";
+
+const REFRESH_S = 10;
+
+/** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+
+/** How a replay differs from what was live. @param {ReplayJob} job */
+export const differences = (job) => [job.machine && `machine file ${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");
+
+/** What came of a replay so far. @param {ReplayJob} job */
+export function outcome(job) {
+  if (job.error) return job.error;
+  if (job.summary) return `${job.summary.windows} windows, ${job.summary.alarms} alarm events; raised at the end: ${job.summary.raised.join(", ") || "none"}`;
+  return job.progress ? `${(100 * job.progress.fraction).toFixed(0)} % done` : "begins";
+}
+
+/** Replays since the service started, the latest first. */
+class ReplayList extends LiveElement {
+  #said = "";
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.#said = "";
+    this.keepLoading(REFRESH_S);
+  }
+
+  async ask() {
+    const found = /** @type {ReplayJob[]} */ ((await monitor.ask(`${API}/replays`)).replays);
+    const said = JSON.stringify(found);
+    if (said === this.#said) return; // what has the focus keeps it
+    this.#said = said;
+    const rows = found.map((one) => ({
+      cells: [
+        html("a", { href: `#/replays/${one.id}` }, clock(one.started_ns)),
+        html("span", {}, one.state),
+        html("span", {}, one.mode === "paced" ? `paced, ${one.pace} s of data per second` : "as fast as possible"),
+        html("span", {}, [...new Set(one.recordings.map((id) => id.split("/").slice(0, 2).join("/")))].join(", "), ` (${one.recordings.length})`),
+        html("span", {}, differences(one) || "as recorded"),
+        html("span", {}, outcome(one)),
+      ],
+    }));
+    lay(this, rows.length ? table(["started", "state", "how", "recordings", "with", "outcome"], rows, "Replays since the service started") : html("p", { class: "note" }, "Nothing has been replayed since the service started."));
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    lay(this, html("p", { class: "message", role: "status" }, why));
+  }
+}
+
+customElements.define("replay-list", ReplayList);

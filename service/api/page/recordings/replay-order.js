@@ -1,0 +1,87 @@
+import { stretch } from "../monitor/figures.js";
+import { html, lay } from "../elements/markup.js";
+import { API, monitor } from "../monitor/monitor.js";
+
+/** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
+/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {import("./recordings-view.js").Chosen} Chosen */
+
+/** A form that starts a replay of what is chosen: as it was, or with another machine file or another limit. */
+class ReplayOrder extends HTMLElement {
+  #what = html("p", { role: "status" });
+  #message = html("p", { class: "message", role: "alert" });
+  #machine = /** @type {HTMLSelectElement} */ (html("select"));
+  #raise = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0.1, max: 99, step: "any", placeholder: "as in the file" }));
+  #delay = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0, max: 86400, step: "any", placeholder: "as in the file" }));
+  #lines = /** @type {HTMLTextAreaElement} */ (html("textarea", { rows: 2, spellcheck: "false", placeholder: "alarms.parameters.k_by.raise_above = 0.2" }));
+  #mode = /** @type {HTMLSelectElement} */ (html("select", { change: () => this.#offer() }, html("option", { value: "offline" }, "as fast as possible, with reports and alarms as result"), html("option", { value: "paced" }, "onto the network at a pace, for a monitor in its own namespace")));
+  #pace = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0.1, max: 1000, step: "any", value: 10, required: true }));
+  #offline = html("div", { class: "offline" });
+  #paced = html("label", { hidden: true }, "Seconds of data per second", this.#pace);
+  #start = /** @type {HTMLButtonElement} */ (html("button", { type: "submit", class: "main" }, "Start replay"));
+  #clear = html("button", { type: "button", click: () => this.dispatchEvent(new CustomEvent("choose", { detail: { ids: new Set(), stretch: null } })) }, "Choose nothing");
+  /** @type {Chosen} */
+  #chosen = { ids: new Set(), stretch: null };
+
+  connectedCallback() {
+    lay(
+      this.#offline,
+      html("label", {}, "Machine file", this.#machine),
+      html("label", {}, "Alert when a parameter changed by more than, %", this.#raise),
+      html("label", {}, "Alarm when that has lasted, s", this.#delay),
+      html("label", { class: "lines" }, "Other lines instead of the machine file's, one each", this.#lines),
+    );
+    lay(this, html("form", { submit: (event) => this.#submit(event) }, html("h2", {}, "Replay"), this.#what, html("label", {}, "How", this.#mode), this.#offline, this.#paced, html("div", { class: "actions" }, this.#start, this.#clear), this.#message));
+    this.show("", [], [], this.#chosen);
+  }
+
+  #offer() {
+    this.#offline.hidden = this.#mode.value !== "offline";
+    this.#paced.hidden = !this.#offline.hidden;
+  }
+
+  /** @param {string} place @param {RecordingEntry[]} _recordings @param {AlarmEvent[]} _alarms @param {Chosen} chosen */
+  show(place, _recordings, _alarms, chosen) {
+    this.#chosen = chosen;
+    const others = [...monitor.machines.keys()].filter((one) => one !== place).sort();
+    if (this.#machine.options.length !== others.length + 1 || this.#machine.dataset.place !== place) {
+      this.#machine.dataset.place = place;
+      this.#machine.replaceChildren(html("option", { value: "" }, "that of the machine"), ...others.map((one) => html("option", { value: one }, `that of ${one}`)));
+    }
+    const count = chosen.ids.size;
+    const may = monitor.may("operate");
+    this.#what.textContent = !may
+      ? "You may look: whoever starts a replay needs the scope operate."
+      : count
+        ? `${count} recording${count > 1 ? "s" : ""} of ${place}${chosen.stretch ? `, of them ${stretch(...chosen.stretch)}` : ""}.`
+        : "Choose recordings below, or what is around an alarm above.";
+    this.#start.disabled = !count || !may;
+    this.#clear.hidden = !count;
+  }
+
+  #changes() {
+    const raise = this.#raise.value ? Number(this.#raise.value) / 100 : null;
+    // The way back stays where it is in proportion: 6 % for 10 %.
+    const limits = raise === null ? [] : [`alarms.limits.raise_above = ${raise}`, `alarms.limits.clear_below = ${Number((0.6 * raise).toPrecision(6))}`];
+    const delay = this.#delay.value ? [`alarms.on_delay_s = ${Number(this.#delay.value)}`] : [];
+    return [...limits, ...delay, ...this.#lines.value.split("\n").map((one) => one.trim()).filter(Boolean)];
+  }
+
+  /** @param {Event} event */
+  async #submit(event) {
+    event.preventDefault();
+    const mode = this.#mode.value;
+    const times = this.#chosen.stretch ? { from_ns: this.#chosen.stretch[0], to_ns: this.#chosen.stretch[1] } : {};
+    const how = mode === "paced" ? { pace: Number(this.#pace.value) } : { ...(this.#machine.value ? { machine: this.#machine.value } : {}), changes: this.#changes() };
+    this.#start.disabled = true;
+    try {
+      const job = await monitor.order(`${API}/replays`, { recordings: [...this.#chosen.ids], mode, ...times, ...how });
+      location.hash = `#/replays/${job.id}`;
+    } catch (error) {
+      this.#message.textContent = `Not started. ${error instanceof Error ? error.message : String(error)}`;
+      this.#start.disabled = false;
+    }
+  }
+}
+
+customElements.define("replay-order", ReplayOrder);

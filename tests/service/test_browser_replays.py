@@ -1,0 +1,163 @@
+"""Recordings in a browser: found on a line of time, replayed with another limit, looked through window by window."""
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+
+from models.machine import load_machine
+from rotorwatch.records.replays import ReplayJob
+from service.runtime import Runtime, running
+from service.settings.service import RecordingSettings
+from simulator.scenario import parse_fault
+from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, violations
+from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, send, settings, until
+from tests.service.monitored import client
+from tests.service.replaying import recording
+
+ID = "demo/lab/20260101T000000Z.mcap"
+SECONDS, FAULT_S = 80.0, 30.0
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
+    """A machine that has had a fault, and the recording of it."""
+    folder = tmp_path_factory.mktemp("recordings")
+    blocks = scenario_blocks(SECONDS, parse_fault(f"k_by=-0.33@{FAULT_S:g}"))
+    file = machine_file(
+        tmp_path_factory.mktemp("machine"), *SHORT, ("[operation]", "[ingest]\nno_data_after_s = 3600\n\n[operation]")
+    )
+    recording(folder / ID, blocks, load_machine(file))
+    address = endpoint()
+    plan = settings(address, file, when_full="wait")
+    kept_in = RecordingSettings(directory=str(folder), keep_days=36_500.0)
+    with running(plan.model_copy(update={"recording": kept_in})) as started:
+        send(address, blocks, load_machine(file))
+        worker = started.machines()[0]
+        until(lambda: worker.health().quality.accepted_blocks == len(blocks), "all blocks")
+        yield started
+
+
+def chosen(page: Page, url: str) -> None:
+    """The view of recordings, with what is around the alarm chosen."""
+    page.goto(f"{url}/#/recordings")
+    page.get_by_role("button", name=re.compile("Choose ten minutes before and after .*k_by")).click()
+    expect(page.locator("replay-order")).to_contain_text("1 recording of demo/lab")
+    expect(page.get_by_role("checkbox", name="20260101T000000Z.mcap")).to_be_checked()
+
+
+def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url
+    expect.set_options(timeout=PATIENCE_MS)
+    with looking(browser, url) as page:
+        chosen(page, url)
+        kept(page, "recordings-light")
+        with page.expect_download() as download:
+            page.get_by_role("link", name="Download 20260101T000000Z.mcap").click()
+        assert download.value.suggested_filename == "20260101T000000Z.mcap"
+        page.get_by_label("Alarm when that has lasted, s").fill("10")
+        page.get_by_role("button", name="Start replay").click()
+        view = page.locator("replay-view")
+        expect(view.get_by_role("status").first).to_contain_text("Finished")
+        expect(page.locator(".replay-banner")).to_contain_text("REPLAY of demo/lab. Nothing on this view is live")
+        expect(view).to_contain_text("alarms.on_delay_s = 10")
+
+        # Ten seconds later than live; and windows are full from the twentieth second on.
+        events = page.locator("alarm-comparison tbody tr")
+        expect(events.filter(has_text="raised").filter(has_text="live only")).to_have_count(1)
+        later = events.filter(has_text="raised").filter(has_text="this replay only")
+        expect(later).to_contain_text("k_by")
+        expect(page.locator("state-strip tbody tr")).not_to_have_count(0)
+        expect(page.locator("replay-parameters canvas")).to_have_count(6)
+        window = page.locator("offline-result .window")
+        scrub = page.get_by_role("slider", name="Window")
+        expect(scrub).to_have_attribute("aria-valuetext", re.compile("^window 1 of .*, warming$"))
+        expect(window).to_contain_text("No alarm raised in the replay by then")
+        scrub.focus()
+        page.keyboard.press("End")
+        expect(window.locator("state-mark.alert")).to_be_visible()
+        expect(window).to_contain_text("Raised in the replay by then: k_by (alert, −")
+        expect(page.locator("parameter-table tr.alert")).to_contain_text("bearing stiffness, horizontal")
+        page.keyboard.press("ArrowLeft")
+        moved = scrub.get_attribute("aria-valuetext")
+        last = int(scrub.get_attribute("max") or 0)
+        assert moved is not None
+        assert moved.startswith(f"window {last} of {last + 1},")
+        page.keyboard.press("Home")
+        expect(page.locator("parameter-table tr.alert")).to_have_count(0)
+        page.get_by_role("button", name="alarm event ▸").click()
+        expect(window).to_contain_text("Raised in the replay by then: k_by")
+        replayed = page.url
+        kept(page, "replay-light")
+        assert not violations(page)
+
+        chosen(page, url)
+        page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
+        page.get_by_label("Other lines").fill("alarms.limits.danger_above = 0.9")
+        page.get_by_role("button", name="Start replay").click()
+        expect(view.get_by_role("status").first).to_contain_text("raised at the end: none")
+        expect(page.locator("alarm-comparison tbody tr").first).to_contain_text("live only")
+        page.get_by_label("Beside it").select_option(index=1)
+        expect(page.locator("alarm-comparison tbody tr").first).to_contain_text("the other replay only")
+
+    with browser.new_page() as page:  # whose console says that something was refused
+        chosen(page, url)
+        page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
+        page.get_by_role("button", name="Start replay").click()
+        expect(page.locator("replay-order [role=alert]")).to_contain_text("Not started. changes: ")
+        expect(page.locator("replay-order [role=alert]")).to_contain_text("raise_above < danger_above")
+    for kind, phone, dark in (("dark", False, True), ("phone", True, False)):
+        with looking(browser, url, phone=phone, dark=dark) as page:
+            for name, address in (("replay", replayed), ("recordings", f"{url}/#/recordings")):
+                page.goto(address)
+                expect(page.locator("offline-result, recording-table").get_by_role("table").first).to_be_visible()
+                if name == "replay":
+                    expect(page.locator("replay-levels canvas").first).to_be_visible()
+                kept(page, f"{name}-{kind}")
+                assert not violations(page)
+                assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+
+
+def test_a_paced_replay_is_paused_and_moved(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url
+    expect.set_options(timeout=PATIENCE_MS)
+    with looking(browser, url) as page, client(runtime) as http:
+        chosen(page, url)
+        page.get_by_label("How").select_option("paced")
+        page.get_by_label("Seconds of data per second").fill("0.5")
+        page.get_by_role("button", name="Start replay").click()
+        control = page.locator("paced-control")
+        expect(control).to_contain_text("rotorwatch run --namespace replay/")
+        job_id = page.url.rpartition("/")[2]
+
+        def job() -> ReplayJob:
+            return ReplayJob.model_validate_json(http.get(f"/api/v1/replays/{job_id}").raise_for_status().content)
+
+        def position_s() -> float:
+            progress = job().progress
+            return -1.0 if progress is None else (progress.position_ns - START_NS) / 1e9
+
+        until(lambda: position_s() >= 0, "the first block")
+        control.get_by_role("button", name="Pause").click()
+        expect(control.get_by_role("button", name="Resume")).to_be_visible()
+        assert job().state == "paused"
+        slider = control.get_by_role("slider")
+        expect(slider).to_have_attribute("aria-label", re.compile("00:00:00"))
+        slider.focus()
+        page.keyboard.press("End")
+        page.keyboard.press("PageDown")
+        control.get_by_role("button", name="Resume").click()
+        until(lambda: position_s() > 0.7 * SECONDS, "the place")
+        kept(page, "replay-paced")
+        assert not violations(page)
+        page.get_by_role("button", name="Stop").click()
+        expect(page.locator("replay-view").get_by_role("status").first).to_contain_text("Stopped")
+        assert job().state == "stopped"
+        assert len(runtime.machines()[0].history.events(limit=100)) < 5  # nothing of it was live
