@@ -61,6 +61,7 @@ class Plant:
     feed: Feed
     until: int = 300
     cut: threading.Event = field(default_factory=threading.Event)
+    heard: list[str] = field(default_factory=list)  # on the topic of alarm events
 
     def run(self) -> None:
         for number, block in enumerate(scenario_blocks(100.0, parse_fault(f"k_by=-0.33@{FAULT_AT / 10}"))):
@@ -84,6 +85,7 @@ def plant_running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Plant]:
     plan = settings(address, when_full="wait").model_copy(update={"machines": tuple(entries)})
     with running(plan) as runtime, open_session(address) as session:
         made = Plant(runtime, Feed(session, LAB))
+        session.declare_subscriber(LAB.keys.alarm_event, lambda sample: made.heard.append(sample.payload.to_string()))
         thread = threading.Thread(target=made.run)
         thread.start()
         yield made

@@ -26,6 +26,7 @@ from tests.service.browsing import (
     plant_running,
     violations,
 )
+from tests.service.live import until
 from tests.service.monitored import GUARDED, PLACE, client, fed, token
 
 
@@ -142,6 +143,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         why.get_by_role("button", name="Acknowledge").click()
         expect(seen.get_by_role("button", name="Acknowledge")).to_have_count(0)
         assert http.get(f"{PLACE}/alarms/k_by").json()["state"] == "acknowledged"
+        until(lambda: "acknowledged by anonymous" in " ".join(plant.heard), "acknowledgement on the topic")
         expect(why.locator("alarm-list")).to_contain_text("acknowledged")
 
         plant.cut.set()

@@ -2,7 +2,7 @@ import { clock } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { why } from "./alarm-list.js";
+import { why } from "./why-link.js";
 import "../elements/state-mark.js";
 
 const PAGE = 50;

@@ -1,8 +1,9 @@
 import { clock, interval, percent } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
 import { monitor, Refused } from "../monitor/monitor.js";
-import { byUrgency, ofMachine, UNSEEN } from "../monitor/states.js";
+import { byUrgency, UNSEEN } from "../monitor/states.js";
 import { ordered } from "./alarm-order.js";
+import { why } from "./why-link.js";
 import "../elements/state-mark.js";
 
 /** @typedef {import("../monitor/records.js").Alarm} Alarm */
@@ -23,9 +24,6 @@ const keyOf = ({ place, alarm }) => `${place} ${alarm.name}`;
 
 /** When its condition began. @param {Alarm} alarm */
 const came = (alarm) => alarm.raised_ns ?? alarm.since_ns;
-
-/** To what an alarm rests on; nothing for those that no window decides. @param {string} place @param {{name: string, occurrence: number, evidence: unknown}} alarm */
-export const why = (place, { name, occurrence, evidence }) => evidence && ofMachine({ name }) ? html("a", { href: `#/why/${place}/${encodeURIComponent(name)}/${occurrence}` }, "Why?") : null;
 
 /** What can be done to an alarm as it is: the order, the button, and the scope that takes. @param {Alarm} alarm @returns {[string, string, string, boolean][]} */
 function operations(alarm) {

@@ -2,6 +2,7 @@ import { clock } from "../monitor/figures.js";
 import { html } from "../elements/markup.js";
 import { monitor } from "../monitor/monitor.js";
 import { byUrgency, stands, UNSEEN } from "../monitor/states.js";
+import { why } from "./why-link.js";
 import "../elements/state-mark.js";
 
 const SHOWN = 5;
@@ -40,7 +41,7 @@ class AlarmStrip extends HTMLElement {
         { class: UNSEEN.has(alarm.state) ? "unseen" : null },
         html("state-mark", { state: alarm.raised ? alarm.severity : "cleared" }),
         html("a", { href: `#/machines/${place}` }, place),
-        html("span", { class: "what" }, alarm.text),
+        html("span", { class: "what" }, alarm.text, " ", why(place, alarm)),
         html("span", { class: "note" }, alarm.state),
         html("time", { class: "number" }, clock(alarm.raised_ns ?? alarm.since_ns)),
       ),
