@@ -227,17 +227,17 @@ class SpectralModel:
             (self.cutoff_at, self.order_at), low_pass_slopes(self.groups.nodes_hz, *self.filter(theta)), strict=True
         ):
             out[at] = packed(_summed(response * slope[:, :, None, None], whitened))
-        columns = L_inverse.transpose(2, 0, 1)
-        densities = packed(columns[:, :, :, None] * columns.conj()[:, :, None, :])
+        of_noise = L_inverse.transpose(2, 0, 1)
+        densities = packed(of_noise[:, :, :, None] * of_noise.conj()[:, :, None, :])
         out[self.noise_at] = self._noise_parts(theta).T[:, :, None] * densities[self._motion_of]
         out[self.colour_at] = (self.noise(theta) * self._noise_shape[:, None]).T[:, :, None] * densities
-        for dof in range(6):
-            force = whitened[..., dof].transpose(0, 2, 1) @ response[..., dof].conj()
-            slope = twice_packed(force) / 2
-            out[self.shape_at][dof::6] = self._b.T[:, :, None] * slope
-        for number, (row, column) in enumerate(zip(ROWS, COLUMNS, strict=True)):
-            pair = whitened[..., row].transpose(0, 2, 1) @ whitened[..., column].conj()
-            out[self.level_at.start + number] = twice_packed(pair) * (0.5 if row == column else 1.0)
+        left, right = (side.transpose(3, 0, 2, 1) for side in (whitened, response.conj()))  # of every force
+        by_force = twice_packed(np.asarray(left @ right.swapaxes(2, 3))) / 2
+        of_shapes = out[self.shape_at].reshape(self.shapes, 6, *out.shape[1:])
+        np.multiply(self._b.T[:, None, :, None], by_force, out=of_shapes)
+        columns = whitened.transpose(0, 2, 3, 1).reshape(len(whitened), self.n * 6, -1)
+        pairs = (columns @ columns.conj().swapaxes(1, 2)).reshape(-1, self.n, 6, self.n, 6)[:, :, ROWS, :, COLUMNS]
+        out[self.level_at] = twice_packed(pairs) * np.where(ROWS == COLUMNS, 0.5, 1.0)[:, None, None]
         return out
 
     def sides(self, point: ModelPoint, whitened: ComplexArray, response: ComplexArray) -> "Sides":
