@@ -99,6 +99,26 @@ class ReadingList(Record):
     )
 
 
+class Trend(Record):
+    """One reading of one machine up to its newest window; n values each."""
+
+    site: Site
+    machine: Name
+    quantity: str = Field(description="as in the list of readings", examples=["parameter"])
+    name: str = Field(description="which parameter, equation or level", examples=["k_by"])
+    length_ns: int | None = Field(description="of each bucket; null if there is none", examples=[1_800_000_000_000])
+    starts_ns: tuple[int, ...] = Field(
+        description="when each bucket begins; those without a reading are left out", examples=[(EXAMPLE_NS,)]
+    )
+    means: tuple[float, ...] = Field(description="mean of the readings in each bucket", examples=[(-0.246,)])
+
+
+class TrendList(Record):
+    """What was asked for, in that order."""
+
+    trends: tuple[Trend, ...] = Field(description="one for each `of`, in that order")
+
+
 class AuditRecord(Record):
     """One entry of the audit log."""
 

@@ -264,16 +264,33 @@ class MachineStore:
         names : sequence of str, optional
             Which; all if left out.
         since_ns, until_ns : int, optional
-            Windows with since_ns ≤ end_ns < until_ns; all if left out. Over more than 20 000 windows, or where readings
-            have been dropped, stored buckets are taken; those returned are multiples of them in length then and begin
-            at multiples of that, so the first may begin before `since_ns`. Only where readings have been dropped, a
-            stored bucket counts as a whole, if its beginning is within.
+            Windows with since_ns ≤ end_ns < until_ns; all if left out. Buckets begin with the first of them. Over more
+            than 20 000 windows, over more than 2000 where `points` asks for half a stored bucket or more, or where
+            readings have been dropped, stored buckets are taken; those returned are multiples of them in length then
+            and begin at multiples of that, so the first may begin before `since_ns`. Only where readings have been
+            dropped, a stored bucket counts as a whole, if its beginning is within.
         points : int
             At most this many buckets for each name; those without a reading are left out.
         """
         with self._database.reading() as connection:
             of = connection, self._claim.machine_id, self._bucket_ns
             return trend(*of, quantity, names, since_ns, until_ns, _checked(points))
+
+    def latest(self, quantity: str, name: str, *, span_ns: int, points: int) -> tuple[ReadingBucket, ...]:
+        """Readings of one name up to the newest window, reduced like those of `downsampled`.
+
+        Parameters
+        ----------
+        span_ns : int
+            How long before the end of the newest window.
+        """
+        window = windows.c
+        newest = select(window.end_ns).where(window.machine_id == self._claim.machine_id)
+        with self._database.reading() as connection:
+            end_ns = connection.scalar(newest.order_by(window.end_ns.desc()).limit(1))
+            of = connection, self._claim.machine_id, self._bucket_ns
+            since_ns = max(0, (end_ns or 0) - span_ns)
+            return trend(*of, quantity, [name], since_ns, None, _checked(points))
 
     def _follow(self, events: Sequence[StoredEvent]) -> int:
         """The last sequence after these events."""

@@ -13,6 +13,8 @@ from service.history.windows import BUCKET, READING, Records, add_up, finite, si
 
 _SINGLE = 20_000
 """Windows whose single readings are reduced when a trend is asked for; over more of them the stored buckets are."""
+_SINGLE_FOR_COARSE = 2_000
+"""The same where stored buckets are at most twice as long as what is asked for; they cost a tenth."""
 _END = 2**63 - 1
 _Timed = tuple[npt.NDArray[np.int64], Records]
 """Buckets, and when each begins."""
@@ -51,14 +53,16 @@ def trend(  # noqa: PLR0913  # each narrows it
         connection.scalar(asked.order_by(order).limit(1)) for order in (window.end_ns.asc(), window.end_ns.desc())
     )
     found, unit, parts = [each for each in (oldest, newest) if each is not None], 1, list[_Timed]()
-    count = select(func.count()).select_from(asked.limit(_SINGLE + 1).subquery())
-    single = dropped_ns < since and connection.execute(count).scalar_one() <= _SINGLE
+    coarse = bool(found) and 2 * (found[-1] - max(since, found[0])) >= bucket_ns * points
+    most = min(_SINGLE, _SINGLE_FOR_COARSE) if coarse else _SINGLE
+    count = select(func.count()).select_from(asked.limit(most + 1).subquery())
+    single = dropped_ns < since and connection.execute(count).scalar_one() <= most
     if not single:
         unit, stored = _stored(connection, machine_id, list(titles), since, until, bucket_ns)
         found += [int(each) for times, _ in stored for each in (times.min(), times.max())]
     if not found:
         return ()
-    start = (min(found) if since_ns is None else since) // unit * unit
+    start = max(since, min(found)) // unit * unit
     end = max(found) + 1 if until_ns is None else until
     shortest = -(-(end - start) // points)
     length = -(-shortest // unit) * unit

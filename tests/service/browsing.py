@@ -8,7 +8,7 @@ kept up to date, so where there is none, these tests are skipped (what is asked 
 import os
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 from service.runtime import Runtime, running
 from service.settings.service import MachineEntry
@@ -117,6 +117,12 @@ def looking(browser: Browser, url: str, *, phone: bool = False, dark: bool = Fal
 def kept(page: Page, name: str) -> None:
     if SCREENSHOTS:
         page.screenshot(path=Path(SCREENSHOTS) / f"{name}.png", full_page=True)
+
+
+def route_events(page: Page, instead: Callable[[Route], None]) -> None:
+    """Tell a page something else than the monitor does, and end that."""
+    page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
+    page.route("**/api/v1/events", instead)
 
 
 def violations(page: Page) -> list[str]:

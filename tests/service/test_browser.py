@@ -24,6 +24,7 @@ from tests.service.browsing import (
     kept,
     looking,
     plant_running,
+    route_events,
     violations,
 )
 from tests.service.live import until
@@ -70,10 +71,16 @@ def test_who_signs_in_with_a_token_sees_the_machine_until_signing_out(browser: B
         page.reload()
         expect(page.locator("sign-in")).to_have_count(0)
         page.goto(f"{url}/#/")
-        page.locator("summary", has_text="1 without data").click()
+        page.get_by_text("1 without data").click()
         page.get_by_role("heading", name="demo/lab").wait_for()
+        others = [context.new_page() for _ in range(6)]  # more than a caller has streams, and a browser connections
+        for other in others:
+            other.goto(url)
+            expect(other.locator(".apart summary")).to_have_text("1 without data")
         page.get_by_role("button", name="Sign out").click()
         expect(said).to_have_text("Signed out.")
+        for other in others:
+            expect(other.locator("sign-in")).to_be_visible()
         assert not context.cookies()
         page.reload()
         expect(page.locator("sign-in")).to_be_visible()
@@ -101,7 +108,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         assert "unsafe" not in policy
         tile = page.locator("machine-tile[place='demo/lab']")
         expect(tile.locator("state-mark")).to_have_text("healthy")
-        expect(page.locator("summary")).to_have_text("1 without data")
+        expect(page.locator(".apart summary")).to_have_text("1 without data")
         second.goto(f"{url}/#/alarms")
         plant.until = SEEN_AT
 
@@ -194,7 +201,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     sensor = {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "H", "unit": "m/s2"}
     file = {"description": "", "rotor": None, "operation": None, "sensors": [sensor]}
     with looking(browser, url) as page:
-        page.route("**/api/v1/events", instead)
+        route_events(page, instead)
         page.goto(f"{url}/#/machines/demo/lab")
         view = page.locator("machine-view")
         expect(view).to_contain_text("<b>reason</b> & more")
@@ -212,7 +219,7 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     told["report"] = report | {"parameters": [], "verdict": None, "levels": [growing]}
     told["alarms"] = [told["alarms"][0] | {"name": "level:DE-H", "severity": "danger"}]
     with looking(browser, url) as page:
-        page.route("**/api/v1/events", instead)
+        route_events(page, instead)
         page.route("**/configuration", lambda route: route.fulfill(json={"file": file}))
         page.goto(f"{url}/#/machines/demo/lab")
         expect(page.locator("rotor-drawing .sensor.danger")).to_contain_text("DE-H ◆ danger")

@@ -106,6 +106,37 @@ def test_windows_are_added_to_their_bucket_when_one_of_another_time_comes(
     assert counts(lab, points=1) == [11]
 
 
+def test_a_trend_begins_with_the_first_reading_and_ends_with_the_newest_window(store: Store) -> None:
+    lab = store.machine("demo", "lab")
+    for time_s in range(0, 100, 10):
+        commit(lab, time_s)
+    found = lab.downsampled(quantity="parameter", names=["e"], since_ns=T0 - 3600 * NS, points=10)
+    assert [one.count for one in found] == [1] * 10
+    assert found[0].start_ns == T0
+    latest = lab.latest("parameter", "e", span_ns=30 * NS, points=4)
+    assert [round((one.start_ns - T0) / NS) for one in latest] == [60, 68, 75, 83]
+    assert sum(one.count for one in latest) == 4
+    assert lab.latest("parameter", "nothing", span_ns=30 * NS, points=4) == ()
+    assert store.machine("demo", "none").latest("parameter", "e", span_ns=30 * NS, points=4) == ()
+
+
+def test_what_is_asked_coarsely_of_many_windows_is_made_of_buckets(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 100)
+    lab = store.machine("demo", "lab")
+    commit(lab, *range(0, 7200, 60))
+    commit(lab, 7260)
+    lengths = {
+        points: {one.length_ns // NS for one in lab.downsampled(quantity="parameter", names=["e"], points=points)}
+        for points in (6, 24, 25)
+    }
+    assert lengths == {6: {1800}, 24: {600}, 25: {290}}
+    assert [sum(counts(lab, points)) for points in (6, 24, 25)] == [121] * 3
+    monkeypatch.setattr("service.history.trend._SINGLE_FOR_COARSE", 121)
+    assert lab.downsampled(quantity="parameter", names=["e"], points=24)[0].length_ns == 7260 * NS // 24 + 1
+
+
 def test_readings_count_once_when_the_length_of_buckets_is_another_after_a_restart(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

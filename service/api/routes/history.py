@@ -1,5 +1,6 @@
 """The history over HTTP: alarm events, window reports, readings over time, and the audit log."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Annotated, Any
@@ -11,7 +12,16 @@ from pydantic_core import PydanticCustomError
 
 from rotorwatch.records.alarms import EventKind, Severity
 from rotorwatch.records.health import MEASURES
-from rotorwatch.records.history import AlarmEventList, AlarmEvidence, AuditList, AuditRecord, ReadingList, ReportList
+from rotorwatch.records.history import (
+    AlarmEventList,
+    AlarmEvidence,
+    AuditList,
+    AuditRecord,
+    ReadingList,
+    ReportList,
+    Trend,
+    TrendList,
+)
 from rotorwatch.records.monitor import HistoryStatus
 from service.access.guard import Guard
 from service.access.problems import responses
@@ -28,6 +38,7 @@ from service.api.views import (
 )
 
 _LARGEST = 2**63 - 1
+_PLACE = "[A-Za-z0-9][A-Za-z0-9_-]{0,63}"
 _QUANTITIES = ("parameter", "equation", "level", *MEASURES)
 
 _After = Annotated[
@@ -61,6 +72,7 @@ _Points = Annotated[
     int | None,
     Query(ge=1, le=5000, description="reduce each to at most so many buckets of equal length, instead of one by one"),
 ]
+_Of = Annotated[str, Query(pattern=rf"^{_PLACE}/{_PLACE}/({'|'.join(_QUANTITIES)})/[A-Za-z0-9_.:-]{{1,80}}$")]
 _Plain = Annotated[str | None, Query(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
@@ -172,6 +184,15 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
         following = found[-1].number if len(found) == limit else None
         return ReadingList(quantity=quantity, readings=found, buckets=(), next_after=following)
 
+    @app.get("/api/v1/trends", responses=responses(TrendList, 404, 422), **common)
+    def trends(
+        of: Annotated[list[_Of], Query(min_length=1, max_length=64, description="site/machine/quantity/name")],
+        hours: Annotated[int, Query(ge=1, le=87_600, description="up to the end of the machine's newest window")] = 24,
+        points: Annotated[int, Query(ge=1, le=500, description="at most so many buckets for each")] = 48,
+    ) -> TrendList:
+        """What was read lately of many machines at once, for an overview of the plant."""
+        return TrendList(trends=tuple(_trend(service, each, hours, points) for each in of))
+
     @app.get("/api/v1/audit", tags=["service"], dependencies=[guard.configure], responses=responses(AuditList, 422))
     def audit(
         before: _Before = None,
@@ -188,6 +209,22 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
     def history() -> HistoryStatus:
         """How large the history is, how far back it goes, and for how long things are kept."""
         return service.holdings.read()
+
+
+def _trend(service: ServiceView, of: str, hours: int, points: int) -> Trend:
+    site, machine, quantity, name = of.split("/")
+    span_ns = hours * 3_600_000_000_000
+    found = found_machine(service, site, machine).history.latest(quantity, name, span_ns=span_ns, points=points)
+    buckets = [one for one in found if math.isfinite(one.mean)]
+    return Trend(
+        site=site,
+        machine=machine,
+        quantity=quantity,
+        name=name,
+        length_ns=buckets[0].length_ns if buckets else None,
+        starts_ns=tuple(one.start_ns for one in buckets),
+        means=tuple(one.mean for one in buckets),
+    )
 
 
 def _listed(name: str, texts: Sequence[str], **cursors: int | None) -> Response:

@@ -32,7 +32,7 @@ class AlarmStrip extends HTMLElement {
 
   #show() {
     const all = standing();
-    const said = JSON.stringify([all.length, all.slice(0, SHOWN)]);
+    const said = JSON.stringify([all.length, all.slice(0, SHOWN).map(({ place, alarm }) => [place, { ...alarm, evidence: null }])]);
     if (said === this.#said) return;
     this.#said = said;
     const rows = all.slice(0, SHOWN).map(({ place, alarm }) =>

@@ -36,6 +36,26 @@ export function lay(parent, ...children) {
 }
 
 /**
+ * Let a parent have a child for each key, in this order; one that stays is the same element, and keeps the focus.
+ * @param {Element} parent
+ * @param {string[]} keys
+ * @param {Map<string, HTMLElement>} made children by key
+ * @param {(key: string) => HTMLElement} make
+ */
+export function arrange(parent, keys, made, make) {
+  const focused = document.activeElement;
+  const children = keys.map((key) => {
+    const child = made.get(key) ?? make(key);
+    made.set(key, child);
+    return child;
+  });
+  const kept = new Set(children);
+  for (const old of /** @type {HTMLElement[]} */ ([...parent.children])) if (!kept.has(old)) old.remove();
+  children.forEach((child, at) => parent.children[at] === child || parent.insertBefore(child, parent.children[at] ?? null));
+  if (focused instanceof HTMLElement && focused !== document.activeElement && parent.contains(focused)) focused.focus({ preventScroll: true });
+}
+
+/**
  * An element of the page; attributes that are functions are listeners.
  * @param {string} tag
  * @param {Attributes} [attributes]

@@ -1,83 +1,81 @@
 import { svg } from "./markup.js";
-import { monitor, pathOf } from "../monitor/monitor.js";
+import { monitor } from "../monitor/monitor.js";
 import { MachineElement } from "./machine-element.js";
 
-const [WIDTH, HEIGHT, POINTS, DAY_NS] = [120, 28, 48, 86_400e9];
+const [WIDTH, HEIGHT] = [120, 28];
 const REFRESH_S = 300;
-const AT_ONCE = 4;
+const [TOGETHER, SOON_MS, PACE_MS] = [64, 50, 1000];
 
-/** Elements that wait for their turn: a plant of five hundred tiles asks a few at a time. @type {SparkLine[]} */
-const waiting = [];
-let asking = 0;
+/** Elements that can be seen and wait for their line; asked for together, once a second. @type {Set<SparkLine>} */
+const waiting = new Set();
+let asking = false;
 
-function next() {
-  while (asking < AT_ONCE && waiting.length) {
-    asking += 1;
-    const one = /** @type {SparkLine} */ (waiting.shift());
-    one.load().finally(() => {
-      asking -= 1;
-      next();
-    });
+async function askTogether() {
+  if (asking) return;
+  asking = true;
+  await pause(SOON_MS);
+  while (waiting.size) {
+    const some = [...waiting].slice(0, TOGETHER);
+    for (const one of some) waiting.delete(one);
+    if (document.hidden) continue;
+    try {
+      const { trends } = await monitor.ask(`/api/v1/trends?${new URLSearchParams(some.map((one) => ["of", one.of]))}`);
+      some.forEach((one, at) => one.draw(trends[at]));
+    } catch {
+      for (const one of some) one.replaceChildren();
+    }
+    await pause(PACE_MS);
   }
+  asking = false;
 }
 
+const pause = (/** @type {number} */ ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
 const seen = new IntersectionObserver((entries) => {
-  for (const entry of entries) if (entry.isIntersecting) /** @type {SparkLine} */ (entry.target).queue();
+  for (const { target, isIntersecting } of entries) /** @type {SparkLine} */ (target).seen(isIntersecting);
 });
 
 /** The last 24 h of one reading, without numbers: `<spark-line place quantity series>`. */
 class SparkLine extends MachineElement {
-  #asked = -Infinity;
+  #drawn = -Infinity;
+  #visible = false;
 
   connectedCallback() {
     super.connectedCallback();
     seen.observe(this);
-    this.repeat(REFRESH_S, () => this.queue());
+    this.repeat(REFRESH_S / 5, () => this.seen(this.#visible));
   }
 
   disconnectedCallback() {
     super.disconnectedCallback();
     seen.unobserve(this);
+    waiting.delete(this);
   }
 
-  /** Load when it is one's turn. */
-  queue() {
-    if (performance.now() - this.#asked < 1000 * REFRESH_S - 1 || waiting.includes(this)) return;
-    waiting.push(this);
-    next();
+  /** What the line is of. */
+  get of() {
+    return [this.place, this.getAttribute("quantity"), this.getAttribute("series")].join("/");
   }
 
-  async ask() {
-    const end = this.health?.report?.end_ns;
-    if (!this.isConnected || !end) return;
-    this.#asked = performance.now();
-    const of = { quantity: this.getAttribute("quantity") ?? "", name: this.getAttribute("series") ?? "", points: String(POINTS) };
-    const read = (/** @type {Record<string, string>} */ more) => monitor.ask(`${pathOf(this.place)}/readings?${new URLSearchParams({ ...of, ...more })}`);
-    const day = await read({ since_ns: String(Math.max(0, end - DAY_NS)) });
-    // Buckets divide the time that was asked for: of a monitor that is younger than a day all may be in the last.
-    this.#draw(day.buckets.length > POINTS / 4 ? day.buckets : (await read({})).buckets.filter((/** @type {{start_ns: number}} */ one) => one.start_ns >= end - DAY_NS));
+  /** Wait for a line while somebody sees where it is to be. @param {boolean} visible */
+  seen(visible) {
+    this.#visible = visible;
+    waiting.delete(this);
+    if (!visible || performance.now() - this.#drawn < 1000 * REFRESH_S) return;
+    waiting.add(this);
+    askTogether();
   }
 
-  refused() {
-    this.replaceChildren();
-  }
-
-  /** @param {import("../monitor/records.js").Bucket[]} buckets */
-  #draw(buckets) {
-    if (buckets.length < 2) return this.replaceChildren();
-    const [first, last] = [buckets[0].start_ns, buckets[buckets.length - 1].start_ns];
-    const values = buckets.map((one) => one.mean);
-    const [low, high] = [Math.min(...values), Math.max(...values)];
+  /** @param {import("../monitor/records.js").Trend} trend */
+  draw({ starts_ns: starts, means }) {
+    if (starts.length < 2) return this.replaceChildren();
+    this.#drawn = performance.now();
+    const [first, last] = [starts[0], starts[starts.length - 1]];
+    const [low, high] = [Math.min(...means), Math.max(...means)];
     const x = (/** @type {number} */ ns) => 2 + ((WIDTH - 4) * (ns - first)) / (last - first);
     const y = (/** @type {number} */ value) => HEIGHT - 3 - ((HEIGHT - 6) * (value - low)) / (high - low || 1);
-    const line = buckets.map((one) => `${x(one.start_ns).toFixed(1)},${y(one.mean).toFixed(1)}`).join(" ");
-    this.replaceChildren(
-      svg(
-        "svg",
-        { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", "aria-hidden": "true" },
-        svg("polyline", { points: line }),
-      ),
-    );
+    const points = starts.map((start, at) => `${x(start).toFixed(1)},${y(means[at]).toFixed(1)}`).join(" ");
+    this.replaceChildren(svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", "aria-hidden": "true" }, svg("polyline", { points })));
   }
 }
 

@@ -1,10 +1,13 @@
 /** What the page knows of the monitor: asked over HTTP, kept up to date by the stream of events. */
 
+import { EventStream } from "./event-stream.js";
+
 /** @typedef {import("./records.js").Health} Health */
 /** @typedef {import("./records.js").Alarm} Alarm */
 
 export const API = "/api/v1";
 const AGAIN_MS = 5_000;
+const TOGETHER_MS = 100;
 
 /** An answer that says what was wrong. */
 export class Refused extends Error {
@@ -16,11 +19,26 @@ export class Refused extends Error {
   }
 }
 
+/**
+ * The stream of events that all pages of a browser share; of one's own where a browser knows nothing to share it with.
+ * @param {import("./event-stream.js").Listener} hear
+ * @returns {(order: "listen" | "leave" | "renew") => void}
+ */
+function sharedStream(hear) {
+  if (!("SharedWorker" in window)) {
+    const own = new EventStream();
+    return (order) => own[order](hear);
+  }
+  const { port } = new SharedWorker(new URL("./shared-stream.js", import.meta.url), { type: "module" });
+  port.onmessage = ({ data }) => hear(data);
+  return (order) => port.postMessage(order);
+}
+
 /** @param {string} place */
 export const pathOf = (place) => `${API}/machines/${place}`;
 
 /**
- * Tells `health` (the detail is the machine), `health:SITE/MACHINE`, `alarm`, `connection`, and `caller` where another one, or nobody, is signed in.
+ * Tells `health:SITE/MACHINE`, `health` of any machine but at most ten times a second, `alarm`, `connection`, and `caller` where another one, or nobody, is signed in.
  */
 export class Monitor extends EventTarget {
   /** @type {Map<string, {health: Health, heard: number}>} */
@@ -32,8 +50,14 @@ export class Monitor extends EventTarget {
   connected = false;
   /** @type {number | null} since when nothing is heard */
   lostAt = null;
-  /** @type {EventSource | null} */
-  #stream = null;
+  #order = sharedStream((told) => this.#hear(told));
+  #due = 0;
+
+  constructor() {
+    super();
+    addEventListener("pagehide", () => this.#order("leave"));
+    addEventListener("pageshow", ({ persisted }) => persisted && this.listen());
+  }
 
   /** Begin to listen, now and whenever the stream has ended. */
   async listen() {
@@ -45,17 +69,21 @@ export class Monitor extends EventTarget {
       setTimeout(() => this.listen(), AGAIN_MS);
       return;
     }
-    const stream = new EventSource(`${API}/events`);
-    this.#stream = stream;
-    stream.addEventListener("start", () => this.#found());
-    stream.addEventListener("health", (event) => this.#health(JSON.parse(event.data)));
-    stream.addEventListener("alarm", (event) => this.#tell("alarm", JSON.parse(event.data).data));
-    stream.addEventListener("error", () => {
+    this.#order("listen");
+  }
+
+  /** @param {import("./event-stream.js").Told} told */
+  #hear({ kind, text, at }) {
+    if (kind === "start") this.#found();
+    else if (kind === "health") this.#health(JSON.parse(text), at - performance.timeOrigin);
+    else if (kind === "alarm") this.#tell("alarm", JSON.parse(text).data);
+    else if (kind === "renewed") {
+      this.machines.clear();
+      this.listen();
+    } else {
       this.#lost("the stream of events has ended");
-      if (stream.readyState !== EventSource.CLOSED) return; // else the browser tries again by itself
-      stream.close();
-      setTimeout(() => this.listen(), AGAIN_MS);
-    });
+      if (kind === "ended") setTimeout(() => this.listen(), AGAIN_MS);
+    }
   }
 
   /** Whether the caller may operate alarms, or with `configure` take them out of service. @param {string} scope */
@@ -70,12 +98,13 @@ export class Monitor extends EventTarget {
    */
   async signIn(token) {
     await this.#session("POST", { Authorization: `Bearer ${token}` });
+    this.#order("renew");
     await this.listen();
   }
 
   async signOut() {
     await this.#session("DELETE");
-    this.#stream?.close();
+    this.#order("renew");
     this.machines.clear();
     this.#known(null, "Signed out.");
   }
@@ -127,12 +156,15 @@ export class Monitor extends EventTarget {
     return known && age !== null && age !== undefined ? age + (performance.now() - known.heard) / 1000 : null;
   }
 
-  /** @param {Health} health */
-  #health(health) {
+  /** @param {Health} health @param {number} heard */
+  #health(health, heard) {
     const place = `${health.site}/${health.machine}`;
-    this.machines.set(place, { health, heard: performance.now() });
+    this.machines.set(place, { health, heard });
     this.#tell(`health:${place}`, place);
-    this.#tell("health", place);
+    this.#due ||= setTimeout(() => {
+      this.#due = 0;
+      this.#tell("health", "");
+    }, TOGETHER_MS);
   }
 
   /** @param {{name: string, scopes: string[]} | null} caller @param {string} stranger */

@@ -17,6 +17,7 @@
  * @typedef {{publisher_alive: boolean, silent: boolean, silent_since_ns: number | null, data_age_s: number | null, replay_announced: boolean, descriptor_mismatch: string[]}} Stream
  * @typedef {{site: string, machine: string, state: string, reason: string, filled: number, report: Report | null, alarms: Alarm[], quality: Quality, stream: Stream, restart: string, worker_errors: number, last_worker_error: string, machine_hash: string}} Health
  * @typedef {{name: string, start_ns: number, length_ns: number, count: number, minimum: number, mean: number, maximum: number, mean_standard_error: number | null}} Bucket
+ * @typedef {{starts_ns: number[], means: number[]}} Trend
  * @typedef {{semi_major: number, semi_minor: number, tilt_deg: number, sense: string, precession: string | null}} Ellipse
  * @typedef {{location: string, unit: string, ellipse: Ellipse | null, nominal: Ellipse | null, estimated: Ellipse | null, path: {times_s: number[], y: number[], z: number[]} | null}} PlaceOrbit
  * @typedef {{speed_rad_s: number | null, orbits: PlaceOrbit[], revolutions: number, pulses_s: number[], reason: string, path_reason: string}} Orbits

@@ -6,50 +6,62 @@ import { ABNORMAL, stands, UNSEEN, worst } from "../monitor/states.js";
 import "../elements/spark-line.js";
 import "../elements/state-mark.js";
 
+const seen = new IntersectionObserver(
+  (entries) => {
+    for (const { target, isIntersecting } of entries) /** @type {MachineTile} */ (target).seen(isIntersecting);
+  },
+  { rootMargin: "50%" },
+);
+
 /** One machine of the plant: its worst standing state, what is worst, and how old that is. */
 class MachineTile extends MachineElement {
-  /** @type {Element | null} */
-  #spark = null;
+  #states = html("div", { class: "states" });
+  #worst = html("p", { class: "worst" });
+  #line = html("div", { class: "line" });
+  #count = html("span");
+  #age = html("span", { class: "number" });
+  #near = false;
+  #late = false;
 
   connectedCallback() {
     super.connectedCallback();
-    this.repeat(5, () => this.age());
+    seen.observe(this);
+    this.repeat(5, () => this.#near && this.age());
+  }
+
+  disconnectedCallback() {
+    super.disconnectedCallback();
+    seen.unobserve(this);
+  }
+
+  /** What is far from being seen, of a plant of many machines, is brought up to date when it comes near. @param {boolean} near */
+  seen(near) {
+    this.#near = near;
+    if (near && this.#late) this.show();
   }
 
   show() {
     const health = this.health;
     if (!health) return;
+    this.#late = !this.#near && this.childElementCount > 0;
+    if (this.#late) return;
     const silent = health.stream.silent;
     const found = worst(health);
     const unseen = health.alarms.filter((one) => UNSEEN.has(one.state)).length;
     const standing = health.alarms.filter(stands).length;
     this.className = ABNORMAL.has(health.state) ? `tile ${health.state}` : silent ? "tile no-data" : "tile";
-    lay(
-      this,
-      html("div", { class: "states" }, html("state-mark", { state: health.state }), silent && health.state !== "no-data" && html("state-mark", { state: "no-data" })),
-      html("h2", {}, html("a", { href: `#/machines/${this.place}` }, html("small", {}, `${health.site}/`), health.machine)),
-      html(
-        "p",
-        { class: "worst" },
-        ...(found ? [html("span", {}, found.title), html("b", { class: "number" }, found.value), html("small", {}, found.limit)] : [html("span", {}, health.reason || "Nothing has been evaluated yet.")]),
-      ),
-      this.#line(found),
-      html("p", { class: "foot" }, html("span", {}, unseen ? `${unseen} unacknowledged` : standing ? `${standing} acknowledged` : "no alarm"), html("span", { class: "age number" })),
-    );
+    if (!this.childElementCount) lay(this, this.#states, html("h3", {}, html("a", { href: `#/machines/${this.place}` }, html("small", {}, `${health.site}/`), health.machine)), this.#worst, this.#line, html("p", { class: "foot" }, this.#count, this.#age));
+    lay(this.#states, html("state-mark", { state: health.state }), silent && health.state !== "no-data" && html("state-mark", { state: "no-data" }));
+    lay(this.#worst, ...(found ? [html("span", {}, found.title), html("b", { class: "number" }, found.value), html("small", {}, found.limit)] : [html("span", {}, health.reason || "Nothing has been evaluated yet.")]));
+    this.#count.textContent = unseen ? `${unseen} unacknowledged` : standing ? `${standing} acknowledged` : "no alarm";
+    const line = this.#line.firstElementChild;
+    if ((line?.getAttribute("series") ?? "") !== (found?.series ?? "")) lay(this.#line, found?.series && html("spark-line", { place: this.place, quantity: found.quantity, series: found.series }));
     this.age();
   }
 
   age() {
-    const [age, shown] = [monitor.dataAge(this.place), this.querySelector(".age")];
-    if (shown) shown.textContent = age === null ? "never any data" : `data ${lasting(age)} old`;
-  }
-
-  /** The same element as long as it shows the same series. @param {import("../monitor/states.js").Worst | null} found */
-  #line(found) {
-    if (!found?.series) return null;
-    if (this.#spark?.getAttribute("series") !== found.series)
-      this.#spark = html("spark-line", { place: this.place, quantity: found.quantity, series: found.series });
-    return this.#spark;
+    const age = monitor.dataAge(this.place);
+    this.#age.textContent = age === null ? "never any data" : `data ${lasting(age)} old`;
   }
 }
 

@@ -1,35 +1,54 @@
-import { html } from "../elements/markup.js";
+import { arrange, html } from "../elements/markup.js";
 import { monitor } from "../monitor/monitor.js";
 import { STATES, stands, urgency } from "../monitor/states.js";
 import "../alarms/alarm-strip.js";
-import "./machine-tile.js";
+import "./site-section.js";
+
+const KEPT = "rotorwatch.order";
+const byName = new Intl.Collator(undefined, { numeric: true }).compare;
 
 /** @typedef {import("../monitor/records.js").Health} Health */
+/** @typedef {import("./site-section.js").Machine} Machine */
 
-/** Every machine as a tile, the most urgent first; those without data and without an alarm apart. */
+/** Minutes since the newest data: machines whose data come all the time stay where they are. @param {Machine} machine */
+const minutes = ({ place }) => Math.floor((monitor.dataAge(place) ?? Infinity) / 60);
+
+/** What comes first; names decide between equals. @type {Record<string, (one: Machine, other: Machine) => number>} */
+const ORDERS = {
+  "most urgent first": (one, other) => urgency(one.health.state) - urgency(other.health.state),
+  "by name": () => 0,
+  "oldest data first": (one, other) => (minutes(one) === minutes(other) ? 0 : minutes(other) - minutes(one)),
+};
+
+/** Whether there is nothing to be told of a machine but that it has no data. @param {Health} health */
+const apart = (health) => (health.state === "no-data" || health.stream.data_age_s === null) && !health.alarms.some((one) => stands(one) && one.name !== "stream-lost");
+
+/** Every machine as a tile, by site; those without data and without an alarm apart. */
 class PlantView extends HTMLElement {
   #gone = new AbortController();
-  /** @type {Map<string, Element>} */
+  /** @type {Map<string, HTMLElement>} */
+  #sections = new Map();
+  /** @type {Map<string, HTMLElement>} */
   #tiles = new Map();
-  #due = false;
-  #search = html("input", { type: "search", placeholder: "Search machines", "aria-label": "Search machines", input: () => this.#soon() });
-  #filter = html("select", { "aria-label": "State", change: () => this.#soon() });
-  #found = html("div", { class: "tiles" });
+  #search = /** @type {HTMLInputElement} */ (html("input", { type: "search", placeholder: "Search machines", "aria-label": "Search machines", input: () => this.#arrange() }));
+  #filter = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "State", change: () => this.#arrange() }));
+  #order = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Order", change: () => this.#reorder() }, ...Object.keys(ORDERS).map((each) => html("option", { value: each, selected: each === localStorage.getItem(KEPT) }, each))));
+  #sites = html("div");
   #silent = html("div", { class: "tiles" });
   #summary = html("summary");
-  #apart = html("details", {}, this.#summary, this.#silent);
+  #apart = /** @type {HTMLDetailsElement} */ (html("details", { class: "apart" }, this.#summary, this.#silent));
   #none = html("p", { class: "note", hidden: true });
 
   connectedCallback() {
     this.#gone = new AbortController();
     this.replaceChildren(
       html("alarm-strip"),
-      html("div", { class: "tools" }, html("h1", {}, "Plant"), this.#search, this.#filter),
+      html("div", { class: "tools" }, html("h1", {}, "Plant"), this.#search, this.#filter, this.#order),
       this.#none,
-      this.#found,
+      this.#sites,
       this.#apart,
     );
-    monitor.addEventListener("health", () => this.#soon(), { signal: this.#gone.signal });
+    monitor.addEventListener("health", () => this.#arrange(), { signal: this.#gone.signal });
     this.#arrange();
   }
 
@@ -37,48 +56,36 @@ class PlantView extends HTMLElement {
     this.#gone.abort();
   }
 
-  /** Once a frame, however many machines are heard of. */
-  #soon() {
-    if (this.#due) return;
-    this.#due = true;
-    requestAnimationFrame(() => {
-      this.#due = false;
-      this.#arrange();
-    });
+  #reorder() {
+    localStorage.setItem(KEPT, this.#order.value);
+    this.#arrange();
   }
 
   #arrange() {
     const all = [...monitor.machines].map(([place, { health }]) => ({ place, health }));
     this.#count(all.map((one) => one.health));
-    const words = /** @type {HTMLInputElement} */ (this.#search).value.toLowerCase().split(/\s+/);
-    const state = /** @type {HTMLSelectElement} */ (this.#filter).value;
+    const words = this.#search.value.toLowerCase().split(/\s+/);
+    const state = this.#filter.value;
+    const first = ORDERS[this.#order.value];
     const chosen = all
       .filter(({ place, health }) => words.every((word) => place.toLowerCase().includes(word)) && (!state || health.state === state || (state === "no-data" && health.stream.silent)))
-      .sort((one, other) => urgency(one.health.state) - urgency(other.health.state) || one.place.localeCompare(other.place));
-    const apart = (/** @type {Health} */ health) => (health.state === "no-data" || health.stream.data_age_s === null) && !health.alarms.some((one) => stands(one) && one.name !== "stream-lost");
+      .sort((one, other) => first(one, other) || byName(one.place, other.place));
+    /** @type {Map<string, Machine[]>} */
+    const sites = new Map();
+    for (const one of chosen) if (!apart(one.health)) sites.set(one.health.site, [...(sites.get(one.health.site) ?? []), one]);
+    arrange(this.#sites, [...sites.keys()], this.#sections, (site) => html("site-section", { site }));
+    for (const [site, machines] of sites) /** @type {import("./site-section.js").SiteSection} */ (this.#sections.get(site)).show(machines);
     const silent = chosen.filter(({ health }) => apart(health));
-    this.#place(this.#found, chosen.filter(({ health }) => !apart(health)));
-    this.#place(this.#silent, silent);
+    arrange(this.#silent, silent.map(({ place }) => place), this.#tiles, (place) => html("machine-tile", { place }));
     this.#summary.textContent = `${silent.length} without data`;
     this.#apart.hidden = !silent.length;
     this.#none.hidden = chosen.length > 0;
     this.#none.textContent = all.length ? "No machine is like that." : "Nothing has been heard of any machine yet.";
   }
 
-  /** Elements move only where the order has changed: what has the focus keeps it. @param {Element} where @param {{place: string}[]} machines */
-  #place(where, machines) {
-    const tiles = machines.map(({ place }) => {
-      const made = this.#tiles.get(place) ?? html("machine-tile", { place });
-      this.#tiles.set(place, made);
-      return made;
-    });
-    for (const old of [...where.children]) if (!tiles.includes(old)) old.remove();
-    tiles.forEach((tile, at) => where.children[at] === tile || where.insertBefore(tile, where.children[at] ?? null));
-  }
-
   /** How many are in each state; states that none is in are not offered. @param {Health[]} healths */
   #count(healths) {
-    const chosen = /** @type {HTMLSelectElement} */ (this.#filter).value;
+    const chosen = this.#filter.value;
     const count = (/** @type {string} */ state) => healths.filter((one) => one.state === state || (state === "no-data" && one.stream.silent)).length;
     const options = [["", `all ${healths.length} machines`], ...Object.entries(STATES).flatMap(([state, text]) => (count(state) || state === chosen ? [[state, `${text} (${count(state)})`]] : []))];
     const said = options.map(([, text]) => text).join();
