@@ -132,6 +132,14 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         expect(page.locator("spectrum-plot canvas")).to_be_visible()
         expect(page.get_by_role("img", name="orbit at the bearing")).to_be_visible()
 
+        level = page.locator("level-table tr", has_text="y1").first
+        in_um = float(level.locator("td").nth(2).inner_text())
+        page.get_by_role("button", name="µm, mm/s").click()
+        expect(level).to_contain_text("mil pp")
+        assert float(level.locator("td").nth(2).inner_text()) == pytest.approx(in_um / 25.4, rel=0.3)  # data go on
+        expect(page.get_by_role("img", name="orbit at the bearing")).to_contain_text("mil")
+        page.get_by_role("button", name="mil, in/s").click()
+
         seen = second.locator("alarm-list tr", has_text="k_by")
         expect(seen).to_contain_text("unacknowledged")
         page.locator("alarm-list tr", has_text="k_by").get_by_role("link", name="Why?").click()

@@ -1,4 +1,4 @@
-import { clock, local, showLocal } from "./monitor/figures.js";
+import { clock, inches, local, showInches, showLocal } from "./monitor/figures.js";
 import { html } from "./elements/markup.js";
 import { monitor } from "./monitor/monitor.js";
 import { standing } from "./alarms/alarm-strip.js";
@@ -23,12 +23,13 @@ class RotorwatchPage extends HTMLElement {
   #administration = html("a", { href: "#/administration", hidden: true }, "Administration");
   #who = html("span", { class: "note" });
   #leave = html("button", { type: "button", hidden: true, click: () => this.#signOut() }, "Sign out");
-  #times = html("button", { type: "button", click: () => this.#switch() });
+  #times = html("button", { type: "button", title: "Show times in UTC or in the time of this computer", click: () => this.#switch(showLocal, !local()) });
+  #units = html("button", { type: "button", title: "Show lengths and velocities in µm and mm/s, or in mil and in/s", click: () => this.#switch(showInches, !inches()) });
   #main = html("main", { tabindex: "-1", id: "main" });
 
   connectedCallback() {
     this.replaceChildren(
-      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms, html("a", { href: "#/recordings" }, "Recordings"), this.#administration), this.#who, this.#leave, this.#times),
+      html("header", {}, html("a", { href: "#/", class: "brand" }, "rotorwatch"), html("nav", {}, html("a", { href: "#/" }, "Plant"), this.#alarms, html("a", { href: "#/recordings" }, "Recordings"), this.#administration), this.#who, this.#leave, this.#units, this.#times),
       this.#banner,
       this.#main,
       html("footer", {}, "Monitoring, not machine protection. ", html("a", { href: "/docs" }, "HTTP API"), ", ", html("a", { href: "/openapi.json" }, "its description"), ", ", html("a", { href: "/readyz" }, "readiness")),
@@ -81,8 +82,9 @@ class RotorwatchPage extends HTMLElement {
     }
   }
 
-  #switch() {
-    showLocal(!local());
+  /** @param {(wanted: boolean) => void} show @param {boolean} wanted */
+  #switch(show, wanted) {
+    show(wanted);
     this.#count();
     this.#go(false);
   }
@@ -94,7 +96,7 @@ class RotorwatchPage extends HTMLElement {
     this.#alarms.textContent = all.length ? `Alarms ${all.length}` : "Alarms";
     this.#alarms.classList.toggle("unseen", unseen > 0);
     this.#times.textContent = local() ? "local time" : "UTC";
-    this.#times.title = "Show times in UTC or in the time of this computer";
+    this.#units.textContent = inches() ? "mil, in/s" : "µm, mm/s";
     const where = this.querySelector("machine-view")?.getAttribute("place");
     document.title = `${all.length ? `(${unseen ? `${unseen} of ` : ""}${all.length}) ` : ""}${where ? `${where} · ` : ""}rotorwatch`;
   }

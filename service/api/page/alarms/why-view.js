@@ -1,4 +1,4 @@
-import { clock, figure, interval, lasting, within, Z95 } from "../monitor/figures.js";
+import { clock, figure, interval, lasting, quantity, within, Z95 } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { levelUnit, limitText, measureText } from "../monitor/states.js";
@@ -142,10 +142,10 @@ class WhyView extends HTMLElement {
       return {
         cells: [
           html("b", {}, measureText(measure)),
-          html("span", { class: "number" }, `${figure(old)} ${levelUnit(now, measure)}`),
-          html("span", { class: "number" }, `${figure(value)} ${levelUnit(now, measure)}`),
+          html("span", { class: "number" }, quantity(old, levelUnit(now, measure))),
+          html("span", { class: "number" }, quantity(value, levelUnit(now, measure))),
           html("span", { class: "number" }, old && value ? `× ${figure(value / old)}` : ""),
-          html("span", {}, limitText(now.limits.find((one) => one.measure === measure))),
+          html("span", {}, limitText(now.limits.find((one) => one.measure === measure), now)),
         ],
       };
     });

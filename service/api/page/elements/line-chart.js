@@ -1,5 +1,5 @@
 import { html } from "./markup.js";
-import { clock, local, ticks } from "../monitor/figures.js";
+import { clock, local, shownIn, ticks } from "../monitor/figures.js";
 
 /** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number}} Line */
 /** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
@@ -25,12 +25,14 @@ class LineChart extends HTMLElement {
   #plot = null;
   /** @type {Drawing | null} */
   #drawing = null;
+  /** @type {Drawing | null} as it was asked for, before its units became those that are shown */
+  #given = null;
   #shape = "";
   #sized = new ResizeObserver(() => this.#plot?.setSize(this.#size()));
   #dark = matchMedia("(prefers-color-scheme: dark)");
   #again = () => {
     this.#shape = "";
-    if (this.#drawing) this.draw(this.#drawing);
+    if (this.#given) this.draw(this.#given);
   };
 
   connectedCallback() {
@@ -46,8 +48,18 @@ class LineChart extends HTMLElement {
     this.#shape = "";
   }
 
-  /** @param {Drawing} drawing */
-  async draw(drawing) {
+  /** @param {Drawing} given */
+  async draw(given) {
+    this.#given = given;
+    const [factor, unit] = shownIn(given.unit);
+    const scaled = (/** @type {number | null} */ value) => (value === null ? null : factor * value);
+    const drawing = factor === 1 ? given : {
+      ...given,
+      unit,
+      lines: given.lines.map((line) => ({ ...line, values: line.values.map(scaled) })),
+      marks: given.marks.map((mark) => (mark.axis === "y" ? { ...mark, at: factor * mark.at } : mark)),
+      include: given.include?.map((each) => factor * each),
+    };
     this.#drawing = drawing;
     const uPlot = await charts();
     if (!this.isConnected) return;

@@ -1,10 +1,16 @@
-import { figure, printed } from "../monitor/figures.js";
+import { figure, printed, shownIn } from "../monitor/figures.js";
 import { html, table } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { limitText, measureText } from "../monitor/states.js";
+import { levelUnit, limitText, measureText } from "../monitor/states.js";
 import "../elements/state-mark.js";
 
 const MEASURES = ["overall", "velocity", "x1", "x2", "mean", "crest", "kurtosis"];
+
+/** @param {import("../monitor/records.js").ChannelLevels} one @param {string} measure */
+function leveled(one, measure) {
+  const value = /** @type {any} */ (one)[measure];
+  return value === null ? null : value * shownIn(levelUnit(one, measure))[0];
+}
 
 /** Vibration levels of each channel, their limits beside them, and what is beyond them. */
 class LevelTable extends MachineElement {
@@ -16,7 +22,7 @@ class LevelTable extends MachineElement {
     const rows = report.levels.map((one) => {
       const worst = one.limits.find((limit) => limit.state === "danger") ?? one.limits.find((limit) => limit.state === "alert");
       const limits = one.limits.map((limit) =>
-        html("div", { title: limit.source }, `${measureText(limit.measure)}: ${limitText(limit)}`, html("small", {}, ` ${limit.source}`)),
+        html("div", { title: limit.source }, `${measureText(limit.measure)}: ${limitText(limit, one)}`, html("small", {}, ` ${limit.source}`)),
       );
       const detection = one.detection === "peak to peak" ? "pp" : "rms";
       return {
@@ -24,14 +30,14 @@ class LevelTable extends MachineElement {
         cells: [
           html("b", {}, one.channel),
           worst ? html("div", {}, html("state-mark", { state: worst.state }), html("div", {}, worst.text)) : "",
-          `${printed(one.unit)} ${detection}`,
-          ...shown.map((measure) => html("span", { class: "number" }, figure(/** @type {any} */ (one)[measure]))),
+          `${shownIn(printed(one.unit))[1]} ${detection}`,
+          ...shown.map((measure) => html("span", { class: "number" }, figure(leveled(one, measure)))),
           one.zone,
           limits.length ? html("details", {}, html("summary", {}, `${limits.length}`), ...limits) : "none",
         ],
       };
     });
-    const heads = ["channel", "alarm", "unit", ...shown.map((one) => (one === "velocity" ? "velocity, mm/s" : measureText(one))), "zone", "limits"];
+    const heads = ["channel", "alarm", "unit", ...shown.map((one) => (one === "velocity" ? `velocity, ${shownIn("mm/s")[1]}` : measureText(one))), "zone", "limits"];
     const growth = report.level_growth?.text;
     this.replaceChildren(table(heads, rows, "Vibration levels"), html("p", { class: "note" }, growth ? `${growth[0].toUpperCase()}${growth.slice(1)}.` : ""));
   }

@@ -1,4 +1,4 @@
-import { figure, printed } from "../monitor/figures.js";
+import { figure, printed, quantity, shownIn } from "../monitor/figures.js";
 import { html, svg } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
@@ -40,7 +40,8 @@ export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured"
     const at = each * 0.46 * SIZE;
     return [svg("line", { class: "grid", x1: -half, x2: half, y1: at, y2: at }), svg("line", { class: "grid", y1: -half, y2: half, x1: at, x2: at })];
   });
-  const said = ellipse ? `${figure(2 * ellipse.semi_major)} × ${figure(2 * ellipse.semi_minor)} ${printed(unit)} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
+  const [factor] = shownIn(printed(unit));
+  const said = ellipse ? `${figure(2 * ellipse.semi_major * factor)} × ${quantity(2 * ellipse.semi_minor, printed(unit))} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
   const keys = [path && ["path", "samples"], ellipse && ["measured", called.measured], nominal && ["nominal", called.nominal], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
   return html(
     "figure",
@@ -57,7 +58,7 @@ export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured"
       ...marked(orbit, pulses_s).map(([y, z]) => svg("circle", { class: "pulse", cx: y * scale, cy: -z * scale, r: 3 })),
       svg("text", { x: half - 4, y: -4, "text-anchor": "end" }, "y"),
       svg("text", { x: 4, y: -half + 12 }, "z"),
-      svg("text", { x: 0.46 * SIZE - 2, y: half - 4, "text-anchor": "end" }, `grid ${figure(round(reach) / 2)} ${printed(unit)}`),
+      svg("text", { x: 0.46 * SIZE - 2, y: half - 4, "text-anchor": "end" }, `grid ${quantity(round(reach) / 2, printed(unit))}`),
     ),
     html("p", { class: "keys" }, ...keys.filter(Boolean).map((key) => html("span", { class: `key ${/** @type {string[]} */ (key)[0]}` }, /** @type {string[]} */ (key)[1]))),
   );

@@ -1,6 +1,6 @@
 /** A machine of which nothing is known but its sensors: where they are, and what they measure. */
 
-import { figure } from "../monitor/figures.js";
+import { quantity } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
 import { levelUnit, measureText, STATES } from "../monitor/states.js";
 import { sensorState } from "./machine-file.js";
@@ -17,7 +17,7 @@ function level(sensor, health) {
   if (!found) return "no level yet";
   const measure = (found.limits.find((one) => one.state !== "normal") ?? found.limits[0])?.measure ?? (found.velocity === null ? "overall" : "velocity");
   const value = /** @type {any} */ (found)[measure] ?? null;
-  return value === null ? `${measureText(measure)}: none` : `${measure === "overall" ? "" : `${measureText(measure)} `}${figure(value)} ${levelUnit(found, measure)}`;
+  return value === null ? `${measureText(measure)}: none` : `${measure === "overall" ? "" : `${measureText(measure)} `}${quantity(value, levelUnit(found, measure))}`;
 }
 
 /**

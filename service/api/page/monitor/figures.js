@@ -39,6 +39,26 @@ export function printed(unit) {
   return unit.replace(/^u/, "µ").replace("/s2", "/s²").replace("^2", "²");
 }
 
+/** Whether lengths and velocities are shown in mil and in/s. */
+export const inches = () => localStorage.getItem("rotorwatch.units") === "inches";
+
+/** @param {boolean} wanted */
+export const showInches = (wanted) => localStorage.setItem("rotorwatch.units", wanted ? "inches" : "metres");
+
+/** What a value in a unit is multiplied with, and which unit it then has. @param {string} unit @returns {[number, string]} */
+export function shownIn(unit) {
+  const [, length] = /(µm|mm)/.exec(unit) ?? [];
+  if (!inches() || !length || unit.includes("/s²")) return [1, unit];
+  const factor = 1 / 25.4; // µm in a mil, mm in an inch
+  return [unit.includes("²") ? factor ** 2 : factor, unit.replace(length, length === "µm" ? "mil" : "in")];
+}
+
+/** A number with its unit. @param {number | null | undefined} value @param {string} unit */
+export function quantity(value, unit) {
+  const [factor, shown] = shownIn(unit);
+  return `${figure(value === null || value === undefined ? value : factor * value)} ${shown}`.trim();
+}
+
 /** Whether times are local ones. */
 export const local = () => localStorage.getItem(KEPT) === "local";
 

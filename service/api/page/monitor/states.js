@@ -1,5 +1,5 @@
 /** What states are called, how urgent they are, and what of a machine is worst. */
-import { figure, percent, printed, within, Z95 } from "./figures.js";
+import { figure, percent, printed, quantity, shownIn, within, Z95 } from "./figures.js";
 
 /** @typedef {import("./records.js").Health} Health */
 /** @typedef {import("./records.js").Alarm} Alarm */
@@ -59,11 +59,12 @@ export function levelUnit(levels, measure) {
   return printed(levels.unit) + suffix;
 }
 
-/** A level's limits in words. @param {LevelLimits | undefined} limit */
-export function limitText(limit) {
+/** A level's limits in words. @param {LevelLimits | undefined} limit @param {ChannelLevels} levels */
+export function limitText(limit, levels) {
   if (!limit) return "";
+  const [factor] = shownIn(levelUnit(levels, limit.measure));
   const parts = [["alert from", limit.alert], ["danger from", limit.danger], ["alert below", limit.fall]];
-  return parts.filter(([, value]) => value !== null).map(([word, value]) => `${word} ${figure(Number(value))}`).join(", ");
+  return parts.filter(([, value]) => value !== null).map(([word, value]) => `${word} ${figure(factor * Number(value))}`).join(", ");
 }
 
 /** @param {Health} health @returns {(Worst & {nearness: number})[]} */
@@ -75,8 +76,8 @@ function levels(health) {
       const beyond = { normal: 0, alert: 10, danger: 20 }[limit.state] ?? 0;
       return {
         title: `${one.channel} ${measureText(limit.measure)}`,
-        value: `${figure(value)} ${levelUnit(one, limit.measure)}`,
-        limit: limitText(/** @type {LevelLimits} */ (limit)) || "no limit",
+        value: quantity(value, levelUnit(one, limit.measure)),
+        limit: limitText(/** @type {LevelLimits} */ (limit), one) || "no limit",
         quantity: "level",
         series: `${one.channel}:${limit.measure}`,
         nearness: beyond + (limit.alert ? value / limit.alert : 0),
