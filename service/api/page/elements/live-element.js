@@ -4,9 +4,13 @@ import { monitor } from "../monitor/monitor.js";
 export class LiveElement extends HTMLElement {
   #gone = new AbortController();
   #loading = false;
+  #unseen = false;
 
   connectedCallback() {
     this.#gone = new AbortController();
+    this.#unseen = false;
+    // Not while nobody looks, but as soon as somebody does.
+    document.addEventListener("visibilitychange", () => this.#unseen && !document.hidden && this.load(), { signal: this.#gone.signal });
   }
 
   disconnectedCallback() {
@@ -32,6 +36,7 @@ export class LiveElement extends HTMLElement {
 
   /** Ask for what is shown: never twice at once, nor while nobody looks. */
   async load() {
+    this.#unseen = document.hidden;
     if (this.#loading || document.hidden) return;
     this.#loading = true;
     try {

@@ -129,6 +129,14 @@ export class Monitor extends EventTarget {
     return body;
   }
 
+  /** Ask for what may not be there: null then. @param {string} path @returns {Promise<any>} @throws {Refused} */
+  async find(path) {
+    return this.ask(path).catch((error) => {
+      if (error instanceof Refused && error.status === 404) return null;
+      throw error;
+    });
+  }
+
   /** Ask for something to be done. @param {string} path @param {unknown} [order] @returns {Promise<any>} */
   order(path, order = {}) {
     return this.ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(order) });

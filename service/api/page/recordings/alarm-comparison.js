@@ -29,7 +29,7 @@ class AlarmComparison extends HTMLElement {
     lay(this, html("h2", {}, "What would have been raised"), html("label", {}, "Beside it: ", this.#beside), this.#message, this.#rows);
     const all = /** @type {ReplayJob[]} */ ((await monitor.ask(`${API}/replays`)).replays);
     const same = all.filter((one) => one.id !== job.id && one.summary && one.recordings[0].startsWith(`${this.#place}/`));
-    const live = monitor.machines.has(this.#place);
+    const live = await monitor.find(pathOf(this.#place));
     lay(
       this.#beside,
       live && html("option", { value: "live" }, "what the live monitor raised then"),

@@ -72,11 +72,12 @@ class OfflineResult extends HTMLElement {
       this,
       this.#facts,
       this.#strip,
+      this.#alarms,
+      html("h2", {}, "Window by window"),
       html("div", { class: "scrubber" }, jump(-1, "◂ alarm event"), this.#scrub, jump(1, "alarm event ▸"), this.#place),
       this.#message,
       this.#window,
       ...this.#tables,
-      this.#alarms,
       ...this.#trends,
       html("p", { class: "note" }, "As the API tells it: ", html("a", { href: this.#path }, "replay"), ", ", html("a", { href: `${this.#path}/reports` }, "reports"), ", ", html("a", { href: `${this.#path}/alarms` }, "alarms")),
     );
@@ -129,14 +130,15 @@ class OfflineResult extends HTMLElement {
 
   /** @param {Report} report @param {number} at */
   #stand(report, at) {
-    const said = `window ${at + 1} of ${Number(this.#scrub.max) + 1}, ${stretch(report.start_ns, report.end_ns)}`;
+    const when = report.start_ns < report.end_ns ? stretch(report.start_ns, report.end_ns) : `until ${clock(report.end_ns)}`;
+    const said = `window ${at + 1} of ${Number(this.#scrub.max) + 1}, ${when}`;
     this.#place.textContent = said;
     this.#scrub.setAttribute("aria-valuetext", `${said}, ${report.state}`);
     const health = this.#health(report);
     const standing = health.alarms.filter((one) => one.raised);
     lay(
       this.#window,
-      html("div", { class: "states" }, html("state-mark", { state: report.state }), html("span", { class: "number" }, `until ${clock(report.end_ns)}, ${(100 * report.filled).toFixed(0)} % full${report.speed_rad_s === null ? "" : `, ${figure((report.speed_rad_s * 30) / Math.PI)} rpm`}`)),
+      html("div", { class: "states" }, html("state-mark", { state: report.state }), html("span", { class: "number" }, `${(100 * report.filled).toFixed(0)} % full${report.speed_rad_s === null ? "" : `, ${figure((report.speed_rad_s * 30) / Math.PI)} rpm`}`)),
       html("p", { class: "reason" }, report.reason),
       html("p", { class: "verdict" }, report.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`),
       html("ul", {}, ...[...report.sensors, ...report.shapes].map((one) => html("li", {}, one.text))),

@@ -3,7 +3,7 @@ import { html, lay, svg, table } from "../elements/markup.js";
 import { within } from "./stretches.js";
 import "../elements/state-mark.js";
 
-const [WIDTH, HEIGHT, LEAST, SHOWN, AROUND_S] = [1000, 46, 2, 10, 600];
+const [WIDTH, HEIGHT, LEAST, SHOWN, AROUND_S] = [1000, 26, 2, 10, 600];
 const RANGES = /** @type {[string, string][]} */ ([["", "all that is shown below"], ["720", "last 30 days"], ["24", "last 24 h"], ["1", "last hour"]]);
 
 /** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
@@ -45,13 +45,18 @@ class RecordingLine extends HTMLElement {
       .map((one) => {
         const [from, to] = [Math.max(0, x(Number(one.data_start_ns))), x(Number(one.data_end_ns))];
         const kind = [one.kept_because && "kept", chosen.ids.has(one.id) && "chosen"].filter(Boolean).join(" ");
-        return svg("rect", { class: kind || null, x: Math.min(from, WIDTH - LEAST), y: chosen.ids.has(one.id) ? 20 : one.kept_because ? 23 : 26, width: Math.max(LEAST, to - from - 1), height: chosen.ids.has(one.id) ? 22 : one.kept_because ? 16 : 10 }, svg("title", {}, `${one.id}${one.kept_because ? `, kept because of ${one.kept_because}` : ""}`));
+        return svg("rect", { class: kind || null, x: Math.min(from, WIDTH - LEAST), y: chosen.ids.has(one.id) ? 2 : one.kept_because ? 5 : 8, width: Math.max(LEAST, to - from - 1), height: chosen.ids.has(one.id) ? 22 : one.kept_because ? 16 : 10 }, svg("title", {}, `${one.id}${one.kept_because ? `, kept because of ${one.kept_because}` : ""}`));
       });
-    const marks = seen.map((one) => svg("path", { class: one.severity, d: one.severity === "danger" ? "M0 2 8 10 0 18-8 10Z" : "M0 2 8 18-8 18Z", transform: `translate(${Math.min(WIDTH - 8, Math.max(8, x(one.time_ns))).toFixed(1)} 0)` }, svg("title", {}, `${clock(one.time_ns)}: ${one.text}`)));
+    const marks = seen.map((one) => {
+      const mark = svg("svg", { viewBox: "-8 0 16 18", class: one.severity }, svg("title", {}, `${clock(one.time_ns)}: ${one.text}`), svg("path", { d: one.severity === "danger" ? "M0 1 8 9 0 17-8 9Z" : "M0 1 8 17-8 17Z" }));
+      mark.style.left = `${(100 * x(one.time_ns)) / WIDTH}%`;
+      return mark;
+    });
     const times = chosen.stretch ? chosen.stretch.map((one) => Math.min(WIDTH, Math.max(0, x(one)))) : null;
     lay(
       this.#picture,
-      svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", role: "img", "aria-label": `${bars.length} recordings, ${seen.length} alarms raised, ${stretch(first, last)}` }, times && svg("rect", { class: "stretch", x: times[0], y: 0, width: Math.max(LEAST, times[1] - times[0]), height: HEIGHT }), ...bars, ...marks),
+      html("div", { class: "alarm-marks", "aria-hidden": "true" }, ...marks),
+      svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", role: "img", "aria-label": `${bars.length} recordings, ${seen.length} alarms raised, ${stretch(first, last)}` }, times && svg("rect", { class: "stretch", x: times[0], y: 0, width: Math.max(LEAST, times[1] - times[0]), height: HEIGHT }), ...bars),
       html("p", { class: "ends note" }, html("span", {}, clock(first)), html("span", {}, clock(last))),
       html("p", { class: "keys" }, html("span", { class: "key bar" }, "recording"), html("span", { class: "key bar kept" }, "kept for an alarm"), html("span", { class: "key bar chosen" }, "chosen"), html("span", {}, "▲ alert raised"), html("span", {}, "◆ danger raised"), html("span", {}, "times of the data")),
     );

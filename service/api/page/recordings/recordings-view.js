@@ -6,7 +6,7 @@ import "./recording-table.js";
 import "./replay-list.js";
 import "./replay-order.js";
 
-const [LATEST, EVENTS, REFRESH_S] = [300, 200, 30];
+const [LATEST, EVENTS, REFRESH_S] = [200, 200, 30];
 
 /** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
@@ -35,6 +35,12 @@ class RecordingsView extends LiveElement {
         this.#show();
       });
     lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.#message, this.#line, this.#order, this.#table, html("replay-list"));
+    let heard = monitor.machines.size;
+    this.follow("health", () => {
+      if (heard === monitor.machines.size) return;
+      heard = monitor.machines.size;
+      this.#show();
+    });
     this.keepLoading(REFRESH_S);
   }
 
@@ -59,7 +65,8 @@ class RecordingsView extends LiveElement {
     const asked = new URLSearchParams({ site, machine, latest: String(LATEST), data_times: "true" });
     const recordings = /** @type {RecordingEntry[]} */ ((await monitor.ask(`${API}/recordings?${asked}`)).recordings);
     const from = Math.min(...recordings.map((one) => one.data_start_ns ?? Infinity));
-    const alarms = monitor.machines.has(place) && Number.isFinite(from) ? (await monitor.ask(`${pathOf(place)}/alarms/events?kind=raised&limit=${EVENTS}&since_ns=${from}`)).events : [];
+    // A machine that was recorded need not be monitored any more.
+    const alarms = Number.isFinite(from) ? ((await monitor.find(`${pathOf(place)}/alarms/events?kind=raised&limit=${EVENTS}&since_ns=${from}`))?.events ?? []) : [];
     if (place !== this.#machine.value) return;
     this.#recordings = recordings;
     this.#alarms = alarms.map((/** @type {{data: AlarmEvent}} */ one) => one.data);

@@ -10,10 +10,13 @@ const REFRESH_S = 10;
 /** How a replay differs from what was live. @param {ReplayJob} job */
 export const differences = (job) => [job.machine && `machine file ${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");
 
+/** @param {number} count @param {string} word */
+const counted = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
+
 /** What came of a replay so far. @param {ReplayJob} job */
 export function outcome(job) {
   if (job.error) return job.error;
-  if (job.summary) return `${job.summary.windows} windows, ${job.summary.alarms} alarm events; raised at the end: ${job.summary.raised.join(", ") || "none"}`;
+  if (job.summary) return `${counted(job.summary.windows, "window")}, ${counted(job.summary.alarms, "alarm event")}; raised at the end: ${job.summary.raised.join(", ") || "none"}`;
   return job.progress ? `${(100 * job.progress.fraction).toFixed(0)} % done` : "begins";
 }
 
