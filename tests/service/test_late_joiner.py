@@ -53,7 +53,13 @@ def test_follower_killed_again_and_again_has_the_exact_log(tmp_path: Path) -> No
         monitor.wait_for(".")
         latest = int(monitor.output().split()[-1].rstrip("."))
         started("follow", file)
-        until(lambda: f'"sequence":{latest},'.encode() in file.read_bytes().splitlines()[-1], "the end of the log")
+
+        def ended() -> bool:
+            return f'"sequence":{latest},'.encode() in file.read_bytes().splitlines()[-1]
+
+        while not ended():  # thousands of lines, each on the disk before the next: as long as it takes
+            size = file.stat().st_size
+            until(lambda size=size: ended() or file.stat().st_size > size, "more of the log")  # type: ignore[misc]
     sys.stdout.write(f"{latest + 1} events; {grown} of {KILLS} kills while events came in, {torn} within a line\n")
     with opened(history) as store:
         log = store.machine("demo", "lab").events(limit=latest + 10)
