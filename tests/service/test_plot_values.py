@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from models.errors import RotorwatchError
-from models.signals.block import FloatArray
-from models.signals.channels import Channel
 from rotorwatch.records.plots import (
     CentrelineSeries,
     FullSpectrumSnapshot,
@@ -27,28 +25,9 @@ from service.api.routes import plots
 from service.runtime import Runtime
 from tests.service.live import LAB, START_NS
 from tests.service.monitored import PLACE, answered, client, faulty, problem
-from tests.service.replaying import S, machine_blocks, recorded, recording
+from tests.service.replaying import S, recorded, recording
+from tests.service.run_up import BLOCKS, CHANNELS, FROM_HZ, LAG, RUNOUT_UM, SECONDS, SHAFT_UM, TO_HZ, angle
 from tests.service.snapshotting import numbers
-
-SECONDS = 20.0
-FROM_HZ, TO_HZ = 15.0, 35.0
-SHAFT_UM, RUNOUT_UM, LAG = 20.0, 300.0, np.radians(40.0)
-CHANNELS: tuple[Channel, ...] = tuple(one for one in LAB.sensors if one.name in ("y1", "z1"))
-
-
-def angle(t: FloatArray) -> FloatArray:
-    """Of a run-up from 15 to 35 Hz."""
-    return np.asarray(2 * np.pi * (FROM_HZ * t + (TO_HZ - FROM_HZ) / SECONDS * t**2 / 2))
-
-
-BLOCKS = machine_blocks(
-    {
-        "theta": lambda t: angle(t) % (2 * np.pi),
-        "y1": lambda t: SHAFT_UM * np.cos(angle(t) - LAG) + RUNOUT_UM,
-        "z1": lambda t: SHAFT_UM * np.sin(angle(t) - LAG) - 4 * t,
-    },
-    SECONDS,
-)
 
 
 @pytest.fixture(scope="module", params=["newest samples", "recordings"])

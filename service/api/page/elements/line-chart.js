@@ -1,9 +1,9 @@
 import { html } from "./markup.js";
 import { clock, local, shownIn, ticks } from "../monitor/figures.js";
 
-/** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number}} Line */
+/** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number, dots?: boolean}} Line */
 /** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
-/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, xUnit?: string, shaded?: {from: number, to: number, text?: string}[], height: number}} Drawing */
+/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, cut?: [number, number, number], xUnit?: string, shaded?: {from: number, to: number, text?: string}[], height: number}} Drawing */
 
 /** @type {Promise<any> | undefined} */
 let library;
@@ -18,6 +18,9 @@ function charts() {
   });
   return library;
 }
+
+/** Of places for ticks only those on the axis. @param {any} plot @param {number[]} at */
+const within = (plot, at) => at.map((each) => (each >= plot.scales.x.min && each <= plot.scales.x.max ? each : null));
 
 /** Lines over time or frequency, with bands, limits and marks; colours are names of properties of the style sheet. */
 class LineChart extends HTMLElement {
@@ -89,15 +92,16 @@ class LineChart extends HTMLElement {
       stroke: line.hidden ? "transparent" : this.#colour(line.colour ?? "trace"),
       width: line.hidden ? 0 : (line.width ?? 1.5),
       dash: line.dash,
-      points: { show: drawing.x.length < 3 && !line.hidden },
+      points: { show: !line.hidden && (line.dots || drawing.x.length < 3), size: 4 },
+      ...(line.dots ? { paths: () => null } : {}),
       value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : Number(value.toPrecision(3)).toString().replace("-", "−")),
     }));
     return {
       ...this.#size(),
       series: [{ label: drawing.time ? "time" : drawing.xUnit, value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : drawing.time ? clock(value * 1e9) : value.toFixed(1)) }, ...lines],
       bands: drawing.band ? [{ series: drawing.band.map((at) => at + 1), fill: this.#colour("band") }] : [],
-      scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
-      axes: [drawing.time ? { ...axis, space: 75, values: (/** @type {any} */ _, /** @type {number[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16 }],
+      scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : drawing.cut ? { dir: -1, range: drawing.cut.slice(0, 2) } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
+      axes: [drawing.time ? { ...axis, space: 50, filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}) }],
       tzDate: (/** @type {number} */ seconds) => (local() ? new Date(seconds * 1e3) : uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC")),
       cursor: { drag: { x: true, y: false } },
       hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)] },

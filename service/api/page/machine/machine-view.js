@@ -6,8 +6,8 @@ import "../alarms/alarm-history.js";
 import "../alarms/alarm-list.js";
 import "./data-quality.js";
 import "./level-table.js";
-import "./level-trend.js";
 import "./orbit-plot.js";
+import "./parameter-forest.js";
 import "./parameter-table.js";
 import "./parameter-trend.js";
 import "./plot-fold.js";
@@ -19,7 +19,14 @@ const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "l
 const RAW = ["health", "reports", "alarms", "alarms/events", "detectable", "configuration"];
 
 /** What is loaded only when it is opened: element and heading. */
-const FOLDED = [["machine-facts", "Machine file"]];
+const FOLDED = [
+  ["waveform-plot", "Waveform"],
+  ["vector-plot", "1× over speed: Bode and polar"],
+  ["waterfall-plot", "Waterfall"],
+  ["full-spectrum-plot", "Full spectrum"],
+  ["centreline-plot", "Shaft centreline"],
+  ["correlation-plot", "Correlations and residuals of the equations"],
+];
 
 /** Everything that is known of one machine. */
 class MachineView extends MachineElement {
@@ -58,13 +65,15 @@ class MachineView extends MachineElement {
   #build() {
     this.#built = true;
     const place = this.place;
-    const trends = [html("parameter-trend", { place, hours: "24" }), html("level-trend", { place, hours: "24" })];
+    // Where parameters are read, levels tell less.
+    const trends = [html("parameter-trend", { place, hours: "24" }), html("plot-fold", { place, shows: "level-trend", heading: "Levels over time", hours: "24", open: !this.health?.report?.parameters.length })];
     const range = html(
       "select",
       {
         "aria-label": "Range of the trends",
         change: (event) => {
-          for (const trend of trends) {
+          for (const trend of trends) trend.setAttribute("hours", event.target.value);
+          for (const trend of this.querySelectorAll("parameter-trend, level-trend")) {
             trend.setAttribute("hours", event.target.value);
             /** @type {any} */ (trend).load();
           }
@@ -76,14 +85,16 @@ class MachineView extends MachineElement {
       this,
       html("div", { class: "top" }, this.#head, html("rotor-drawing", { place }), html("alarm-list", { place })),
       html("parameter-table", { place }),
+      html("parameter-forest", { place }),
       html("level-table", { place }),
       html("label", { class: "range" }, "Trends: ", range),
       ...trends,
       html("orbit-plot", { place }),
       html("spectrum-plot", { place }),
+      ...FOLDED.map(([shows, heading]) => html("plot-fold", { place, shows, heading })),
       html("data-quality", { place }),
       html("alarm-history", { place }),
-      ...FOLDED.map(([shows, heading]) => html("plot-fold", { place, shows, heading })),
+      html("plot-fold", { place, shows: "machine-facts", heading: "Machine file" }),
       html("p", { class: "note" }, "As the API tells it: ", ...RAW.flatMap((part, at) => [at ? ", " : "", html("a", { href: `${pathOf(place)}/${part}` }, part)])),
     );
   }

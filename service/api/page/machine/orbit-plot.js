@@ -2,18 +2,13 @@ import { figure, printed, quantity, shownIn } from "../monitor/figures.js";
 import { html, svg } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
+import { plane, REACH, roundUp } from "./plane.js";
 
-const [REFRESH_S, REVOLUTIONS, SIZE] = [15, 8, 220];
+const [REFRESH_S, REVOLUTIONS] = [15, 8];
 
 /** @typedef {import("../monitor/records.js").Ellipse} Ellipse */
 /** @typedef {import("../monitor/records.js").PlaceOrbit} PlaceOrbit */
 /** @typedef {import("../monitor/records.js").Orbits} Orbits */
-
-/** A length at or above another one with a single leading digit. @param {number} length */
-function round(length) {
-  const power = 10 ** Math.floor(Math.log10(length));
-  return power * (/** @type {number} */ ([1, 2, 5, 10].find((each) => each * power >= length)));
-}
 
 /** Where the shaft was when its mark passed the sensor. @param {PlaceOrbit} orbit @param {number[]} pulses_s */
 function marked({ path }, pulses_s) {
@@ -31,15 +26,10 @@ function marked({ path }, pulses_s) {
 export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured", nominal: "as nominal" }) {
   const { path, ellipse, nominal, estimated, location, unit } = orbit;
   const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);
-  const scale = (0.46 * SIZE) / round(reach);
+  const scale = REACH / roundUp(reach);
   const oval = (/** @type {Ellipse | null} */ one, /** @type {string} */ kind) =>
     one && svg("ellipse", { class: kind, rx: one.semi_major * scale, ry: one.semi_minor * scale, transform: `rotate(${-one.tilt_deg})` });
   const points = path ? path.y.map((y, at) => `${(y * scale).toFixed(1)},${(-path.z[at] * scale).toFixed(1)}`).join(" ") : "";
-  const half = SIZE / 2;
-  const grid = [-1, -0.5, 0, 0.5, 1].flatMap((each) => {
-    const at = each * 0.46 * SIZE;
-    return [svg("line", { class: "grid", x1: -half, x2: half, y1: at, y2: at }), svg("line", { class: "grid", y1: -half, y2: half, x1: at, x2: at })];
-  });
   const [factor] = shownIn(printed(unit));
   const said = ellipse ? `${figure(2 * ellipse.semi_major * factor)} × ${quantity(2 * ellipse.semi_minor, printed(unit))} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
   const keys = [path && ["path", "samples"], ellipse && ["measured", called.measured], nominal && ["nominal", called.nominal], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
@@ -47,18 +37,14 @@ export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured"
     "figure",
     {},
     html("figcaption", {}, location, html("small", { class: "number" }, ` ${said}`)),
-    svg(
-      "svg",
-      { viewBox: `${-half} ${-half} ${SIZE} ${SIZE}`, role: "img", "aria-label": `orbit at the ${location}: ${said}`, class: "orbit" },
-      ...grid,
+    plane(
+      `orbit at the ${location}: ${said}`,
+      quantity(roundUp(reach) / 2, printed(unit)),
       svg("polyline", { class: "path", points }),
       oval(nominal, "nominal"),
       oval(estimated, "estimated"),
       oval(ellipse, "measured"),
       ...marked(orbit, pulses_s).map(([y, z]) => svg("circle", { class: "pulse", cx: y * scale, cy: -z * scale, r: 3 })),
-      svg("text", { x: half - 4, y: -4, "text-anchor": "end" }, "y"),
-      svg("text", { x: 4, y: -half + 12 }, "z"),
-      svg("text", { x: 0.46 * SIZE - 2, y: half - 4, "text-anchor": "end" }, `grid ${quantity(round(reach) / 2, printed(unit))}`),
     ),
     html("p", { class: "keys" }, ...keys.filter(Boolean).map((key) => html("span", { class: `key ${/** @type {string[]} */ (key)[0]}` }, /** @type {string[]} */ (key)[1]))),
   );

@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 
 /**
- * Something that is not always needed, folded: `<plot-fold place shows="waveform-plot" heading>`. It is loaded when it is
+ * Something that is not always needed, folded: `<plot-fold place shows="waveform-plot" heading>`, with `open` not at first. It is loaded when it is
  * opened, and asks for nothing once it is closed again.
  */
 class PlotFold extends HTMLElement {
@@ -12,12 +12,12 @@ class PlotFold extends HTMLElement {
       if (!target.open) return inside.replaceChildren();
       try {
         await import(`./${shows}.js`);
-        if (target.open) inside.replaceChildren(html(shows, { place }));
+        if (target.open) inside.replaceChildren(html(shows, { place, hours: this.getAttribute("hours") }));
       } catch {
         inside.replaceChildren(html("p", { class: "note" }, "The monitor serves another page by now: load this one again."));
       }
     };
-    this.replaceChildren(html("details", { toggle: toggled }, html("summary", {}, this.getAttribute("heading")), inside));
+    this.replaceChildren(html("details", { toggle: toggled, open: this.hasAttribute("open") }, html("summary", {}, html("h2", {}, this.getAttribute("heading"))), inside));
   }
 }
 

@@ -1,6 +1,6 @@
 /** The rotor of a machine file: along the shaft, and across it at bearing and disc. */
 
-import { figure } from "../monitor/figures.js";
+import { quantity } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
 import { arrow, damper, LINE, parameter, rotation, sensorsRound, spring } from "./rotor-parts.js";
 
@@ -14,7 +14,7 @@ const DISC = { x: 250, y: 422 };
 const ARROW = 30;
 
 /** Length of a dimension as it is written on drawings. @param {number} metres */
-const millimetres = (metres) => `${figure(1000 * metres)} mm`;
+const millimetres = (metres) => quantity(1000 * metres, "mm");
 
 /** @param {number} angle */
 const degrees = (angle) => angle.toFixed(1).replace("-", "−");

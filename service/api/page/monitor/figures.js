@@ -78,21 +78,23 @@ export function clock(ns) {
   return `${format({ dateStyle: "short", timeStyle: "medium" }).format(ns / 1e6)}${local() ? "" : " UTC"}`;
 }
 
-/** From when to when, the date once. @param {number} start_ns @param {number} end_ns */
+/** From when to when, the date once; of what is short, how long. @param {number} start_ns @param {number} end_ns */
 export function stretch(start_ns, end_ns) {
+  if (end_ns - start_ns < 2e9) return `${clock(start_ns)}, ${figure((end_ns - start_ns) / 1e9)} s`;
   const [from, to] = [clock(start_ns), clock(end_ns)];
   return `${from.replace(" UTC", "")} to ${from.slice(0, 10) === to.slice(0, 10) ? to.slice(11) : to}`;
 }
 
 /**
- * Times along an axis: date or time of day, as fine as the axis is divided.
- * @param {number[]} seconds
+ * Times along an axis: date or time of day, as fine as the axis is divided; nothing for null.
+ * @param {(number | null)[]} seconds
  * @param {number} step_s
  */
 export function ticks(seconds, step_s) {
   const day = format({ month: "2-digit", day: "2-digit" });
   const time = format({ hour: "2-digit", minute: "2-digit", ...(step_s < 60 ? { second: "2-digit" } : {}) });
-  return seconds.map((each, at) => (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === 0 ? `\n${day.format(each * 1e3)}` : ""));
+  const first = seconds.findIndex((each) => each !== null);
+  return seconds.map((each, at) => (each === null ? "" : (step_s >= 86_400 ? "" : `${time.format(each * 1e3)}`) + (step_s >= 86_400 || at === first ? `\n${day.format(each * 1e3)}` : "")));
 }
 
 /** How large a file or a database is. @param {number} bytes */

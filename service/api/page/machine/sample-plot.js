@@ -1,0 +1,121 @@
+import { html } from "../elements/markup.js";
+import { MachineElement } from "../elements/machine-element.js";
+import { stretch } from "../monitor/figures.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
+import { machineFile } from "./machine-file.js";
+
+const [REFRESH_S, RECORDINGS] = [15, 40];
+
+/** @typedef {import("./machine-file.js").Sensor} Sensor */
+/** @typedef {{source: string, reason: string}} Values */
+
+/**
+ * A plot of what is live, or of a recording of the machine: says in one line what is shown and from when. A recording does
+ * not change, and is asked for once.
+ * @template {Values} T
+ */
+export class SamplePlot extends MachineElement {
+  /** Route of the API. */
+  route = "";
+  /** What is shown where no recording is chosen. */
+  live = "newest samples";
+  /** @type {Sensor[]} */
+  sensors = [];
+  body = html("div");
+  #said = html("p", { class: "note", role: "status" });
+  #shown = "";
+  /** @type {Map<string, HTMLElement>} */
+  #charts = new Map();
+  #source = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Samples of", change: () => this.load() }));
+
+  connectedCallback() {
+    super.connectedCallback();
+    this.#source.replaceChildren(html("option", { value: "" }, this.live));
+    this.#source.hidden = true;
+    this.replaceChildren(html("div", { class: "tools" }, ...this.choices(), this.#source), this.#said, this.body);
+    this.#offer();
+    this.keepLoading(REFRESH_S);
+  }
+
+  /**
+   * Charts beside each other, each the same element as long as its name stays.
+   * @param {{name: string, more?: string, said: string, drawing: import("../elements/line-chart.js").Drawing}[]} charts
+   */
+  lines(charts) {
+    const names = charts.map((one) => one.name);
+    if (names.join() !== [...this.#charts.keys()].join()) {
+      this.#charts = new Map(names.map((name) => [name, html("figure", {}, html("figcaption"), html("line-chart", { role: "img" }))]));
+      this.body.replaceChildren(html("div", { class: "charts" }, ...this.#charts.values()));
+    }
+    for (const { name, more, said, drawing } of charts) {
+      const [caption, chart] = /** @type {any} */ (this.#charts.get(name)).children;
+      caption.replaceChildren(name, html("small", { class: "number" }, ` ${more ?? ""}`));
+      chart.setAttribute("aria-label", said);
+      chart.draw(drawing);
+    }
+  }
+
+  /** What else may be chosen. @returns {HTMLElement[]} */
+  choices() {
+    return [];
+  }
+
+  /** Offer channels or places, once it is known which there are. */
+  offer() {}
+
+  /** What is asked for. @returns {[string, string][]} */
+  asked() {
+    return [];
+  }
+
+  /** Lay out what was found, and say in words what it is. @param {T} _found @returns {string} */
+  draw(_found) {
+    return "";
+  }
+
+  /** @returns {Promise<void>} */
+  async ask() {
+    if (!this.sensors.length) {
+      this.sensors = (await machineFile(this.place, this.health?.machine_hash)).sensors.filter((one) => one.quantity !== "shaft_angle");
+      this.offer();
+    }
+    const asked = this.#wanted();
+    if (this.#source.value && asked === this.#shown) return;
+    if (this.#source.value) this.#said.textContent = "The recording is being read …";
+    const found = /** @type {T} */ (await monitor.ask(`${pathOf(this.place)}/${this.route}?${asked}`));
+    if (asked !== this.#wanted()) return this.ask(); // something else was chosen meanwhile
+    this.#shown = asked;
+    const said = [this.draw(found), found.reason].filter(Boolean).join(". ");
+    this.#said.textContent = said.charAt(0).toUpperCase() + said.slice(1);
+  }
+
+  #wanted() {
+    const recording = this.#source.value;
+    return new URLSearchParams([...this.asked(), ...(recording ? [["recording", recording]] : [])]).toString();
+  }
+
+  /** @param {string} why */
+  refused(why) {
+    this.#said.textContent = why;
+  }
+
+  /** The newest recordings; none where none are kept. */
+  async #offer() {
+    const [site, machine] = this.place.split("/");
+    try {
+      const found = (await monitor.ask(`/api/v1/recordings?${new URLSearchParams({ site, machine, latest: String(RECORDINGS), data_times: "true" })}`)).recordings;
+      const whole = /** @type {import("../monitor/records.js").RecordingEntry[]} */ (found).filter((one) => one.data_start_ns !== null).reverse();
+      this.#source.append(...whole.map((one) => html("option", { value: one.id.split("/")[2] }, `recorded ${stretch(Number(one.data_start_ns), Number(one.data_end_ns))}${one.kept_because ? ", kept for an alarm" : ""}`)));
+      this.#source.hidden = !whole.length;
+    } catch {
+      this.#source.hidden = true;
+    }
+  }
+}
+
+/** A choice among names, which asks anew. @param {string} label @param {() => void} changed */
+export const choiceOf = (label, changed) => /** @type {HTMLSelectElement} */ (html("select", { "aria-label": label, change: changed }));
+
+/** Offer names, with words where they differ. @param {HTMLSelectElement} choice @param {(string | [string, string])[]} names */
+export const offered = (choice, names) =>
+  choice.replaceChildren(...names.map((name) => html("option", { value: typeof name === "string" ? name : name[0] }, typeof name === "string" ? name : name[1])));

@@ -1,0 +1,89 @@
+"""The plots of a machine in a browser: loaded when they are opened, of what is live and of recordings."""
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from service.runtime import Runtime
+from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, violations
+from tests.service.monitored import faulty
+from tests.service.replaying import recording
+from tests.service.run_up import BLOCKS
+
+#: Element, what it asks for, what is drawn, and what it says of that.
+PLOTS = (
+    (
+        "waveform-plot",
+        "waveforms",
+        "canvas",
+        r"^Newest samples, 8 revolutions of 2026-01-01 00:01:17 UTC, 0\.36\d? s, d",
+    ),
+    (
+        "vector-plot",
+        "vectors",
+        "canvas, svg",
+        r"^1× of y1, history, \d+ vectors of a window each.*1320 rpm.* over time$",
+    ),
+    ("waterfall-plot", "waterfalls", "canvas", r"^Newest samples, 20 spectra of y1, .*strongest shade is \d+ µm p-p"),
+    ("full-spectrum-plot", "full-spectra", "canvas", r"^Newest samples, .*, 19 averages"),
+    ("centreline-plot", "centrelines", "svg", r"^History, \d+ mean positions"),
+    ("correlation-plot", "correlations", "canvas", r"^Window .*without mean and 1×; theory is apart"),
+)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
+    folder = tmp_path_factory.mktemp("machine")
+    recording(folder / "recordings" / "demo" / "lab" / "run-up.mcap", BLOCKS)
+    with faulty(folder) as (running, _):
+        yield running
+
+
+def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url
+    expect.set_options(timeout=PATIENCE_MS)
+    with looking(browser, url) as page:
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url.partition("?")[0].rsplit("/", 1)[1]))
+        page.goto(f"{url}/#/machines/demo/lab")
+        expect(page.locator("parameter-forest circle.decides")).to_have_count(7)  # one of them in the key
+        expect(page.locator("spectrum-plot canvas")).to_be_visible()
+        assert not {route for _, route, _, _ in PLOTS} & set(asked)
+        for element, route, drawn, said in PLOTS:
+            page.locator(f"plot-fold[shows={element}] summary").click()
+            plot = page.locator(element)
+            expect(plot.get_by_role("status")).to_have_text(re.compile(said))
+            expect(plot.locator(drawn).first).to_be_visible()
+            assert route in asked
+        expect(page.get_by_role("table", name="Residuals")).to_contain_text("(28)")
+        kept(page, "plots")
+        assert not violations(page)
+
+        vectors = page.locator("vector-plot")
+        vectors.get_by_label("Samples of").select_option("run-up.mcap")
+        expect(vectors.get_by_role("status")).to_have_text(re.compile("^1× of y1, recordings, .*of 8 revolutions each"))
+        expect(vectors).to_contain_text("Phase lag over speed")
+        waterfall = page.locator("waterfall-plot")
+        waterfall.get_by_label("Over").select_option("speed")
+        expect(waterfall.get_by_role("status")).to_have_text(re.compile("^Spectra over speed need a run-up"))
+        waterfall.get_by_label("Samples of").select_option("run-up.mcap")
+        expect(waterfall.locator(".up")).to_contain_text(re.compile(r"20\d\d rpm.*9\d\d rpm"))
+        page.locator("plot-fold[shows=full-spectrum-plot] summary").click()
+        expect(page.locator("full-spectrum-plot")).to_have_count(0)
+        kept(page, "plots-recorded")
+    with looking(browser, url, phone=True, dark=True) as page:
+        page.goto(f"{url}/#/machines/demo/lab")
+        for element, *_ in PLOTS:
+            page.locator(f"plot-fold[shows={element}] summary").press("Enter")
+            expect(page.locator(f"{element} :is(canvas, svg)").first).to_be_visible()
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        assert not violations(page)
+        kept(page, "plots-phone")
