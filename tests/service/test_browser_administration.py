@@ -7,10 +7,16 @@ import httpx
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
+from rotorwatch.records.example import example
+from rotorwatch.records.monitor import MachineReadiness, Readiness, WebhookList
 from service.access.scopes import Scope
+from service.history.records import AuditEntry
 from service.runtime import Runtime
 from tests.service.browsing import PATIENCE_MS, chromium, kept, violations
 from tests.service.monitored import GUARDED, fed, token
+
+OLD = 60
+"""Entries of the audit log from before, more than a page."""
 
 
 @pytest.fixture(scope="module")
@@ -23,6 +29,10 @@ def browser() -> Iterator[Browser]:
 def runtime(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Runtime]:
     with fed(tmp_path_factory.mktemp("machine"), GUARDED) as (running, feed):
         feed.put_good()
+        for number in range(OLD):
+            running.store.audit.append(
+                AuditEntry(0, number, "anna", "", "POST", "/api/v1/x", 200, "reset", "demo/lab", "k_by", "long ago")
+            )
         yield running
 
 
@@ -84,6 +94,22 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
         expect(page.locator("service-load tbody tr")).to_contain_text("demo/lab")
         expect(page.locator("history-status")).to_contain_text("kept for 14 days")
         expect(page.locator("webhook-list")).to_contain_text("The settings name no webhook")
+        page.get_by_role("button", name="Older").click()
+        expect(log.filter(has_text="long ago")).to_have_count(OLD)
+        page.route("**/api/v1/webhooks", lambda route: route.fulfill(json=example(WebhookList)))
+        stuck = example(MachineReadiness) | {
+            "trouble": "no window has been evaluated for two hops",
+            "queue_blocks": 412,
+        }
+        unready = example(Readiness) | {"ready": False, "reasons": ["demo/lab: stuck"], "machines": [stuck]}
+        page.route("**/readyz", lambda route: route.fulfill(status=503, json=unready))
+        page.reload()
+        for element, texts in {
+            "webhook-list": ("pager", "https://pager.example", "503 Service Unavailable (1 failed in all)", "00:02:25"),
+            "service-load": ("Not ready.", "demo/lab: stuck", "412", "no window has been evaluated for two hops"),
+        }.items():
+            for told in texts:
+                expect(page.locator(element)).to_contain_text(told)
         for kind, width, dark in (("light", 1360, False), ("dark", 1360, True), ("phone", 390, False)):
             page.set_viewport_size({"width": width, "height": 850})
             page.emulate_media(color_scheme="dark" if dark else "light")

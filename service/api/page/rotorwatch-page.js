@@ -56,7 +56,7 @@ class RotorwatchPage extends HTMLElement {
     if (monitor.stranger) return this.#main.replaceChildren(html("sign-in"));
     const view = html(tag, { place: rest.join("/") || null });
     for (const link of this.querySelectorAll("nav a")) {
-      if (link.getAttribute("href") === (location.hash || "#/")) link.setAttribute("aria-current", "page");
+      if (link.getAttribute("href") === (name === "replays" ? "#/recordings" : location.hash || "#/")) link.setAttribute("aria-current", "page");
       else link.removeAttribute("aria-current");
     }
     this.#main.replaceChildren(view);

@@ -3,7 +3,7 @@ import { clock } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
-const [PAGE, REFRESH_S] = [100, 15];
+const [PAGE, REFRESH_S] = [50, 15];
 
 /** @typedef {import("../monitor/records.js").AuditRecord} AuditRecord */
 

@@ -83,7 +83,7 @@ class OfflineResult extends HTMLElement {
     );
     this.#strip.show(this.#reports, (/** @type {number} */ at) => this.#go(at * this.#every, true));
     this.#alarms.show(this.#job, this.#events, [first.start_ns, last.end_ns], (/** @type {number} */ ns) => this.#goTo(ns));
-    await this.#go(0);
+    await this.#go(windows - 1, true); // what it came to
   }
 
   #said() {

@@ -1,6 +1,7 @@
 import { clock, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { API, monitor } from "../monitor/monitor.js";
+import { counted } from "./replay-list.js";
 
 /** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
 
@@ -32,7 +33,7 @@ class PacedControl extends HTMLElement {
     const running = job.state === "running" || job.state === "paused";
     this.#tools.hidden = !running || !monitor.may("operate");
     this.#pause.textContent = job.state === "paused" ? "Resume" : "Pause";
-    lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${job.progress.messages} messages are out.` : ".");
+    lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${counted(job.progress.messages, "message")} sent.` : ".");
     if (first) await this.#measure(job);
     if (!this.#held && job.progress && this.#span) {
       this.#seek.value = String((job.progress.position_ns - this.#span[0]) / (this.#span[1] - this.#span[0]));

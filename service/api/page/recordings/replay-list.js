@@ -11,7 +11,7 @@ const REFRESH_S = 10;
 export const differences = (job) => [job.machine && `machine file ${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");
 
 /** @param {number} count @param {string} word */
-const counted = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
+export const counted = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;
 
 /** What came of a replay so far. @param {ReplayJob} job */
 export function outcome(job) {

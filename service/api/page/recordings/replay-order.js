@@ -1,6 +1,7 @@
 import { stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { API, monitor } from "../monitor/monitor.js";
+import { counted } from "./replay-list.js";
 
 /** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
@@ -53,7 +54,7 @@ class ReplayOrder extends HTMLElement {
     this.#what.textContent = !may
       ? "You may look: whoever starts a replay needs the scope operate."
       : count
-        ? `${count} recording${count > 1 ? "s" : ""} of ${place}${chosen.stretch ? `, of them ${stretch(...chosen.stretch)}` : ""}.`
+        ? `${counted(count, "recording")} of ${place}${chosen.stretch ? `, of them ${stretch(...chosen.stretch)}` : ""}.`
         : "Choose recordings below, or what is around an alarm above.";
     this.#start.disabled = !count || !may;
     this.#clear.hidden = !count;

@@ -2,7 +2,7 @@ import { clock, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
-import { differences, outcome } from "./replay-list.js";
+import { counted, differences, outcome } from "./replay-list.js";
 import "./offline-result.js";
 import "./paced-control.js";
 
@@ -47,7 +47,7 @@ class ReplayView extends LiveElement {
     lay(
       this.#head,
       html("div", { class: "tools" }, html("h1", {}, "Replay of ", html("small", {}, `${site}/`), machine), html("a", { href: "#/recordings" }, "Recordings")),
-      html("p", {}, `${job.recordings.length} recording${job.recordings.length > 1 ? "s" : ""}${times}; ${differences(job) || "as recorded"}; started ${clock(job.started_ns)}.`),
+      html("p", {}, `${counted(job.recordings.length, "recording")}${times}; ${differences(job) || "as recorded"}; started ${clock(job.started_ns)}.`),
     );
     this.#show(job);
     if (ENDED.has(job.state)) return;
