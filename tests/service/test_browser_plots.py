@@ -1,13 +1,19 @@
 """The plots of a machine in a browser: loaded when they are opened, of what is live and of recordings."""
 
+import json
 import re
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
+from models.machine import load_machine
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health
+from rotorwatch.records.windows import SensorFault, UnbalanceVector
 from service.runtime import Runtime
-from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, violations
+from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, route_events, violations
 from tests.service.monitored import faulty
 from tests.service.replaying import recording
 from tests.service.run_up import BLOCKS
@@ -87,3 +93,42 @@ def test_plots_are_drawn_when_they_are_opened_and_say_what_they_show(browser: Br
         assert page.evaluate("document.documentElement.scrollWidth") == 390
         assert not violations(page)
         kept(page, "plots-phone")
+
+
+def test_the_drawing_turns_the_unbalance_with_the_shaft_and_names_the_sensor_at_fault(
+    browser: Browser, runtime: Runtime
+) -> None:
+    """A shaft that turns from z to y, its heavy spot first at 30°, now a quarter turn further that way: at -60°."""
+    told: dict[str, Any] = dict(example(Health))
+    report: dict[str, Any] = told["report"]
+    vector = example(UnbalanceVector) | {"turned_deg": 90.0, "turned_interval_95_deg": (88.5, 91.5)}
+    late = report["parameters"][0] | {"name": "c_by"}
+    unbalance = report["parameters"][0] | {"name": "e", "relative_change": 1.41, "vector": vector}
+    told["report"] = report | {
+        "speed_rad_s": -138.2,
+        "parameters": [unbalance, late],
+        "verdict": report["verdict"] | {"settled": False, "current": [unbalance]},
+        "sensors": [example(SensorFault)],
+    }
+    told["alarms"] = [told["alarms"][0] | {"name": "e", "severity": "danger"}]
+    file = load_machine("lab").model_dump(mode="json")
+    file["operation"]["unbalance_phase_rad"] = 0.5235987755982988
+
+    def instead(route: Route) -> None:
+        lines = f"event: start\ndata: {{}}\n\nevent: health\ndata: {json.dumps(told)}\n\n"
+        route.fulfill(body=lines, content_type="text/event-stream")
+
+    with looking(browser, runtime.http_url) as page:
+        route_events(page, instead)
+        page.route("**/configuration", lambda route: route.fulfill(json={"file": file}))
+        page.goto(f"{runtime.http_url}/#/machines/demo/lab")
+        drawing = page.locator("rotor-drawing")
+        expect(drawing.locator(".part.danger")).to_contain_text("e, unbalance ◆ danger+141.0 % ±")
+        expect(drawing).to_contain_text("turned 90.0° ± 1.5°")
+        angles = [
+            float(re.findall(r"rotate\((.*)\)", drawing.locator(f"path.{kind}").get_attribute("transform") or "")[0])
+            for kind in ("nominal", "now")
+        ]
+        assert angles == pytest.approx([-30.0, 60.0])  # on the screen angles count clockwise
+        expect(drawing.locator("g.sensor.data-health")).to_contain_text("y1 ⬢ sensor at fault")
+        expect(drawing.locator("g.part", has_text="c_by")).to_contain_text("too little data yet")

@@ -9,6 +9,7 @@ import { SamplePlot } from "./sample-plot.js";
 class CentrelinePlot extends SamplePlot {
   route = "centrelines";
   live = "windows of the history";
+  refreshS = 60; // hundreds of reports are read
 
   /** @param {Centrelines} found */
   draw(found) {

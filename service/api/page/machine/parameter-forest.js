@@ -8,6 +8,8 @@ import { roundUp } from "./plane.js";
 /** @typedef {import("./machine-file.js").MachineFile} MachineFile */
 
 const [WIDTH, LEFT, ROW, TOP] = [360, 48, 46, 6];
+/** What is farther away is written at the edge: the others would be too close to be told apart. */
+const FARTHEST = 0.6;
 const SHAPES = ["decides", "second", "third"];
 
 /** A mark of whoever reads: each has a shape of its own. @param {number} who @param {number} x @param {number} y */
@@ -48,7 +50,7 @@ class ParameterForest extends MachineElement {
       ),
     }));
     const reach = Math.max(...rows.flatMap((row) => [row.limit.raise_above, ...row.read.flatMap((each) => (each ? [Math.abs(each[0]), Math.abs(each[2])] : []))]));
-    const end = 1.2 * reach;
+    const end = Math.min(1.2 * reach, Math.max(FARTHEST, 1.2 * Math.max(...rows.map((row) => row.limit.danger_above))));
     const x = (/** @type {number} */ change) => LEFT + ((Math.max(-end, Math.min(end, change)) + end) / (2 * end)) * (WIDTH - LEFT - 22);
     const bottom = TOP + rows.length * ROW;
     const step = roundUp(end / 4);
@@ -87,6 +89,10 @@ class ParameterForest extends MachineElement {
       ...limits.flatMap(([kind, at]) => [-at, at].map((each) => svg("line", { class: kind, x1: x(each), x2: x(each), y1: y + 3, y2: y + ROW - 3 }))),
       ...read.flatMap((each, who) => {
         const down = y + ROW / 2 + 12 * (who - (read.length - 1) / 2);
+        if (each && Math.abs(each[1]) > end) {
+          const up = each[1] > 0;
+          return [svg("text", { x: x(each[1]), y: down + 4, "text-anchor": up ? "end" : "start", class: "least" }, up ? `${percent(each[1])} →` : `← ${percent(each[1])}`)];
+        }
         return each ? [svg("line", { class: SHAPES[Math.min(who, 2)], x1: x(each[0]), x2: x(each[2]), y1: down, y2: down }), mark(who, x(each[1]), down)] : [];
       }),
     ];

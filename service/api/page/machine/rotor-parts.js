@@ -28,7 +28,7 @@ function lines(lines, x, y, anchor) {
 function said(reading, name) {
   if (!reading) return [{ text: name, kind: "name" }];
   const { severity, read, why, seen, parameter } = reading;
-  const found = read && parameter.standard_error !== null ? within(Number(parameter.relative_change), Z95 * parameter.standard_error) : why.split(":")[0];
+  const found = read && parameter.standard_error !== null ? within(Number(parameter.relative_change), Z95 * parameter.standard_error) : why.startsWith("not evaluable") ? "not evaluable" : "too little data yet";
   const mark = severity ? ` ${MARKS[severity] ?? ""} ${STATES[severity] ?? severity}` : "";
   const least = seen ? `(${percent(seen.loss).replace(" %", "")} / ${percent(seen.gain)})` : "";
   return [{ text: `${name}${mark}`, kind: "name" }, { text: found }, { text: least, kind: "least" }].filter((one) => one.text);

@@ -8,9 +8,9 @@ import { arrow, damper, LINE, parameter, rotation, sensorsRound, spring } from "
 /** @typedef {import("./machine-file.js").MachineFile} MachineFile */
 /** @typedef {import("../monitor/records.js").Health} Health */
 
-const [WIDTH, HEIGHT] = [360, 474];
+const [WIDTH, HEIGHT] = [360, 496];
 const BEARING = { x: 196, y: 214 };
-const DISC = { x: 250, y: 422 };
+const DISC = { x: 250, y: 444 };
 const ARROW = 30;
 
 /** Length of a dimension as it is written on drawings. @param {number} metres */
@@ -53,10 +53,10 @@ function bearing(file, health, readings) {
     svg("path", { class: "thin", d: "M0 124H360" }),
     svg("text", { x: 4, y: 144, class: "place" }, "across the bearing"),
     svg("path", { class: "solid", d: `M${x - 70} ${y - 28}V${y + 28}M${x - 30} ${y + 72}H${x + 30}` }),
-    parameter(readings.get("k_by"), "k_by", { x: x - 78, y: y - 26, anchor: "end" }, spring(x - 70, y - 11, 48)),
-    parameter(readings.get("c_by"), "c_by", { x: x - 78, y: y + 26, anchor: "end" }, damper(x - 70, y + 11, 48)),
-    parameter(readings.get("k_bz"), "k_bz", { x: x - 36, y: y + 58, anchor: "end" }, spring(x - 11, y + 24, 48, 90)),
-    parameter(readings.get("c_bz"), "c_bz", { x: x + 36, y: y + 58, anchor: "start" }, damper(x + 11, y + 24, 48, 90)),
+    parameter(readings.get("k_by"), "k_by", { x: x - 78, y: y - 12, anchor: "end" }, spring(x - 70, y - 11, 48)),
+    parameter(readings.get("c_by"), "c_by", { x: x - 78, y: y + 36, anchor: "end" }, damper(x - 70, y + 11, 48)),
+    parameter(readings.get("k_bz"), "k_bz", { x: x - 6, y: y + 88, anchor: "end" }, spring(x - 11, y + 24, 48, 90)),
+    parameter(readings.get("c_bz"), "c_bz", { x: x + 6, y: y + 88, anchor: "start" }, damper(x + 11, y + 24, 48, 90)),
     svg("circle", { class: "body", cx: x, cy: y, r: 26 }),
     svg("circle", { class: "solid", cx: x, cy: y, r: 5 }),
     direction && rotation(x, y, 15, direction),
@@ -77,15 +77,15 @@ function disc(file, health, readings) {
   const apart = vector?.turned_interval_95_deg ? vector.turned_interval_95_deg[1] - vector.turned_interval_95_deg[0] : NaN;
   const there = file.sensors.filter((one) => one.location === "disc");
   return [
-    svg("path", { class: "thin", d: "M0 322H360" }),
-    svg("text", { x: 4, y: 342, class: "place" }, "across the disc"),
-    svg("text", { x: 4, y: 357, class: "least" }, phased ? "at the keyphasor's pulse" : "direction not known"),
+    svg("path", { class: "thin", d: "M0 344H360" }),
+    svg("text", { x: 4, y: 364, class: "place" }, "across the disc"),
+    svg("text", { x: 4, y: 379, class: "least" }, phased ? "at the keyphasor's pulse" : "direction not known"),
     svg("circle", { class: "body", cx: x, cy: y, r: 40 }),
     svg("circle", { class: "solid", cx: x, cy: y, r: 5 }),
     svg("path", { class: "mark", d: `M${x + 40} ${y} l-8 -4 v8Z` }),
     arrow(x, y, ARROW, nominal, "nominal"),
-    parameter(reading, "e, unbalance", { x: 4, y: 396, anchor: "start" }, arrow(x, y, ARROW * grown, nominal + turned, "now")),
-    vector && vector.turned_deg !== null && svg("text", { x: 4, y: 396 + 3 * LINE }, `turned ${degrees(vector.turned_deg)}° ± ${degrees(apart / 2)}°`),
+    parameter(reading, "e, unbalance", { x: 4, y: 418, anchor: "start" }, arrow(x, y, ARROW * grown, nominal + turned, "now")),
+    vector && vector.turned_deg !== null && svg("text", { x: 4, y: 418 + 3 * LINE }, `turned ${degrees(vector.turned_deg)}° ± ${degrees(apart / 2)}°`),
     ...sensorsRound(there, health, { x, y, radius: 40 }),
   ];
 }

@@ -4,7 +4,7 @@ import { stretch } from "../monitor/figures.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { machineFile } from "./machine-file.js";
 
-const [REFRESH_S, RECORDINGS] = [15, 40];
+const RECORDINGS = 40;
 
 /** @typedef {import("./machine-file.js").Sensor} Sensor */
 /** @typedef {{source: string, reason: string}} Values */
@@ -19,6 +19,7 @@ export class SamplePlot extends MachineElement {
   route = "";
   /** What is shown where no recording is chosen. */
   live = "newest samples";
+  refreshS = 15;
   /** @type {Sensor[]} */
   sensors = [];
   body = html("div");
@@ -34,7 +35,7 @@ export class SamplePlot extends MachineElement {
     this.#source.hidden = true;
     this.replaceChildren(html("div", { class: "tools" }, ...this.choices(), this.#source), this.#said, this.body);
     this.#offer();
-    this.keepLoading(REFRESH_S);
+    this.keepLoading(this.refreshS);
   }
 
   /**

@@ -13,6 +13,7 @@ const rpm = (/** @type {number | null} */ speed) => Math.abs((speed ?? 0) * 30) 
 class VectorPlot extends SamplePlot {
   route = "vectors";
   live = "windows of the history";
+  refreshS = 60; // hundreds of reports are read
   #channel = choiceOf("Channel", () => this.load());
   #order = choiceOf("Order", () => this.load());
 

@@ -25,7 +25,8 @@ export function figure(value) {
 export function percent(ratio) {
   if (ratio === null || ratio === undefined) return "–";
   const text = (100 * ratio).toFixed(1);
-  return `${ratio > 0 && Number(text) ? "+" : ""}${signed(text)} %`;
+  if (!Number(text)) return "0.0 %";
+  return `${ratio > 0 ? "+" : ""}${signed(text)} %`;
 }
 
 /** A relative change with half its interval. @param {number} ratio @param {number} error */
