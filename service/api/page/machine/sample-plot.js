@@ -86,7 +86,7 @@ export class SamplePlot extends MachineElement {
     const found = /** @type {T} */ (await monitor.ask(`${pathOf(this.place)}/${this.route}?${asked}`));
     if (asked !== this.#wanted()) return this.ask(); // something else was chosen meanwhile
     this.#shown = asked;
-    const said = [this.draw(found), found.reason].filter(Boolean).join(". ");
+    const said = [this.draw(found), found.reason].filter(Boolean).join("; ");
     this.#said.textContent = said.charAt(0).toUpperCase() + said.slice(1);
   }
 

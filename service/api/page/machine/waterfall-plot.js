@@ -1,5 +1,5 @@
 import { clock, figure, quantity, stretch } from "../monitor/figures.js";
-import { html } from "../elements/markup.js";
+import { html, svg } from "../elements/markup.js";
 import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 
 /** @typedef {import("../monitor/records.js").WaterfallSnapshot} Waterfall */
@@ -44,10 +44,13 @@ class WaterfallPlot extends SamplePlot {
         context.fillRect(across, rows.length - 1 - down, 1, 1);
       }),
     );
+    const step = (lines[lines.length - 1] - lines[0]) / (lines.length - 1);
+    const once = rows.flatMap((row, down) => (row.speed_rad_s === null ? [] : [`${(Math.abs(row.speed_rad_s) / (2 * Math.PI) - lines[0]) / step + 0.5},${rows.length - down - 0.5}`]));
+    const order = once.length ? svg("svg", { viewBox: `0 0 ${lines.length} ${rows.length}`, preserveAspectRatio: "none", "aria-hidden": "true" }, svg("polyline", { points: once.join(" ") })) : "";
     const ends = [rows[rows.length - 1], rows[Math.floor(rows.length / 2)], rows[0]].map((row) => html("span", {}, named(row, found.over)));
     const along = [0, 0.25, 0.5, 0.75, 1].map((part) => html("span", {}, figure(lines[0] + part * (lines[lines.length - 1] - lines[0]))));
-    this.body.append(html("figure", { class: "waterfall" }, html("div", { class: "up number" }, ...ends), canvas, html("div", { class: "along number" }, ...along), html("p", { class: "unit" }, "frequency, Hz")));
-    return `${found.source}, ${rows.length} spectra of ${found.channel}, ${stretch(found.start_ns, found.end_ns)}; the strongest shade is ${quantity(top, found.unit)}, with a third of it less a tenth of that`;
+    this.body.append(html("figure", { class: "waterfall" }, html("div", { class: "up number" }, ...ends), canvas, order, html("div", { class: "along number" }, ...along), html("p", { class: "unit" }, "frequency, Hz")));
+    return `${found.source}, ${rows.length} spectra of ${found.channel}, ${stretch(found.start_ns, found.end_ns)}; the strongest shade is ${quantity(top, found.unit)}, with a third of it less a tenth of that${order ? "; dashed: 1×" : ""}`;
   }
 }
 
