@@ -136,3 +136,34 @@ def violations(page: Page) -> list[str]:
         for rule in found["violations"]
         for node in rule["nodes"]
     ]
+
+
+def unreached(page: Page) -> list[str]:
+    """Controls that the Tab key does not lead to, or that do not show that they have the focus."""
+    wrong: list[str] = []
+    page.evaluate(
+        "[document.activeElement.blur(), window.getSelection().removeAllRanges(), window.reached = new Map()]"
+    )
+    for _ in range(500):
+        page.keyboard.press("Tab")
+        told: str | None = page.evaluate(_FOCUSED)
+        if told is None:
+            break
+        if told:
+            wrong.append(f"no outline: {told}")
+    left: list[str] = page.evaluate(_LEFT)
+    return wrong + [f"not reached: {one}" for one in left]
+
+
+_FOCUSED = """() => {
+  const one = document.activeElement, style = getComputedStyle(one);
+  const known = one.outerHTML.slice(0, 300);
+  if (window.reached.has(one)) return null;
+  window.reached.set(one, known);
+  const shown = one === document.body || (style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2);
+  return shown ? "" : known;
+}"""
+_LEFT = """() => [...document.querySelectorAll("a[href], button, input, select, textarea, summary, [tabindex='0']")]
+  .filter((one) => one.checkVisibility({ visibilityProperty: true }) && one.getClientRects().length && !one.disabled)
+  .map((one) => one.outerHTML.slice(0, 300))
+  .filter((known) => ![...window.reached.values()].includes(known))"""

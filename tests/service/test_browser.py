@@ -25,6 +25,7 @@ from tests.service.browsing import (
     looking,
     plant_running,
     route_events,
+    unreached,
     violations,
 )
 from tests.service.live import until
@@ -182,6 +183,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
                     expect(page.locator("spectrum-plot canvas")).to_be_visible()
                 kept(page, f"{name}-{kind}")
                 broken += [f"{name}, {kind}: {one}" for one in violations(page)]
+                broken += [f"{name}: {one}" for one in unreached(page)] if kind == "light" else []
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
                 ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
                 assert (int(re.findall(r"\d+", ground)[0]) < 80) is dark
@@ -249,7 +251,15 @@ def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
         page.route("**/shelve", overtaken)
         page.goto(f"{url}/#/alarms")
         row = page.locator("alarm-list tr", has_text="k_by")
-        row.get_by_role("button", name="Shelve").click()
+        shelve = row.get_by_role("button", name="Shelve")
+        shelve.focus()
+        page.keyboard.press("Enter")
+        expect(page.get_by_label("Reason")).to_be_focused()
+        assert not violations(page)
+        page.keyboard.press("Escape")
+        expect(page.get_by_role("dialog")).to_have_count(0)
+        expect(shelve).to_be_focused()
+        shelve.click()
         page.get_by_label("Reason").fill("cable is replaced")
         page.get_by_role("dialog").get_by_role("button", name="Shelve").click()
         expect(page.locator("alarm-list [role=status]")).to_contain_text("Not done.")

@@ -1,0 +1,86 @@
+"""Pictures of the page for the documents: a real monitor, three simulated rotors, one of which loses bearing stiffness.
+
+Run: ``python benchmarks/screenshots.py [FOLDER]`` (about three minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM``
+names; FOLDER is ``docs/figures`` if left out).
+"""
+
+import argparse
+import io
+import json
+import os
+import tempfile
+from pathlib import Path
+
+from page import chromium
+from PIL import Image
+from playwright.sync_api import Page
+from running_monitor import PLACE, Monitor, monitor, started
+
+#: Path of each view, what is there when it is complete, and how high a picture of it is.
+VIEWS = {
+    "plant": ("", "machine-tile.alert spark-line polyline", 560),
+    "machine": (f"machines/{PLACE}", "spectrum-plot canvas", 1250),
+    "alarms": ("alarms", "alarm-history table", 640),
+    "why": (f"why/{PLACE}/k_by", "why-view canvas", 1250),
+    "recordings": ("recordings", "recording-table table", 760),
+    "administration": ("administration", "audit-log table", 900),
+}
+FAULT = "k_by=-0.25@140"
+WIDTH, MOST_BYTES, PACE = 1280, 150_000, "6"
+WAIT_MS = 240_000
+
+
+def picture(page: Page, at: Path, height: int) -> None:
+    """What is seen, in as many colours as fit into the size."""
+    page.set_viewport_size({"width": WIDTH, "height": height})
+    page.wait_for_timeout(1500)
+    shot = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    for colours in (256, 128, 64, 32):
+        shot.quantize(colours, dither=Image.Dither.NONE).save(at, optimize=True)
+        if at.stat().st_size <= MOST_BYTES:
+            break
+    print(f"{at}: {at.stat().st_size / 1000:.0f} kB")
+
+
+def look(one: Monitor, folder: Path) -> None:
+    """Look at every view once the fault is found."""
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": WIDTH, "height": 900}, color_scheme="light")
+        page.set_default_timeout(WAIT_MS)
+        page.goto(f"{one.url}/#/")
+        page.locator("machine-tile.alert").wait_for()
+        page.wait_for_timeout(5000)
+        for name, (path, there, height) in VIEWS.items():
+            page.goto(f"{one.url}/#/{path}")
+            if name == "plant":
+                page.reload()  # lines of the last day as they are by now
+            page.locator(there).first.wait_for()
+            picture(page, folder / f"page-{name}.png", height)
+
+
+def main() -> None:
+    """Run it."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folder", type=Path, nargs="?", default=Path(__file__).parents[1] / "docs" / "figures")
+    folder = parser.parse_args().folder
+    with tempfile.TemporaryDirectory() as temporary:
+        machines = [{"file": "lab", "bundle": "lab"}, {"file": "heavy"}, {"file": "light"}]
+        settings = {
+            "ROTORWATCH_MACHINES": json.dumps(machines),
+            "ROTORWATCH_RECORDING": json.dumps({"directory": f"{temporary}/recordings", "rotate_s": 60}),
+        }
+        publish = ["--pace", PACE, "--duration", "900"]
+        with monitor(Path(temporary), 1024, settings, *publish, "--fault", FAULT, "--seed", "2") as one:
+            send = ["simulator.rotorsim", "publish", "--connect", one.endpoint, *publish, "--machine"]
+            quiet = Path(os.devnull)
+            others = [started([*send, name], quiet, quiet, dict(os.environ)) for name in ("heavy", "light")]
+            try:
+                look(one, folder)
+            finally:
+                for each in others:
+                    each.terminate()
+                    each.wait(60)
+
+
+if __name__ == "__main__":
+    main()
