@@ -1,7 +1,7 @@
 """Pictures of the page for the documents: a real monitor, three simulated rotors, one of which loses bearing stiffness.
 
-Run: ``python benchmarks/screenshots.py [FOLDER]`` (about three minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM``
-names; FOLDER is ``docs/figures`` if left out).
+Run: ``python benchmarks/screenshots.py [FOLDER]`` (two minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM`` names;
+FOLDER is ``docs/figures`` if left out).
 """
 
 import argparse
@@ -18,11 +18,11 @@ from running_monitor import PLACE, Monitor, monitor, started
 
 #: Path of each view, what is there when it is complete, and how high a picture of it is.
 VIEWS = {
-    "plant": ("", "machine-tile.alert spark-line polyline", 560),
+    "plant": ("", "machine-tile.alert spark-line polyline", 460),
     "machine": (f"machines/{PLACE}", "spectrum-plot canvas", 1250),
     "alarms": ("alarms", "alarm-history table", 640),
     "why": (f"why/{PLACE}/k_by", "why-view canvas", 1250),
-    "recordings": ("recordings", "recording-table table", 760),
+    "recordings": (f"recordings/{PLACE}", "recording-table table", 900),
     "administration": ("administration", "audit-log table", 900),
 }
 FAULT = "k_by=-0.25@140"
@@ -34,6 +34,7 @@ def picture(page: Page, at: Path, height: int) -> None:
     """What is seen, in as many colours as fit into the size."""
     page.set_viewport_size({"width": WIDTH, "height": height})
     page.wait_for_timeout(1500)
+    page.evaluate("scrollTo(0, 0)")
     shot = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     for colours in (256, 128, 64, 32):
         shot.quantize(colours, dither=Image.Dither.NONE).save(at, optimize=True)
@@ -49,11 +50,15 @@ def look(one: Monitor, folder: Path) -> None:
         page.set_default_timeout(WAIT_MS)
         page.goto(f"{one.url}/#/")
         page.locator("machine-tile.alert").wait_for()
-        page.wait_for_timeout(5000)
+        page.wait_for_timeout(20_000)
         for name, (path, there, height) in VIEWS.items():
             page.goto(f"{one.url}/#/{path}")
             if name == "plant":
-                page.reload()  # lines of the last day as they are by now
+                page.reload()  # lines as they are by now
+            if name == "administration":
+                page.goto(f"{one.url}/#/alarms")
+                page.get_by_role("button", name="Acknowledge").first.click()
+                page.goto(f"{one.url}/#/{path}")
             page.locator(there).first.wait_for()
             picture(page, folder / f"page-{name}.png", height)
 
@@ -67,7 +72,7 @@ def main() -> None:
         machines = [{"file": "lab", "bundle": "lab"}, {"file": "heavy"}, {"file": "light"}]
         settings = {
             "ROTORWATCH_MACHINES": json.dumps(machines),
-            "ROTORWATCH_RECORDING": json.dumps({"directory": f"{temporary}/recordings", "rotate_s": 60}),
+            "ROTORWATCH_RECORDING": json.dumps({"directory": f"{temporary}/recordings", "rotate_s": 15}),
         }
         publish = ["--pace", PACE, "--duration", "900"]
         with monitor(Path(temporary), 1024, settings, *publish, "--fault", FAULT, "--seed", "2") as one:

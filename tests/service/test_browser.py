@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Iterator
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 import httpx
 import pytest
@@ -234,6 +235,47 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
         page.goto(f"{url}/#/machines/demo/lab")
         expect(page.locator("rotor-drawing .sensor.danger")).to_contain_text("DE-H ◆ danger")
         expect(page.locator("rotor-drawing svg")).to_contain_text(re.compile(r"[\d.]+ (mm/s|m/s²) rms"))
+
+
+def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(browser: Browser, plant: Plant) -> None:
+    url = plant.runtime.http_url
+    asked: list[list[str]] = []
+
+    def health(number: int) -> str:
+        state = {"state": "healthy", "alarms": []} if number != 70 else {}
+        told = {**dict(example(Health)), "site": f"site-{number // 40}", "machine": f"m{number}", **state}
+        return f"event: health\ndata: {json.dumps(told)}\n\n"
+
+    def instead(route: Route) -> None:
+        lines = "event: start\ndata: {}\n\n" + "".join(map(health, range(120)))
+        route.fulfill(body=lines, content_type="text/event-stream")
+
+    def lines(route: Route) -> None:
+        asked.append(parse_qs(urlsplit(route.request.url).query)["of"])
+        route.fulfill(json={"trends": [{"starts_ns": [1, 2, 3], "means": [0.0, 1.0, 0.5]}] * len(asked[-1])})
+
+    with looking(browser, url) as page:
+        route_events(page, instead)
+        page.route("**/api/v1/trends?*", lines)
+        page.goto(url)
+        sites, tiles = page.locator("site-section"), page.locator("machine-tile")
+        expect(tiles).to_have_count(120)
+        expect(page.locator("site-section h2")).to_have_text(["site-1", "site-0", "site-2"])
+        expect(sites.first.locator("summary")).to_contain_text("40 machines, 1 abnormal")
+        expect(tiles.first).to_have_attribute("place", "site-1/m70")
+        expect(tiles.first.locator("polyline")).to_be_attached()
+        assert 1 <= sum(map(len, asked)) < 60
+        page.get_by_label("Order").select_option("by name")
+        expect(tiles.first).to_have_attribute("place", "site-0/m0")
+        sites.nth(1).locator("summary").click()
+        expect(tiles).to_have_count(80)
+        expect(sites.nth(1).locator("state-mark")).to_have_text("alert")  # what is folded away
+        page.reload()
+        expect(tiles).to_have_count(80)
+        expect(tiles.first).to_have_attribute("place", "site-0/m0")
+        page.get_by_label("Search machines").fill("m70")
+        expect(sites).to_have_count(1)
+        assert not violations(page)
 
 
 def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
