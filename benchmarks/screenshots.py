@@ -19,11 +19,10 @@ from running_monitor import PLACE, Monitor, monitor, started
 #: Path of each view, what is there when it is complete, and how high a picture of it is.
 VIEWS = {
     "plant": ("", "machine-tile.alert spark-line polyline", 460),
-    "machine": (f"machines/{PLACE}", "spectrum-plot canvas", 1250),
-    "alarms": ("alarms", "alarm-history table", 640),
+    "machine": (f"machines/{PLACE}", "spectrum-plot canvas", 935),
+    "alarms": ("alarms", "alarm-history table", 530),
     "why": (f"why/{PLACE}/k_by", "why-view canvas", 1250),
-    "recordings": (f"recordings/{PLACE}", "recording-table table", 900),
-    "administration": ("administration", "audit-log table", 900),
+    "recordings": (f"recordings/{PLACE}", "recording-table table", 755),
 }
 FAULT = "k_by=-0.25@140"
 WIDTH, MOST_BYTES, PACE = 1280, 150_000, "6"
@@ -55,10 +54,6 @@ def look(one: Monitor, folder: Path) -> None:
             page.goto(f"{one.url}/#/{path}")
             if name == "plant":
                 page.reload()  # lines as they are by now
-            if name == "administration":
-                page.goto(f"{one.url}/#/alarms")
-                page.get_by_role("button", name="Acknowledge").first.click()
-                page.goto(f"{one.url}/#/{path}")
             page.locator(there).first.wait_for()
             picture(page, folder / f"page-{name}.png", height)
 
