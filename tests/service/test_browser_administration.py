@@ -12,7 +12,7 @@ from rotorwatch.records.monitor import MachineReadiness, Readiness, WebhookList
 from service.access.scopes import Scope
 from service.history.records import AuditEntry
 from service.runtime import Runtime
-from tests.service.browsing import PATIENCE_MS, chromium, kept, violations
+from tests.service.browsing import PATIENCE_MS, chromium, kept, unreached, violations
 from tests.service.monitored import GUARDED, fed, token
 
 OLD = 60
@@ -115,6 +115,7 @@ def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtim
             page.emulate_media(color_scheme="dark" if dark else "light")
             kept(page, f"administration-{kind}")
             assert not violations(page)
+            assert not unreached(page)
             assert page.evaluate("document.documentElement.scrollWidth") == width
         page.locator("token-list tr", has_text="chief").get_by_role("button", name="Revoke").click()
         expect(page.get_by_role("dialog")).to_contain_text("you are signed out at once")

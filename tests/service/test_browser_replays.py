@@ -11,7 +11,7 @@ from rotorwatch.records.replays import ReplayJob
 from service.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
-from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, violations
+from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations
 from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, send, settings, until
 from tests.service.monitored import client
 from tests.service.replaying import recording
@@ -96,6 +96,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         replayed = page.url
         kept(page, "replay-light")
         assert not violations(page)
+        assert not unreached(page)
 
         chosen(page, url)
         page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
