@@ -312,7 +312,7 @@ def test_page_for_people_is_kept_by_its_content(http: httpx.Client) -> None:
     sheets = {name for name in page_files() if name.endswith(".css")} - {"uPlot.min.css"}  # which charts load
     assert {path.split("/", 3)[3] for path in paths} == sheets | {"rotorwatch-page.js"}
     _, _, version, _ = paths[0].split("/")
-    for path in (*paths, *(f"/page/{version}/{name}" for name in ("uPlot.iife.js", "machine/orbit-plot.js"))):
+    for path in (*paths, *(f"/page/{version}/{name}" for name in ("uPlot.iife.js", "plots/orbit-plot.js"))):
         loaded = http.get(path)
         assert loaded.status_code == 200
         assert "immutable" in loaded.headers["cache-control"]

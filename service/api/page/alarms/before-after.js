@@ -1,7 +1,7 @@
 import { printed } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
-import { orbitFigure } from "../machine/orbit-plot.js";
-import { spectrumDrawing } from "../machine/spectrum-plot.js";
+import { orbitFigure } from "../plots/orbit-plot.js";
+import { spectrumDrawing } from "../plots/spectrum-plot.js";
 import "../elements/line-chart.js";
 
 /** @typedef {import("../monitor/records.js").Picture} Picture */

@@ -6,13 +6,13 @@ import "../alarms/alarm-history.js";
 import "../alarms/alarm-list.js";
 import "./data-quality.js";
 import "./level-table.js";
-import "./orbit-plot.js";
+import "../plots/orbit-plot.js";
 import "./parameter-forest.js";
 import "./parameter-table.js";
 import "./parameter-trend.js";
-import "./plot-fold.js";
-import "./rotor-drawing.js";
-import "./spectrum-plot.js";
+import "../plots/plot-fold.js";
+import "../drawing/rotor-drawing.js";
+import "../plots/spectrum-plot.js";
 import "../elements/state-mark.js";
 
 const RANGES = /** @type {[string, string][]} */ ([["1", "last hour"], ["24", "last 24 h"], ["720", "last 30 days"], ["", "all there is"]]);
@@ -66,7 +66,7 @@ class MachineView extends MachineElement {
     this.#built = true;
     const place = this.place;
     // Where parameters are read, levels tell less.
-    const trends = [html("parameter-trend", { place, hours: "24" }), html("plot-fold", { place, shows: "level-trend", heading: "Levels over time", hours: "24", open: !this.health?.report?.parameters.length })];
+    const trends = [html("parameter-trend", { place, hours: "24" }), html("plot-fold", { place, shows: "machine/level-trend", heading: "Levels over time", hours: "24", open: !this.health?.report?.parameters.length })];
     const range = html(
       "select",
       {
@@ -91,10 +91,10 @@ class MachineView extends MachineElement {
       ...trends,
       html("orbit-plot", { place }),
       html("spectrum-plot", { place }),
-      ...FOLDED.map(([shows, heading]) => html("plot-fold", { place, shows, heading })),
+      ...FOLDED.map(([shows, heading]) => html("plot-fold", { place, shows: `plots/${shows}`, heading })),
       html("data-quality", { place }),
       html("alarm-history", { place }),
-      html("plot-fold", { place, shows: "machine-facts", heading: "Machine file" }),
+      html("plot-fold", { place, shows: "machine/machine-facts", heading: "Machine file" }),
       html("p", { class: "note" }, "As the API tells it: ", ...RAW.flatMap((part, at) => [at ? ", " : "", html("a", { href: `${pathOf(place)}/${part}` }, part)])),
     );
   }

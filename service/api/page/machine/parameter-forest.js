@@ -3,7 +3,7 @@ import { html, lay, svg } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { machineFile } from "./machine-file.js";
 import { parameterReadings } from "./parameter-readings.js";
-import { roundUp } from "./plane.js";
+import { roundUp } from "../plots/plane.js";
 
 /** @typedef {import("./machine-file.js").MachineFile} MachineFile */
 

@@ -1,6 +1,6 @@
 import { quantity, stretch } from "../monitor/figures.js";
 import { html, svg } from "../elements/markup.js";
-import { angleOf } from "./machine-file.js";
+import { angleOf } from "../machine/machine-file.js";
 import { plane, REACH, roundUp } from "./plane.js";
 import { choiceOf, offered, SamplePlot } from "./sample-plot.js";
 import "../elements/line-chart.js";

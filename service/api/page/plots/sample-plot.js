@@ -2,11 +2,11 @@ import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { stretch } from "../monitor/figures.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
-import { machineFile } from "./machine-file.js";
+import { machineFile } from "../machine/machine-file.js";
 
 const RECORDINGS = 40;
 
-/** @typedef {import("./machine-file.js").Sensor} Sensor */
+/** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
 /** @typedef {{source: string, reason: string}} Values */
 
 /**

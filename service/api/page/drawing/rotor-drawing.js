@@ -1,14 +1,14 @@
 import { percent, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { machineFile } from "./machine-file.js";
-import { parameterReadings } from "./parameter-readings.js";
+import { machineFile } from "../machine/machine-file.js";
+import { parameterReadings } from "../machine/parameter-readings.js";
 import { plainPicture } from "./plain-picture.js";
 import { rotorPicture } from "./rotor-picture.js";
 
 /** The machine as its file describes it, with what is read of each part at that part; only what is abnormal has a colour. */
 class RotorDrawing extends MachineElement {
-  /** @type {import("./machine-file.js").MachineFile | null} */
+  /** @type {import("../machine/machine-file.js").MachineFile | null} */
   #file = null;
   #why = "";
 

@@ -3,10 +3,10 @@
 import { quantity } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
 import { levelUnit, measureText, STATES } from "../monitor/states.js";
-import { sensorState } from "./machine-file.js";
+import { sensorState } from "../machine/machine-file.js";
 import { MARKS } from "./rotor-parts.js";
 
-/** @typedef {import("./machine-file.js").Sensor} Sensor */
+/** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
 /** @typedef {import("../monitor/records.js").Health} Health */
 
 const [WIDTH, LINE, SHAFT] = [360, 19, 22];

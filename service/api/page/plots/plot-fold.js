@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 
 /**
- * Something that is not always needed, folded: `<plot-fold place shows="waveform-plot" heading>`, with `open` not at first. It is loaded when it is
+ * Something that is not always needed, folded: `<plot-fold place shows="plots/waveform-plot" heading>`, with `open` not at first. It is loaded when it is
  * opened, and asks for nothing once it is closed again.
  */
 class PlotFold extends HTMLElement {
@@ -11,8 +11,8 @@ class PlotFold extends HTMLElement {
     const toggled = async (/** @type {{target: HTMLDetailsElement}} */ { target }) => {
       if (!target.open) return inside.replaceChildren();
       try {
-        await import(`./${shows}.js`);
-        if (target.open) inside.replaceChildren(html(shows, { place, hours: this.getAttribute("hours") }));
+        await import(`../${shows}.js`);
+        if (target.open) inside.replaceChildren(html(shows.slice(shows.indexOf("/") + 1), { place, hours: this.getAttribute("hours") }));
       } catch {
         inside.replaceChildren(html("p", { class: "note" }, "The monitor serves another page by now: load this one again."));
       }

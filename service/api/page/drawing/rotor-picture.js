@@ -4,8 +4,8 @@ import { quantity } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
 import { arrow, damper, LINE, parameter, rotation, sensorsRound, spring } from "./rotor-parts.js";
 
-/** @typedef {import("./parameter-readings.js").Reading} Reading */
-/** @typedef {import("./machine-file.js").MachineFile} MachineFile */
+/** @typedef {import("../machine/parameter-readings.js").Reading} Reading */
+/** @typedef {import("../machine/machine-file.js").MachineFile} MachineFile */
 /** @typedef {import("../monitor/records.js").Health} Health */
 
 const [WIDTH, HEIGHT] = [360, 496];

@@ -3,10 +3,10 @@
 import { percent, within, Z95 } from "../monitor/figures.js";
 import { svg } from "../elements/markup.js";
 import { STATES } from "../monitor/states.js";
-import { angleOf, sensorState } from "./machine-file.js";
+import { angleOf, sensorState } from "../machine/machine-file.js";
 
-/** @typedef {import("./parameter-readings.js").Reading} Reading */
-/** @typedef {import("./machine-file.js").Sensor} Sensor */
+/** @typedef {import("../machine/parameter-readings.js").Reading} Reading */
+/** @typedef {import("../machine/machine-file.js").Sensor} Sensor */
 /** @typedef {import("../monitor/records.js").Health} Health */
 
 export const LINE = 14;
