@@ -331,11 +331,11 @@ class _Supervisor:
         if before is not None and _news(before) == _news(health):
             return
         self._published[number] = health
-        self._evidence[number].look(health)
         link.publish_health(health.model_dump_json())
         self._feed.health(health)
         if before is None or before.state != health.state:
             _log.info("state", machine=f"{health.site}/{health.machine}", state=health.state.value, why=health.reason)
+        self._evidence[number].look(health)  # last: nothing waits for it
 
 
 def _news(health: Health) -> Health:

@@ -4,10 +4,10 @@ An alarm can then be understood long after its window is gone. Nothing of this d
 """
 
 from models.alarm_names import alarm_kind
+from models.errors import RotorwatchError
 from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.history import AlarmEvidence, Picture
-from service.history.records import StoreError
 from service.stream.worker import MachineWorker
 from service.terminal.logs import logger
 
@@ -44,7 +44,7 @@ class EvidenceCollector:
                 self._before = self._picture(report)
                 self._worker.history.keep_evidence(_BEFORE, 0, self._before.model_dump_json())
             self._looked_ns = report.end_ns
-        except StoreError as error:  # tried again at the next look
+        except RotorwatchError as error:  # tried again at the next look
             _log.warning("evidence could not be kept", machine=f"{health.site}/{health.machine}", why=str(error))
 
     def _keep(self, name: str, occurrence: int, alarm: Alarm, report: Report) -> None:

@@ -1,6 +1,6 @@
 """Recordings over HTTP: list, look at, download."""
 
-from functools import cache
+from functools import lru_cache
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated
@@ -106,7 +106,7 @@ def _with_data_times(recording: Recording) -> Recording:
     return recording.model_copy(update={"data_start_ns": span.start_ns, "data_end_ns": span.end_ns})
 
 
-@cache
+@lru_cache(maxsize=10_000)  # a file that grows is another one each time
 def _data_span(path: Path, _size_bytes: int) -> DataSpan | None:
     """Which data a file holds, read once for as long as it has the same size; None where it is damaged or gone."""
     try:
