@@ -97,6 +97,14 @@ def test_nobody_gives_a_scope_that_is_not_his_own(monitor: Guarded) -> None:
     assert "more, operate" in refused[0].reason
 
 
+def test_nobody_gives_a_token_that_is_valid_for_longer_than_his_own(monitor: Guarded) -> None:
+    with monitor.client(monitor.token(*Scope, name="guest", days=30)) as guest:
+        for days in (31, None):
+            wish = {"name": "heir", "scopes": ["read"], "days": days}
+            assert "valid for longer" in problem(guest.post(TOKENS, json=wish), 403)
+        assert create(guest, "heir", days=29).token.expires_ns
+
+
 @pytest.mark.parametrize(
     ("wish", "said"),
     [

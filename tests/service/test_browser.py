@@ -308,6 +308,7 @@ def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:
         expect(row).to_contain_text("I was first")
         row.get_by_role("button", name="Unshelve").click()
         expect(row.get_by_role("button", name="Unshelve")).to_have_count(0)
+        expect(page.get_by_role("img", name=re.compile("^k_by was raised once"))).to_be_visible()
         page.unroute("**/shelve")
         page.get_by_label("Order").select_option("first-out")
         expect(page.locator("alarm-list tbody tr")).to_have_text([re.compile("k_by"), re.compile("stream-lost")])

@@ -51,7 +51,11 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
             raise HTTPException(403, text)
         now_ns = guard.clock_ns()
         try:
-            record, text = new_token(wish.name, scopes, now_ns=now_ns, days=wish.days)
+            record, secret = new_token(wish.name, scopes, now_ns=now_ns, days=wish.days)
+            if _outlasts(record, guard.tokens.find(caller.token_id)):
+                text = f"{caller.name} expires, and so cannot give a token that is valid for longer; give it fewer days"
+                request.state.audit = AuditNote("create-token", reason=f"{said}: {text}")
+                raise HTTPException(403, text)
             with one_at_a_time:
                 check_name_is_free(wish.name, guard.tokens.all(), now_ns)
                 guard.tokens.add(record)
@@ -60,7 +64,7 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
         except MachineFileError as error:
             raise HTTPException(422, str(error)) from error
         request.state.audit = AuditNote("create-token", reason=f"{record.token_id}, {said}")
-        return TokenCreated(token=_entry(guard, record), text=text)
+        return TokenCreated(token=_entry(guard, record), text=secret)
 
     @app.delete(
         f"{_PLACE}/{{token_id}}", tags=["service"], dependencies=[guard.configure], responses=responses(TokenEntry, 404)
@@ -74,6 +78,13 @@ def add_token_routes(app: FastAPI, guard: Guard) -> None:
             raise HTTPException(404, f"no token {masked(token_id)[:80]}; expected the 12 characters after rw_")
         request.state.audit = AuditNote("revoke-token", reason=f"{record.token_id}, {record.name}")
         return _entry(guard, record)
+
+
+def _outlasts(made: TokenRecord, own: TokenRecord | None) -> bool:
+    """Whether a token is valid for longer than that of who creates it."""
+    if own is None or own.expires_ns is None:
+        return False
+    return made.expires_ns is None or made.expires_ns > own.expires_ns
 
 
 def _entry(guard: Guard, record: TokenRecord) -> TokenEntry:

@@ -2,6 +2,7 @@ import { clock } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { MachineElement } from "../elements/machine-element.js";
+import { timeLine } from "./alarm-time-line.js";
 import { why } from "./why-link.js";
 import "../elements/state-mark.js";
 
@@ -55,6 +56,7 @@ class AlarmHistory extends MachineElement {
     lay(
       this,
       html("p", { class: "message", role: "status" }, this.#message),
+      timeLine(this.#events, this.health?.report?.end_ns ?? 0),
       rows.length ? table(["time", "what", "event", "by", "reason"], rows, `History of ${this.place}`) : html("p", { class: "note" }, "Nothing has happened to an alarm of this machine."),
       this.#before === null ? "" : html("button", { type: "button", click: () => this.#load() }, "Older"),
     );

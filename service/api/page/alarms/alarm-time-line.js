@@ -1,0 +1,44 @@
+import { clock, stretch } from "../monitor/figures.js";
+import { html, svg } from "../elements/markup.js";
+
+const [WIDTH, HEIGHT, LEAST] = [1000, 12, 3];
+const [BEGINS, ENDS] = [new Set(["raised", "escalated"]), new Set(["cleared", "reset"])];
+
+/** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
+/** @typedef {{from: number, to: number, severity: string, text: string}} Spell */
+
+/** When an alarm was raised and when it cleared, out of its events, oldest first. @param {AlarmEvent[]} events @param {number} end @returns {Spell[]} */
+function spells(events, end) {
+  /** @type {Spell[]} */
+  const found = [];
+  /** @type {Spell | null} */
+  let open = null;
+  for (const one of events) {
+    if (open && (BEGINS.has(one.kind) || ENDS.has(one.kind))) {
+      open.to = one.time_ns;
+      open = null;
+    }
+    if (BEGINS.has(one.kind)) found.push((open = { from: one.time_ns, to: end, severity: one.severity, text: one.text }));
+  }
+  return found;
+}
+
+/** How long each alarm stood, one below the other on a line of time. @param {AlarmEvent[]} events newest first @param {number} now @returns {HTMLElement | null} */
+export function timeLine(events, now) {
+  if (!events.length) return null;
+  const [first, end] = [events[events.length - 1].time_ns, Math.max(now, events[0].time_ns)];
+  const x = (/** @type {number} */ ns) => (WIDTH * (ns - first)) / (end - first || 1);
+  const names = [...new Set(events.map((one) => one.name))];
+  const rows = names.flatMap((name) => {
+    const stood = spells(events.filter((one) => one.name === name).reverse(), end);
+    if (!stood.length) return [];
+    const bars = stood.map((one) => {
+      const from = Math.min(x(one.from), WIDTH - LEAST);
+      const [top, height] = one.severity === "danger" ? [0, HEIGHT] : [HEIGHT / 4, HEIGHT / 2];
+      return svg("rect", { class: one.severity, x: from, width: Math.max(LEAST, x(one.to) - from), y: top, height }, svg("title", {}, `${one.text}, ${stretch(one.from, one.to)}`));
+    });
+    return [html("dt", {}, name), html("dd", {}, svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, preserveAspectRatio: "none", role: "img", "aria-label": `${name} was raised ${stood.length === 1 ? "once" : `${stood.length} times`} between ${clock(first)} and ${clock(end)}` }, ...bars))];
+  });
+  if (!rows.length) return null;
+  return html("div", { class: "alarm-time-line" }, html("dl", {}, ...rows), html("p", { class: "note" }, `${stretch(first, end)}; high bars are danger, low ones alert.`));
+}
