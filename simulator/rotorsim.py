@@ -1,5 +1,6 @@
 """The command ``rotorsim``: a simulated machine that publishes its vibration, or writes it into a recording."""
 
+import queue
 import signal
 import threading
 import time
@@ -250,12 +251,23 @@ def _time_ns(text: str) -> int:
 def _stop_on_signal() -> Iterator[threading.Event]:
     """Event that SIGINT and SIGTERM set, so that a run ends between two blocks with everything closed."""
     stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
+
+    def listen() -> None:
+        if asked.get():
+            stop.set()
+
+    # The handler itself may not set the event: it may interrupt this thread where it holds the event's lock.
+    listener = threading.Thread(target=listen, name="signals", daemon=True)
+    listener.start()
+    before = {number: signal.signal(number, lambda *_: asked.put(True)) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        asked.put(False)
+        listener.join()
 
 
 class _ProgressLine:

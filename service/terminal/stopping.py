@@ -1,7 +1,7 @@
 """The request to stop that a program gets as a signal."""
 
+import queue
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,11 +14,12 @@ class StopRequest:
     """Whether SIGINT or SIGTERM has come."""
 
     def __init__(self) -> None:
-        self._asked = threading.Event()
+        # Not an event: the handler may interrupt the main thread where it holds the event's lock, and wait for ever.
+        self._asked: queue.SimpleQueue[bool] = queue.SimpleQueue()
 
     def ask(self) -> None:
         """Ask for the stop."""
-        self._asked.set()
+        self._asked.put(True)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait for the stop, at most so long, and say whether it was asked for.
@@ -27,10 +28,14 @@ class StopRequest:
         only when the main thread next does something.
         """
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while not self._asked.wait(_TICK_S):
-            if deadline_s is not None and time.monotonic() >= deadline_s:
-                return False
-        return True
+        while True:
+            try:
+                self._asked.put(self._asked.get(timeout=_TICK_S))  # back again, for whoever asks next
+            except queue.Empty:
+                if deadline_s is not None and time.monotonic() >= deadline_s:
+                    return False
+            else:
+                return True
 
 
 @contextmanager

@@ -1,0 +1,31 @@
+"""SIGTERM stops both programs wherever it finds them, in the middle of a wait as well."""
+
+import subprocess
+import sys
+
+import pytest
+
+# Every line that the main thread runs during the wait, inside the standard library too, is interrupted by the signal.
+_SCRIPT = """
+import signal, sys
+from {module} import {name}
+
+def interrupt(frame, event, argument):
+    signal.raise_signal(signal.SIGTERM)
+    return interrupt
+
+with {name}() as stop:
+    sys.settrace(interrupt)
+    stop.wait(0.0)
+    sys.settrace(None)
+    print(stop.wait(60.0))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "name"), [("service.terminal.stopping", "stop_request"), ("simulator.rotorsim", "_stop_on_signal")]
+)
+def test_a_signal_in_the_middle_of_a_wait_stops(module: str, name: str) -> None:
+    script = _SCRIPT.format(module=module, name=name)
+    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60.0, check=True)
+    assert run.stdout == "True\n"
