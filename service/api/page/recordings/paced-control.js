@@ -18,6 +18,9 @@ class PacedControl extends HTMLElement {
   /** First and last data. @type {[number, number] | null} */
   #span = null;
   #held = false;
+  /** Orders are given one after the other: of two at once, the first might be carried out last. */
+  #orders = Promise.resolve();
+  #waiting = 0;
 
   connectedCallback() {
     const step = (/** @type {number} */ by_s, /** @type {string} */ text) => html("button", { type: "button", click: () => this.#order("seek", { by_s }) }, text);
@@ -35,7 +38,7 @@ class PacedControl extends HTMLElement {
     this.#pause.textContent = job.state === "paused" ? "Resume" : "Pause";
     lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${counted(job.progress.messages, "message")} sent.` : ".");
     if (first) await this.#measure(job);
-    if (!this.#held && job.progress && this.#span) {
+    if (!this.#held && !this.#waiting && job.progress && this.#span) {
       this.#seek.value = String((job.progress.position_ns - this.#span[0]) / (this.#span[1] - this.#span[0]));
       this.#tell();
     }
@@ -64,14 +67,16 @@ class PacedControl extends HTMLElement {
   }
 
   /** @param {string} kind @param {unknown} [order] */
-  async #order(kind, order) {
+  #order(kind, order) {
     this.#held = false;
-    try {
-      await this.show(await monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order));
-      this.#message.textContent = "";
-    } catch (error) {
-      this.#message.textContent = error instanceof Error ? error.message : String(error);
-    }
+    this.#waiting += 1;
+    this.#orders = this.#orders
+      .then(() => monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order).finally(() => { this.#waiting -= 1; }))
+      .then((job) => {
+        this.#message.textContent = "";
+        return this.show(job);
+      })
+      .catch((error) => { this.#message.textContent = error instanceof Error ? error.message : String(error); });
   }
 }
 
