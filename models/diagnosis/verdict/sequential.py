@@ -239,13 +239,15 @@ class SequentialTest:
 
         So does one that the model explains, one that it does not: the longer one is of two machines.
         """
-        clean = [(hops, look, _values(look)) for hops, look in every.items() if self._is_clean(look)]
-        for at, (hops, short, part) in enumerate(clean):
+        clean = [(hops, look) for hops, look in every.items() if self._is_clean(look)]
+        values = [_values(look) for _, look in clean]
+        for at, (hops, short) in enumerate(clean):
             if hops > self.settings.window_hops:
                 return
             explained = short.known and not short.unexplained and not model_test(short, self._thresholds[hops])[0]
-            for _, longer, whole in reversed(clean[at + 1 :]):
-                if _worst(part, whole) > self._contradiction or (explained and longer.unexplained):
+            worst = _worst(values[at], values[at + 1 :])
+            for (_, longer), whole, differs in zip(clean[:at:-1], values[:at:-1], worst[::-1], strict=True):
+                if differs > self._contradiction or (explained and longer.unexplained):
                     inside = hops < self.settings.window_hops
                     self.state.change_ns = short.end_ns if inside else short.start_ns
                     self.state.dated_ns = short.end_ns
@@ -389,18 +391,19 @@ def _clock(time_ns: int) -> str:
     return f"{datetime.fromtimestamp(time_ns // 10**9, UTC):%H:%M:%S}"
 
 
-def _worst(part: tuple[FloatArray, FloatArray], whole: tuple[FloatArray, FloatArray]) -> float:
-    """Largest difference of a stretch from one that contains it, in standard errors of the difference.
+def _worst(part: tuple[FloatArray, FloatArray], wholes: Sequence[tuple[FloatArray, FloatArray]]) -> list[float]:
+    """Largest difference of a stretch from each that contains it, in standard errors of the difference.
 
     The errors of a part and of the whole differ by as much as their variances do (Hausman); half of the part's variance
     is the least that is believed, because both variances are estimates.
     """
-    common = np.isfinite(part[1]) & np.isfinite(whole[1])
-    if not common.any():
-        return 0.0
-    variance = part[1][common]
-    spread = np.maximum(variance - whole[1][common], variance / 2)
-    return float(np.max(np.abs(part[0] - whole[0])[common] / np.sqrt(spread)))
+    if not wholes:
+        return []
+    values, variances = np.array([one[0] for one in wholes]), np.array([one[1] for one in wholes])
+    common = np.isfinite(part[1]) & np.isfinite(variances)
+    spread = np.maximum(part[1] - np.where(common, variances, 0.0), part[1] / 2)
+    differs: FloatArray = np.max(np.abs(part[0] - values) / np.sqrt(spread), axis=1, initial=0.0, where=common)
+    return list(differs.tolist())
 
 
 def _values(look: Stretch) -> tuple[FloatArray, FloatArray]:
