@@ -8,7 +8,7 @@ about the loudest and the quietest healthy level as well as about their mean.
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,13 +20,14 @@ from models.levels.reference import LevelReference, OperatingState, ReferenceLev
 from models.levels.settings import LevelSettings
 from models.levels.zones import ZONES, zone_of
 from models.signals.channels import Channel, Quantity
-from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelGrowth, LevelLimits
+from rotorwatch.records.levels import LEVEL_MEASURES, ChannelLevels, LevelBound, LevelGrowth, LevelLimits
 
 _BEYOND_RANGE = 1.25
 _ERRORS = 6.0
 _ERRORS_OF_DOUBT = 4.0
 """Where it decides whether to believe what else has been found, not whether anything has happened."""
 _TURNED = 0.6
+_TURNED_OUT = "1x vector"
 _DEADBAND = 0.9
 _PEAK_TO_PEAK = (Quantity.DISPLACEMENT, Quantity.TILT)
 _WORDS = {
@@ -43,6 +44,14 @@ class _Limit:
     alert: float | None = None
     danger: float | None = None
     fall: float | None = None
+    zones: tuple[float, float, float] | None = field(default=None, kw_only=True)
+
+    def bound(self) -> LevelBound:
+        edges = {"alert": self.alert, "danger": self.danger, "fall": self.fall}
+        rounded = {name: None if edge is None else _rounded(edge) for name, edge in edges.items()}
+        zones = None if self.zones is None else tuple(map(_rounded, self.zones))
+        source = self.source if zones is None else self.source.rpartition(", zone ")[0]
+        return LevelBound.model_validate({"source": source, "zones": zones} | rounded)
 
 
 class LevelJudge:
@@ -126,7 +135,8 @@ class LevelJudge:
         if standard is not None:
             name, measure, boundaries = standard
             zone = zone_of(values[measure], boundaries)
-            limits.setdefault(measure, []).append(_Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2]))
+            judged = _Limit(f"{name}, zone {zone}", True, boundaries[1], boundaries[2], zones=boundaries)
+            limits.setdefault(measure, []).append(judged)
         if reference is not None:
             for measure, limit in self._relative(column, levels, reference):
                 limits.setdefault(measure, []).append(limit)
@@ -209,7 +219,7 @@ class LevelJudge:
         by_chance = _ERRORS * one.error * shorter / of_amplitude
         radius = max(_TURNED * abs(complex(*one.vector)), farthest, by_chance)
         if abs(now - complex(*one.vector)) > radius:
-            yield "x1", _Limit("1x vector", False, alert=_shown(channel, "x1", min(abs(now) * of_amplitude, alert)))
+            yield "x1", _Limit(_TURNED_OUT, False, alert=_shown(channel, "x1", min(abs(now) * of_amplitude, alert)))
 
     def _limited(self, channel: Channel, name: str, value: float, limits: Sequence[_Limit], words: str) -> LevelLimits:
         """The nearest limits of a level, and on which side it is."""
@@ -225,7 +235,7 @@ class LevelJudge:
         elif alert is not None and value >= (alert.alert or math.inf):
             what = (
                 "has moved out of its acceptance region"
-                if alert.source == "1x vector"
+                if alert.source == _TURNED_OUT
                 else (f"alert from {alert.alert:.3g} ({alert.source})")
             )
             state, text, decided = "alert", f"{said}, {what}", alert
@@ -241,6 +251,9 @@ class LevelJudge:
                 "source": "" if decided is None else decided.source,
                 "state": state,
                 "text": text,
+                "bounds": tuple(one.bound() for one in limits if one.source != _TURNED_OUT)  # that is no level
+                if len(limits) > 1 or any(one.zones for one in limits)
+                else (),
             }
         )
 

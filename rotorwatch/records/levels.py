@@ -7,6 +7,18 @@ from pydantic import Field
 from rotorwatch.records.fields import Number, Record
 
 
+class LevelBound(Record):
+    """Limits of one kind: of a standard, of the machine file, or relative to a reference."""
+
+    source: str = Field(description="where they come from", examples=["ISO 20816-3 group 2 rigid"])
+    zones: tuple[float, float, float] | None = Field(
+        default=None, description="boundaries A/B, B/C and C/D of a standard; null without", examples=[(1.4, 2.8, 4.5)]
+    )
+    alert: Number = Field(default=None, description="alert from here on; null without such a limit", examples=[2.8])
+    danger: Number = Field(default=None, description="danger from here on; null without such a limit", examples=[4.5])
+    fall: Number = Field(default=None, description="alert below; null without such a limit", examples=[None])
+
+
 class LevelLimits(Record):
     """What one level is judged by, and what came of it."""
 
@@ -25,6 +37,12 @@ class LevelLimits(Record):
         default="",
         description="the level and the limit it is beyond, in words; empty while it is normal",
         examples=[""],
+    )
+    bounds: tuple[LevelBound, ...] = Field(
+        default=(),
+        exclude_if=lambda value: not value,
+        description="each kind of limit, the farther ones too; left out where those above are the only ones and "
+        "there are no zones",
     )
 
 

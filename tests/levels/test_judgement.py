@@ -138,6 +138,7 @@ def test_a_1x_vector_that_turns_leaves_its_acceptance_region_at_the_same_size() 
     near, turned = (limits(judged(SHAFT, window(x1=10e-6 * np.exp(1j * turn)), healthy))["x1"] for turn in (0.3, 1.0))
     assert near.state == "normal"
     assert (turned.state, turned.source) == ("alert", "1x vector")
+    assert [one.source for one in turned.bounds] == ["commissioned"]
     without_reference_of_phase = judged(SHAFT, replace(window(x1=-10e-6), vectors=None), healthy)
     assert limits(without_reference_of_phase)["x1"].state == "normal"
 
@@ -154,6 +155,21 @@ def test_every_operating_state_has_levels_of_its_own() -> None:
     between = judged(CASING, window(speed_rad_s=1.3 * SPEED, overall=4.5e-3), healthy)
     assert limits(between)["overall"].source == "commissioned at another speed"
     assert limits(between)["overall"].state == "alert"
+
+
+def test_every_kind_of_limit_is_told_where_there_are_several() -> None:
+    own = [{"channel": "DE-H", "alert": 3.0}, {"channel": "DE-H", "measure": "crest", "alert": 6.0}]
+    healthy = reference(*(window(overall=1e-3) for _ in range(3)))
+    level = window(overall=1.5e-3, crest=4.0)
+    several = limits(judged(CASING, level, healthy, zones=["ISO 20816-3 group 2 rigid"], limits=own))
+    assert (several["overall"].alert, several["overall"].danger) == (1.6, 2.5)
+    assert [(one.source, one.zones, one.alert, one.danger, one.fall) for one in several["overall"].bounds] == [
+        ("own limit", None, 3.0, None, None),
+        ("ISO 20816-3 group 2 rigid", (1.4, 2.8, 4.5), 2.8, 4.5, None),
+        ("commissioned", None, 1.6, 2.5, 0.5),
+    ]
+    assert several["crest"].bounds == ()
+    assert "bounds" not in several["crest"].model_dump()
 
 
 def test_a_channel_clears_only_below_the_deadband() -> None:

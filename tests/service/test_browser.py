@@ -11,7 +11,9 @@ import pytest
 from playwright.sync_api import Browser, Error, HttpCredentials, Route, expect
 
 from rotorwatch.records.example import example
+from rotorwatch.records.fields import EXAMPLE_NS
 from rotorwatch.records.health import Health
+from rotorwatch.records.history import ReadingBucket
 from rotorwatch.records.levels import LevelGrowth
 from rotorwatch.records.windows import SensorFault, Shape
 from service.access.scopes import Scope
@@ -210,6 +212,10 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
 
     growing = report["levels"][0] | {"channel": "DE-H"}
     sensor = {"name": "DE-H", "quantity": "acceleration", "location": "DE", "direction": "H", "unit": "m/s2"}
+    read = [
+        example(ReadingBucket) | {"name": "DE-H:overall", "start_ns": EXAMPLE_NS - (3 - at) * 10**10, "mean": 0.3 + at}
+        for at in range(4)
+    ]
     file = {"description": "", "rotor": None, "operation": None, "sensors": [sensor]}
     with looking(browser, url) as page:
         route_events(page, instead)
@@ -232,7 +238,19 @@ def test_whatever_a_report_tells_is_on_the_page_of_its_machine(browser: Browser,
     with looking(browser, url) as page:
         route_events(page, instead)
         page.route("**/configuration", lambda route: route.fulfill(json={"file": file}))
+        page.route("**/readings?*", lambda route: route.fulfill(json={"buckets": read}))
+        page.add_init_script(_WRITTEN)
         page.goto(f"{url}/#/machines/demo/lab")
+        trend = page.locator("level-trend")
+        expect(trend.locator("figcaption")).to_contain_text("rigid: A to 1.4, B to 2.8, C to 4.5 m/s² rms, D beyond")
+        expect(trend.locator(".u-legend")).to_contain_text(re.compile(r"time\s*2026-01-01 00:03:25 UTC\s*mean\s*3.3"))
+        assert {"zone A", "zone B", "zone C", "zone D", "alert", "danger"} <= set(page.evaluate("window.written"))
+        fold = page.locator("level-table summary")
+        fold.press("Enter")
+        growing["kurtosis"] = 17.3
+        expect(page.locator("level-table")).to_contain_text("17.3")
+        expect(fold).to_be_focused()
+        expect(page.locator("level-table details")).to_have_attribute("open", "")
         expect(page.locator("rotor-drawing .sensor.danger")).to_contain_text("DE-H ◆ danger")
         expect(page.locator("rotor-drawing svg")).to_contain_text(re.compile(r"[\d.]+ (mm/s|m/s²) rms"))
 
@@ -276,6 +294,16 @@ def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(brows
         page.get_by_label("Search machines").fill("m70")
         expect(sites).to_have_count(1)
         assert not violations(page)
+
+
+_WRITTEN = """
+const fill = CanvasRenderingContext2D.prototype.fillText;
+window.written = [];
+CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+  window.written.push(text);
+  fill.call(this, text, ...rest);
+};
+"""  # what charts say; none of it is in the document
 
 
 def _two_operators(browser: Browser, plant: Plant, http: httpx.Client) -> None:

@@ -1,4 +1,4 @@
-import { html, lay, table } from "../elements/markup.js";
+import { html, lay, renew, table } from "../elements/markup.js";
 import { lasting } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { monitor, Refused } from "../monitor/monitor.js";
@@ -43,6 +43,7 @@ class ServiceLoad extends LiveElement {
       const number = (/** @type {string | number | undefined} */ value) => html("span", { class: "number" }, value ?? "–");
       const trouble = [!one.worker_alive && "its thread has stopped", one.trouble, one.worker_errors > 0 && `${one.worker_errors} errors inside the monitor, the latest: ${one.last_worker_error}`].filter(Boolean);
       return {
+        key: place,
         cells: [
           html("a", { href: `#/machines/${place}` }, place),
           html("state-mark", { state: one.state }),
@@ -58,7 +59,7 @@ class ServiceLoad extends LiveElement {
       };
     });
     const heads = ["machine", "state", "age of data", "blocks waiting", "at work", "dropped, too slow", "lost on the way", "steps not in history", "recording", "trouble"];
-    lay(
+    renew(
       this,
       html("h2", {}, "Service"),
       html("p", {}, found.ready ? "Ready: everything that monitoring needs works." : html("strong", {}, "Not ready.")),

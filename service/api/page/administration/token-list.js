@@ -1,4 +1,4 @@
-import { html, lay, table } from "../elements/markup.js";
+import { html, lay, renew, table } from "../elements/markup.js";
 import { clock } from "../monitor/figures.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
@@ -50,6 +50,7 @@ class TokenTable extends LiveElement {
     const rows = sorted.map((one) => {
       const own = one.state === "valid" && one.name === monitor.caller?.name;
       return {
+        key: one.token_id,
         cells: [
           html("div", {}, html("b", {}, one.name), own && " (yours)", html("small", {}, ` ${one.token_id}`)),
           html("span", {}, one.scopes.join(", ")),
@@ -61,7 +62,7 @@ class TokenTable extends LiveElement {
         ],
       };
     });
-    lay(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "Access tokens") : html("p", { class: "note" }, "There is no token."));
+    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "Access tokens") : html("p", { class: "note" }, "There is no token."));
   }
 
   /** @param {string} why */

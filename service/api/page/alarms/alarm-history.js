@@ -1,5 +1,5 @@
 import { clock } from "../monitor/figures.js";
-import { html, lay, table } from "../elements/markup.js";
+import { html, renew, table } from "../elements/markup.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { timeLine } from "./alarm-time-line.js";
@@ -45,6 +45,7 @@ class AlarmHistory extends MachineElement {
 
   #lay() {
     const rows = this.#events.map((one) => ({
+      key: one.sequence,
       cells: [
         html("time", { class: "number" }, clock(one.time_ns)),
         html("span", {}, one.kind),
@@ -53,7 +54,7 @@ class AlarmHistory extends MachineElement {
         html("span", {}, one.reason || one.note),
       ],
     }));
-    lay(
+    renew(
       this,
       html("p", { class: "message", role: "status" }, this.#message),
       timeLine(this.#events, this.health?.report?.end_ns ?? 0),

@@ -1,5 +1,5 @@
 import { clock, interval, percent } from "../monitor/figures.js";
-import { html, lay, table } from "../elements/markup.js";
+import { html, lay, renew, table } from "../elements/markup.js";
 import { monitor, Refused } from "../monitor/monitor.js";
 import { byUrgency, UNSEEN } from "../monitor/states.js";
 import { ordered } from "./alarm-order.js";
@@ -82,23 +82,21 @@ class AlarmList extends HTMLElement {
     if (said === this.#said) return;
     this.#said = said;
     this.#offer(all);
-    const focused = document.activeElement instanceof HTMLElement ? document.activeElement.dataset.order : undefined;
     const rows = all.map((one) => this.#row(one));
     const heads = ["alarm", "state", "since", "what is known", "actions"];
-    this.#rows.replaceChildren(rows.length ? table(heads, rows, this.hasAttribute("alarm") ? "Now" : "Alarms that are not normal") : html("p", { class: "note" }, this.hasAttribute("alarm") ? "The alarm is normal now." : "No alarm is raised, and none waits to be acknowledged."));
-    if (focused) /** @type {HTMLElement | null} */ (this.#rows.querySelector(`[data-order="${CSS.escape(focused)}"]`))?.focus();
+    renew(this.#rows, rows.length ? table(heads, rows, this.hasAttribute("alarm") ? "Now" : "Alarms that are not normal") : html("p", { class: "note" }, this.hasAttribute("alarm") ? "The alarm is normal now." : "No alarm is raised, and none waits to be acknowledged."));
   }
 
   /** What can be done to those that are chosen. @param {Placed[]} all */
   #offer(all) {
     const chosen = all.filter((one) => this.#chosen.has(keyOf(one)));
     const orders = new Map(chosen.flatMap(({ alarm }) => operations(alarm).map(([kind, text]) => [kind, text])));
-    lay(
+    renew(
       this.#together,
       all.length > 1 && this.#order,
       ...[...orders].map(([kind, text]) => {
         const able = chosen.filter(({ alarm }) => operations(alarm).some(([one]) => one === kind));
-        return html("button", { type: "button", "data-order": `chosen ${kind}`, click: () => this.#operate(able, kind) }, `${text} (${able.length})`);
+        return html("button", { type: "button", "data-key": `chosen ${kind}`, click: () => this.#operate(able, kind) }, `${text} (${able.length})`);
       }),
     );
   }
@@ -113,12 +111,13 @@ class AlarmList extends HTMLElement {
       this.#show();
     };
     const several = !this.hasAttribute("alarm") && operations(alarm).length > 0;
-    const box = several && html("input", { type: "checkbox", "aria-label": `choose ${place}: ${alarm.text}`, checked: this.#chosen.has(key), "data-order": `choose ${key}`, change: choose });
+    const box = several && html("input", { type: "checkbox", "aria-label": `choose ${place}: ${alarm.text}`, checked: this.#chosen.has(key), "data-key": `choose ${key}`, change: choose });
     const machine = this.hasAttribute("place") ? null : html("a", { href: `#/machines/${place}` }, place);
     const buttons = operations(alarm).map(([kind, text]) =>
-      html("button", { type: "button", "data-order": `${place} ${alarm.name} ${kind}`, click: () => this.#operate([one], kind) }, text),
+      html("button", { type: "button", "data-key": `${place} ${alarm.name} ${kind}`, click: () => this.#operate([one], kind) }, text),
     );
     return {
+      key,
       attributes: { class: [alarm.raised && alarm.severity, UNSEEN.has(alarm.state) && "unseen"].filter(Boolean).join(" ") || null },
       cells: [
         html("div", {}, box, machine, html("b", {}, alarm.text), html("small", {}, ` ${alarm.name}`), !this.hasAttribute("alarm") && why(place, alarm)),

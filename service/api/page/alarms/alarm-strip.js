@@ -1,5 +1,5 @@
 import { clock } from "../monitor/figures.js";
-import { html } from "../elements/markup.js";
+import { html, renew } from "../elements/markup.js";
 import { monitor } from "../monitor/monitor.js";
 import { byUrgency, stands, UNSEEN } from "../monitor/states.js";
 import { why } from "./why-link.js";
@@ -38,7 +38,7 @@ class AlarmStrip extends HTMLElement {
     const rows = all.slice(0, SHOWN).map(({ place, alarm }) =>
       html(
         "li",
-        { class: UNSEEN.has(alarm.state) ? "unseen" : null },
+        { class: UNSEEN.has(alarm.state) ? "unseen" : null, "data-key": `${place} ${alarm.name}` },
         html("state-mark", { state: alarm.raised ? alarm.severity : "cleared" }),
         html("a", { href: `#/machines/${place}` }, place),
         html("span", { class: "what" }, alarm.text, " ", why(place, alarm)),
@@ -47,7 +47,8 @@ class AlarmStrip extends HTMLElement {
       ),
     );
     this.hidden = !all.length;
-    this.replaceChildren(
+    renew(
+      this,
       html("ul", { "aria-label": "standing alarms" }, ...rows),
       html("a", { href: "#/alarms" }, all.length > SHOWN ? `all ${all.length} standing alarms` : "alarms"),
     );

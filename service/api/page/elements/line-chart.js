@@ -3,7 +3,11 @@ import { clock, local, shownIn, ticks } from "../monitor/figures.js";
 
 /** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number, dots?: boolean}} Line */
 /** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
-/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, cut?: [number, number, number], xUnit?: string, shaded?: {from: number, to: number, text?: string}[], height: number}} Drawing */
+/** A stretch of values, such as a zone of a standard; `edge` where it begins with a line. @typedef {{from: number, to: number, text: string, colour?: string, edge?: boolean}} Zone */
+/** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, cut?: [number, number, number], xUnit?: string, shaded?: {from: number, to: number, text?: string}[], zones?: Zone[], height: number}} Drawing */
+
+/** Pixels between ticks of time: of minutes, and of seconds, whose labels are longer. */
+const SPACE = [56, 84];
 
 /** @type {Promise<any> | undefined} */
 let library;
@@ -62,6 +66,7 @@ class LineChart extends HTMLElement {
       lines: given.lines.map((line) => ({ ...line, values: line.values.map(scaled) })),
       marks: given.marks.map((mark) => (mark.axis === "y" ? { ...mark, at: factor * mark.at } : mark)),
       include: given.include?.map((each) => factor * each),
+      zones: given.zones?.map((zone) => ({ ...zone, from: factor * zone.from, to: factor * zone.to })),
     };
     this.#drawing = drawing;
     const uPlot = await charts();
@@ -101,10 +106,10 @@ class LineChart extends HTMLElement {
       series: [{ label: drawing.time ? "time" : drawing.xUnit, value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : drawing.time ? clock(value * 1e9) : value.toFixed(1)) }, ...lines],
       bands: drawing.band ? [{ series: drawing.band.map((at) => at + 1), fill: this.#colour("band") }] : [],
       scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : drawing.cut ? { dir: -1, range: drawing.cut.slice(0, 2) } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
-      axes: [drawing.time ? { ...axis, space: 50, filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}) }],
+      axes: [drawing.time ? { ...axis, space: (/** @type {any} */ _, /** @type {number} */ __, /** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ wide) => (((to - from) * SPACE[0]) / wide < 60 ? SPACE[1] : SPACE[0]), filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}) }],
       tzDate: (/** @type {number} */ seconds) => (local() ? new Date(seconds * 1e3) : uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC")),
       cursor: { drag: { x: true, y: false } },
-      hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)] },
+      hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)], setLegend: [(/** @type {any} */ plot) => this.#rest(plot)] },
     };
   }
 
@@ -116,6 +121,13 @@ class LineChart extends HTMLElement {
     return [bottom === 0 ? 0 : bottom - rim, top + rim];
   }
 
+  /** Without a pointer the legend tells the newest of a trend, and no value of anything else. @param {any} plot */
+  #rest(plot) {
+    const away = plot.cursor.left < 0;
+    plot.root.classList.toggle("away", away && !this.#drawing?.time);
+    if (away && this.#drawing?.time) plot.setLegend({ idx: Math.max(0, this.#drawing.lines[0].values.findLastIndex((each) => each !== null)) }, false);
+  }
+
   /** @param {any} plot */
   #shade(plot) {
     const { ctx, bbox } = plot;
@@ -125,6 +137,19 @@ class LineChart extends HTMLElement {
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
+    for (const { from, to, text, colour, edge } of this.#drawing?.zones ?? []) {
+      const { min, max } = plot.scales.y;
+      const [low, high] = [Math.max(from, min), Math.min(to, max)];
+      if (low >= high) continue;
+      const [top, bottom] = [high, low].map((each) => plot.valToPos(each, "y", true));
+      ctx.fillStyle = colour ? this.#colour(colour) : "transparent";
+      ctx.fillRect(bbox.left, top, bbox.width, bottom - top);
+      ctx.fillStyle = this.#colour("ink-2");
+      if (edge && low === from) ctx.fillRect(bbox.left, bottom, bbox.width, devicePixelRatio);
+      ctx.textAlign = "right";
+      if (bottom - top > 13 * devicePixelRatio) ctx.fillText(text, bbox.left + bbox.width - 4 * devicePixelRatio, top + 12 * devicePixelRatio);
+      ctx.textAlign = "left";
+    }
     for (const { from, to, text } of this.#drawing?.shaded ?? []) {
       const [left, right] = [from, to].map((each) => plot.valToPos(each, "x", true));
       ctx.fillStyle = this.#colour("shade");
@@ -145,7 +170,17 @@ class LineChart extends HTMLElement {
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
+    /** Text that stays readable on a line. @param {string} text @param {number} x @param {number} y */
+    const write = (text, x, y) => {
+      ctx.setLineDash([]);
+      Object.assign(ctx, { strokeStyle: this.#colour("surface"), lineWidth: 3 * devicePixelRatio });
+      ctx.strokeText(text, x, y);
+      ctx.lineWidth = 1.5 * devicePixelRatio;
+      ctx.fillText(text, x, y);
+    };
     let row = 0;
+    /** @type {{to: number, at: number}[]} labels of limits, which stand beside each other where the limits are close */
+    const said = [];
     for (const mark of this.#drawing?.marks ?? []) {
       const place = plot.valToPos(mark.at, mark.axis, true);
       const upright = mark.axis === "x";
@@ -156,7 +191,17 @@ class LineChart extends HTMLElement {
       ctx.lineTo(upright ? place : bbox.left + bbox.width, upright ? bbox.top + bbox.height : place);
       ctx.stroke();
       const gap = 3 * devicePixelRatio;
-      if (mark.text) ctx.fillText(mark.text, upright ? place + gap : bbox.left + gap, upright ? bbox.top + 4 * gap * (1 + (row++ % 3)) : place - gap);
+      if (!mark.text) continue;
+      const wide = ctx.measureText(mark.text).width;
+      if (upright) {
+        const fits = place + gap + wide < bbox.left + bbox.width;
+        write(mark.text, fits ? place + gap : place - gap - wide, bbox.top + 4 * gap * (1 + (row++ % 3)));
+        continue;
+      }
+      const before = said.filter((each) => Math.abs(each.at - place) < 4 * gap);
+      const from = Math.max(bbox.left + gap, ...before.map((each) => each.to + 3 * gap));
+      said.push({ to: from + wide, at: place });
+      write(mark.text, from, place - gap);
     }
     ctx.restore();
   }

@@ -5,6 +5,16 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 
+/** What hears the events of an element, by their names. @type {WeakMap<Element, Record<string, (event: any) => void>>} */
+const heard = new WeakMap();
+
+/** @param {Element} made @param {string} name @param {(event: any) => void} hear */
+function listen(made, name, hear) {
+  const known = heard.get(made) ?? {};
+  if (!(name in known)) made.addEventListener(name, (event) => heard.get(made)?.[name](event));
+  heard.set(made, { ...known, [name]: hear });
+}
+
 /**
  * @param {Element} made
  * @param {Attributes} attributes
@@ -12,7 +22,7 @@ const SVG = "http://www.w3.org/2000/svg";
  */
 function filled(made, attributes, children) {
   for (const [name, value] of Object.entries(attributes)) {
-    if (typeof value === "function") made.addEventListener(name, value);
+    if (typeof value === "function") listen(made, name, value);
     else if (value === true) made.setAttribute(name, "");
     else if (value !== false && value !== null && value !== undefined) made.setAttribute(name, String(value));
   }
@@ -23,7 +33,7 @@ function filled(made, attributes, children) {
 /** What there is, as nodes and text. @param {Child[]} children */
 function nodes(children) {
   const there = children.filter((child) => child !== null && child !== undefined && child !== false && child !== "");
-  return there.map((child) => (child instanceof Node ? child : String(child)));
+  return there.map((child) => (child instanceof Node ? child : new Text(String(child))));
 }
 
 /**
@@ -33,6 +43,46 @@ function nodes(children) {
  */
 export function lay(parent, ...children) {
   parent.replaceChildren(...nodes(children));
+}
+
+/**
+ * Put children in the place of those that were there, but only what differs: an element that is there already keeps the focus, what is selected of its text, and stays open.
+ * For what is made anew each time; what changes places, and what must not become something else, has the attribute `data-key`.
+ * @param {Element} parent
+ * @param {...Child} children
+ */
+export function renew(parent, ...children) {
+  const focused = document.activeElement;
+  match(parent, nodes(children));
+  if (focused instanceof HTMLElement && focused !== document.activeElement && parent.contains(focused)) focused.focus({ preventScroll: true });
+}
+
+/** @param {Node} one */
+const keyOf = (one) => (one instanceof Element ? one.getAttribute("data-key") : null);
+
+/** @param {Element} parent @param {Node[]} wanted */
+function match(parent, wanted) {
+  wanted.forEach((one, at) => {
+    /** @type {Node | undefined} */
+    const there = one.parentNode === parent ? one : [...parent.childNodes].slice(at).find((old) => old.nodeName === one.nodeName && keyOf(old) === keyOf(one));
+    if (there && there !== one) liken(there, one);
+    const child = there ?? one;
+    if (parent.childNodes[at] !== child) parent.insertBefore(child, parent.childNodes[at] ?? null);
+  });
+  while (parent.childNodes.length > wanted.length) parent.lastChild?.remove();
+}
+
+/** Make a node like another one. @param {Node} old @param {Node} one */
+function liken(old, one) {
+  if (!(old instanceof Element) || !(one instanceof Element)) {
+    if (old.nodeValue !== one.nodeValue) old.nodeValue = one.nodeValue;
+    return;
+  }
+  for (const name of old.getAttributeNames()) if (!one.hasAttribute(name) && name !== "open") old.removeAttribute(name);
+  for (const { name, value } of one.attributes) if (old.getAttribute(name) !== value && name !== "open") old.setAttribute(name, value);
+  if (old instanceof HTMLInputElement && one instanceof HTMLInputElement) old.checked = one.checked;
+  for (const [name, hear] of Object.entries(heard.get(one) ?? {})) listen(old, name, hear);
+  if (!old.localName.includes("-")) match(old, [...one.childNodes]); // those fill themselves
 }
 
 /**
@@ -78,14 +128,14 @@ export function svg(tag, attributes = {}, ...children) {
 }
 
 /**
- * A table that a phone shows as cards: each cell carries the name of its column.
+ * A table that a phone shows as cards: each cell carries the name of its column. A row with a key stays the same element where the table is renewed.
  * @param {string[]} heads
- * @param {{cells: Child[], attributes?: Attributes}[]} rows
+ * @param {{cells: Child[], attributes?: Attributes, key?: string | number}[]} rows
  * @param {string} caption
  */
 export function table(heads, rows, caption) {
-  const body = rows.map(({ cells, attributes }) =>
-    html("tr", attributes, ...cells.map((cell, at) => html(at ? "td" : "th", { "data-head": heads[at], scope: at ? null : "row" }, cell))),
+  const body = rows.map(({ cells, attributes, key }) =>
+    html("tr", { ...attributes, "data-key": key }, ...cells.map((cell, at) => html(at ? "td" : "th", { "data-head": heads[at], scope: at ? null : "row" }, cell))),
   );
   return html(
     "table",

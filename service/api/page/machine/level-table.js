@@ -1,5 +1,5 @@
 import { figure, printed, shownIn } from "../monitor/figures.js";
-import { html, table } from "../elements/markup.js";
+import { html, renew, table } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { levelUnit, limitText, measureText } from "../monitor/states.js";
 import "../elements/state-mark.js";
@@ -26,6 +26,7 @@ class LevelTable extends MachineElement {
       );
       const detection = one.detection === "peak to peak" ? "pp" : "rms";
       return {
+        key: one.channel,
         attributes: { class: worst?.state },
         cells: [
           html("b", {}, one.channel),
@@ -39,7 +40,7 @@ class LevelTable extends MachineElement {
     });
     const heads = ["channel", "alarm", "unit", ...shown.map((one) => (one === "velocity" ? `velocity, ${shownIn("mm/s")[1]}` : measureText(one))), "zone", "limits"];
     const growth = report.level_growth?.text;
-    this.replaceChildren(table(heads, rows, "Vibration levels"), html("p", { class: "note" }, growth ? `${growth[0].toUpperCase()}${growth.slice(1)}.` : ""));
+    renew(this, table(heads, rows, "Vibration levels"), html("p", { class: "note" }, growth ? `${growth[0].toUpperCase()}${growth.slice(1)}.` : ""));
   }
 }
 

@@ -1,26 +1,59 @@
+import { figure, shownIn } from "../monitor/figures.js";
+import { levelUnit, limitText, measureText } from "../monitor/states.js";
 import { ReadingTrend } from "./reading-trend.js";
-import { levelUnit, measureText } from "../monitor/states.js";
 
-/** The leading level of every channel over time, with its limits. */
+/** @typedef {import("../monitor/records.js").LevelBound} LevelBound */
+/** @typedef {import("../elements/line-chart.js").Zone} Zone */
+
+/** Zones of a standard, from the bottom to the top. @param {[number, number, number]} edges @returns {Zone[]} */
+const zonesOf = ([first, second, third]) => [
+  { from: 0, to: first, text: "zone A" },
+  { from: first, to: second, text: "zone B", edge: true },
+  { from: second, to: third, text: "zone C", colour: "zone-c" },
+  { from: third, to: Infinity, text: "zone D", colour: "zone-d" },
+];
+
+/** @param {LevelBound} bound @returns {import("./reading-trend.js").Limit[]} */
+function limitsOf({ source, zones, alert, danger, fall }) {
+  const from = zones ? "" : `, ${source}`; // zones say their own names
+  return [
+    ...(alert === null ? [] : [{ at: alert, kind: /** @type {"alert"} */ ("alert"), text: `alert${from}` }]),
+    ...(danger === null ? [] : [{ at: danger, kind: /** @type {"danger"} */ ("danger"), text: `danger${from}` }]),
+    ...(fall === null ? [] : [{ at: fall, kind: /** @type {"alert"} */ ("alert"), text: `alert below${from}` }]),
+  ];
+}
+
+/** The leading level of every channel over time, with the zones and limits by which the newest is judged. */
 export class LevelTrend extends ReadingTrend {
   quantity = "level";
   title = "Levels over time";
+  note = " Zones and limits are those of the newest window.";
 
   async trended() {
     // Whatever changed, every level may show it.
     const changed = (this.health?.report?.verdict?.changed ?? []).map((one) => ({ ...one, text: `${one.name} changed` }));
     return (this.health?.report?.levels ?? []).map((one) => {
-      const measure = one.limits.find((limit) => limit.state !== "normal")?.measure ?? (one.velocity === null ? "overall" : "velocity");
-      const limit = one.limits.find((each) => each.measure === measure);
-      const there = (/** @type {number | null | undefined} */ value) => (value === null || value === undefined ? [] : [value]);
+      const usual = one.velocity === null ? "overall" : "velocity";
+      const limit = one.limits.find(({ state }) => state !== "normal") ?? one.limits.find((each) => each.measure === usual) ?? one.limits[0];
+      const measure = limit?.measure ?? usual;
+      const bounds = limit?.bounds ?? (limit ? [{ ...limit, zones: null }] : []);
+      const unit = levelUnit(one, measure);
+      const [factor, shown] = shownIn(unit);
+      const said = bounds.map((bound) => {
+        const [first, second, third] = (bound.zones ?? []).map((edge) => figure(factor * edge));
+        const limits = bound.zones ? `A to ${first}, B to ${second}, C to ${third}` : limitText({ ...bound, measure, state: "", text: "" }, one);
+        return `${bound.source}: ${`${limits} ${shown}`.trim()}${bound.zones ? ", D beyond" : ""}`;
+      });
       return {
         name: `${one.channel}:${measure}`,
         alarm: `level:${one.channel}`,
         title: `${one.channel} ${measureText(measure)}`,
-        unit: levelUnit(one, measure),
+        unit,
         scale: 1,
-        alert: [...there(limit?.alert), ...there(limit?.fall)],
-        danger: there(limit?.danger),
+        limits: bounds.flatMap(limitsOf),
+        near: 0,
+        zones: bounds.flatMap((bound) => (bound.zones ? zonesOf(bound.zones) : [])),
+        said: said.join("; ") || "no limit",
         zero: true,
         changed,
       };

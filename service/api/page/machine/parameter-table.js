@@ -1,5 +1,5 @@
 import { interval, percent, within, Z95 } from "../monitor/figures.js";
-import { html, table } from "../elements/markup.js";
+import { html, renew, table } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { parameterReadings } from "./parameter-readings.js";
 import "../elements/state-mark.js";
@@ -33,13 +33,15 @@ class ParameterTable extends MachineElement {
       const name = html("div", {}, html("b", {}, stated.text), html("small", {}, ` ${stated.name}`), parameter.vector && html("div", { class: "note" }, parameter.vector.text));
       const least = html("span", { class: "number" }, seen ? `${percent(seen.loss)} / ${percent(seen.gain)}` : "");
       return {
+        key: stated.name,
         attributes: { class: severity || null },
         cells: [name, severity ? html("state-mark", { state: severity }) : "", ...said(reading), least, ...report.opinions.map((opinion) => other(opinion, stated.name))],
       };
     });
     const heads = ["parameter", "alarm", "change", "95 % interval", "seen from", ...report.opinions.map((one) => one.by)];
     const silent = report.opinions.filter((one) => one.reason).map((one) => `${one.by}: ${one.reason}. `);
-    this.replaceChildren(
+    renew(
+      this,
       table(heads, rows, "Parameters"),
       html(
         "p",

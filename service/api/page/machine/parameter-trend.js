@@ -1,6 +1,9 @@
 import { machineFile } from "./machine-file.js";
 import { ReadingTrend } from "./reading-trend.js";
 
+/** @param {"alert" | "danger"} kind @param {number} limit @returns {import("./reading-trend.js").Limit[]} */
+const both = (kind, limit) => [-100 * limit, 100 * limit].map((at) => ({ at, kind, text: kind }));
+
 /** Changes of the parameters over time, with their 95 % intervals and the limits of the machine file. */
 export class ParameterTrend extends ReadingTrend {
   quantity = "parameter";
@@ -18,7 +21,7 @@ export class ParameterTrend extends ReadingTrend {
     const { limits, parameters } = await this.limits();
     return read.map(({ name, text }) => {
       const { raise_above: alert, danger_above: danger } = { ...limits, ...parameters[name] };
-      return { name, alarm: name, title: `${text} (${name})`, unit: "change, %", scale: 100, alert: [-100 * alert, 100 * alert], danger: [-100 * danger, 100 * danger], zero: true, changed: changed.filter((one) => one.name === name) };
+      return { name, alarm: name, title: `${text} (${name})`, unit: "change, %", scale: 100, limits: [...both("alert", alert), ...both("danger", danger)], near: 10, zero: true, changed: changed.filter((one) => one.name === name) };
     });
   }
 }

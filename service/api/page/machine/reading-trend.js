@@ -1,4 +1,4 @@
-import { html } from "../elements/markup.js";
+import { html, lay } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { stretch, Z95 } from "../monitor/figures.js";
@@ -9,12 +9,15 @@ const GAP = 2.5;
 
 /** @typedef {import("../monitor/records.js").Bucket} Bucket */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
-/** @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, alert: number[], danger: number[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
+/** @typedef {{at: number, kind: "alert" | "danger", text: string}} Limit */
+/** What is shown over time; limits within `near` are always in the picture. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string, zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
 
 /** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */
 export class ReadingTrend extends MachineElement {
   quantity = "";
   title = "";
+  /** What is to be known of the limits. */
+  note = "";
   /** @type {number | null} */
   #oldest = null;
   /** @type {Map<string, any>} */
@@ -83,7 +86,7 @@ export class ReadingTrend extends MachineElement {
     const { shown, buckets, events } = this.#read;
     for (const one of shown) this.#draw(one, buckets.filter((bucket) => bucket.name === one.name), events);
     const ends = buckets.map((bucket) => bucket.start_ns + bucket.length_ns);
-    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for several their mean; the band holds their 95 % intervals.`;
+    if (ends.length) this.#when.textContent = `${stretch(Math.min(...buckets.map((bucket) => bucket.start_ns)), Math.min(Math.max(...ends), this.health?.report?.end_ns ?? Infinity))}: a point for each window, or for several their mean; the band holds their 95 % intervals.${this.note}`;
     this.#message.textContent = buckets.length ? "" : "Nothing has been read yet.";
   }
 
@@ -98,8 +101,10 @@ export class ReadingTrend extends MachineElement {
     if (!chart) {
       chart = html("line-chart", { role: "img", "aria-label": `${one.title} over time` });
       this.#charts.set(one.name, chart);
-      this.#figures.append(html("figure", {}, html("figcaption", {}, one.title), chart));
+      this.#figures.append(html("figure", {}, html("figcaption", {}), chart));
     }
+    const caption = /** @type {HTMLElement} */ (chart.previousElementSibling);
+    lay(caption, one.title, html("small", {}, ` ${one.said ?? ""}`));
     if (!buckets.length) return;
     /** @type {number[]} */
     const x = [];
@@ -123,13 +128,13 @@ export class ReadingTrend extends MachineElement {
       high.push(one.scale * Math.max(bucket.maximum, bucket.mean + error));
     }
     const reached = Math.max(...[...low, ...high].map((each) => Math.abs(each ?? 0)));
-    const near = (/** @type {number[]} */ limits) => limits.filter((each) => Math.abs(each) < 2.5 * reached || Math.abs(each) <= 10);
+    const next = Math.min(...one.limits.map(({ at }) => Math.abs(at)).filter((at) => at > reached));
+    const near = one.limits.map(({ at }) => at).filter((at) => Math.abs(at) < 2.5 * reached || Math.abs(at) <= one.near || (Math.abs(at) === next && next < 8 * reached));
     const changes = one.changed.filter((each) => each.since_ns / 1e9 >= x[0]);
     const marks = [
       ...(this.#moment === null ? [] : [{ at: this.#moment / 1e9, axis: /** @type {"x"} */ ("x"), colour: "estimated" }]),
       ...changes.map((each) => ({ at: each.since_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: "ink", text: each.text })),
-      ...one.alert.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "alert-line", text: "alert", dash: [6, 4] })),
-      ...one.danger.map((at) => ({ at, axis: /** @type {"y"} */ ("y"), colour: "danger-line", text: "danger" })),
+      ...one.limits.map(({ at, kind, text }) => ({ at, axis: /** @type {"y"} */ ("y"), colour: `${kind}-line`, text, ...(kind === "alert" ? { dash: [6, 4] } : {}) })),
       ...events
         .filter((event) => event.name === one.alarm && ["raised", "escalated", "cleared"].includes(event.kind))
         .map((event) => ({ at: event.time_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: event.kind === "cleared" ? "ink-2" : `${event.severity}-line`, text: event.kind, dash: [2, 3] })),
@@ -141,9 +146,10 @@ export class ReadingTrend extends MachineElement {
       marks,
       time: true,
       shaded: [...gaps, ...changes.flatMap(({ between_ns: moment }) => (moment ? [{ from: moment[0] / 1e9, to: moment[1] / 1e9 }] : []))],
-      include: [...near(one.alert), ...near(one.danger), ...(one.zero ? [0] : [])],
+      include: [...near, ...(one.zero ? [0] : [])],
+      zones: one.zones,
       unit: one.unit,
-      height: 170,
+      height: one.zones?.length ? 210 : 170,
     });
   }
 }

@@ -10,7 +10,8 @@
  * @typedef {{text: string, detected: boolean, confidence: number, settled: boolean, low_confidence: boolean, outside_model: boolean, current: Parameter[], changed: Finding[], alternatives?: Alternative[]}} Verdict
  * @typedef {{name: string, text: string, since_ns: number, stretch_s: number, between_ns?: [number, number] | null}} Finding
  * @typedef {{names: string[], probability: number, explained: number}} Alternative
- * @typedef {{measure: string, alert: number | null, danger: number | null, fall: number | null, source: string, state: string, text: string}} LevelLimits
+ * @typedef {{measure: string, alert: number | null, danger: number | null, fall: number | null, source: string, state: string, text: string, bounds?: LevelBound[]}} LevelLimits
+ * @typedef {{source: string, zones: [number, number, number] | null, alert: number | null, danger: number | null, fall: number | null}} LevelBound
  * @typedef {{channel: string, unit: string, detection: string, overall: number | null, velocity: number | null, x1: number | null, x2: number | null, mean: number | null, crest: number | null, kurtosis: number | null, zone: string, limits: LevelLimits[]}} ChannelLevels
  * @typedef {{start_ns: number, end_ns: number, state: string, filled: number, speed_rad_s: number | null, misfit_z: number | null, suspect: string, verdict: Verdict | null, parameters: Parameter[], opinions: Opinion[], equations: Equation[], detectable: Detectable[], sensors: {text: string, states: string[]}[], shapes: {text: string}[], levels: ChannelLevels[], level_growth: {text: string} | null, reason: string}} Report
  * @typedef {{accepted_blocks: number, refused_blocks: Record<string, number>, gaps: number, missing_s: number, queue_dropped_blocks: number, link_missed_blocks: number, last_refusal: string, last_gap: string}} Quality

@@ -1,5 +1,5 @@
 import { clock, stretch } from "../monitor/figures.js";
-import { html, lay, svg, table } from "../elements/markup.js";
+import { html, lay, renew, svg, table } from "../elements/markup.js";
 import { within } from "./stretches.js";
 import "../elements/state-mark.js";
 
@@ -66,6 +66,7 @@ class RecordingLine extends HTMLElement {
   /** The latest alarms, each of which chooses what is around it. @param {AlarmEvent[]} seen */
   #list(seen) {
     const rows = seen.slice(0, SHOWN).map((one) => ({
+      key: one.sequence,
       cells: [
         html("time", { class: "number" }, clock(one.time_ns)),
         html("state-mark", { state: one.severity }),
@@ -73,7 +74,7 @@ class RecordingLine extends HTMLElement {
         html("div", { class: "actions" }, this.#around(one).size ? html("button", { type: "button", "aria-label": `Choose ten minutes before and after ${one.text}`, click: () => this.#choose(one) }, "Choose ± 10 min") : html("span", { class: "note" }, "not recorded")),
       ],
     }));
-    lay(this.#alarms, rows.length ? table(["raised", "severity", "alarm", "recording"], rows, seen.length > SHOWN ? `Alarms, the latest ${SHOWN} of ${seen.length}` : "Alarms") : html("p", { class: "note" }, "No alarm was raised in this time, as far as this monitor's history goes."));
+    renew(this.#alarms, rows.length ? table(["raised", "severity", "alarm", "recording"], rows, seen.length > SHOWN ? `Alarms, the latest ${SHOWN} of ${seen.length}` : "Alarms") : html("p", { class: "note" }, "No alarm was raised in this time, as far as this monitor's history goes."));
   }
 
   /** @param {AlarmEvent} one @returns {Set<string>} */

@@ -1,5 +1,5 @@
 import { clock, lasting, size } from "../monitor/figures.js";
-import { html, lay, table } from "../elements/markup.js";
+import { html, lay, renew, table } from "../elements/markup.js";
 import { API } from "../monitor/monitor.js";
 
 const PAGE = 25;
@@ -19,9 +19,7 @@ class RecordingTable extends HTMLElement {
   /** @param {string} _place @param {RecordingEntry[]} recordings @param {AlarmEvent[]} _alarms @param {Chosen} chosen */
   show(_place, recordings, _alarms, chosen) {
     [this.#recordings, this.#chosen] = [recordings, chosen];
-    const focused = document.activeElement instanceof HTMLInputElement ? document.activeElement.value : "";
     this.#lay();
-    if (focused) /** @type {HTMLElement | null} */ (this.querySelector(`input[value="${CSS.escape(focused)}"]`))?.focus();
   }
 
   #lay() {
@@ -32,6 +30,7 @@ class RecordingTable extends HTMLElement {
       const name = one.id.split("/").slice(2).join("/");
       const box = html("input", { type: "checkbox", value: one.id, checked: this.#chosen.ids.has(one.id), disabled: !able, change: (event) => this.#choose(one.id, event.target.checked) });
       return {
+        key: one.id,
         cells: [
           html("label", { class: "check" }, box, html("span", {}, name)),
           html("time", { class: "number" }, clock(from)),
@@ -45,7 +44,7 @@ class RecordingTable extends HTMLElement {
       };
     });
     const heads = ["recording", "data from", "length", "recorded from", "size", "state", "kept for", "file"];
-    lay(this, rows.length ? table(heads, rows, "Recordings, the latest first") : null, newest.length > this.#shown ? html("button", { type: "button", click: () => this.#more() }, "Older") : null);
+    renew(this, rows.length ? table(heads, rows, "Recordings, the latest first") : null, newest.length > this.#shown ? html("button", { type: "button", click: () => this.#more() }, "Older") : null);
   }
 
   #more() {

@@ -1,5 +1,5 @@
 import { clock } from "../monitor/figures.js";
-import { html, lay, table } from "../elements/markup.js";
+import { html, lay, renew, table } from "../elements/markup.js";
 import { LiveElement } from "../elements/live-element.js";
 import { API, monitor } from "../monitor/monitor.js";
 
@@ -33,9 +33,10 @@ class ReplayList extends LiveElement {
   async ask() {
     const found = /** @type {ReplayJob[]} */ ((await monitor.ask(`${API}/replays`)).replays);
     const said = JSON.stringify(found);
-    if (said === this.#said) return; // what has the focus keeps it
+    if (said === this.#said) return;
     this.#said = said;
     const rows = found.map((one) => ({
+      key: one.id,
       cells: [
         html("a", { href: `#/replays/${one.id}` }, clock(one.started_ns)),
         html("span", {}, one.state),
@@ -45,7 +46,7 @@ class ReplayList extends LiveElement {
         html("span", {}, outcome(one)),
       ],
     }));
-    lay(this, rows.length ? table(["started", "state", "how", "recordings", "with", "outcome"], rows, "Replays since the service started") : html("p", { class: "note" }, "Nothing has been replayed since the service started."));
+    renew(this, rows.length ? table(["started", "state", "how", "recordings", "with", "outcome"], rows, "Replays since the service started") : html("p", { class: "note" }, "Nothing has been replayed since the service started."));
   }
 
   /** @param {string} why */
