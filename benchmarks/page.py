@@ -8,11 +8,14 @@ is the processor time of the browser's main thread, over the number of batches: 
 painting. *Longest* is its longest task. Then the view is scrolled from top to bottom while batches come (*frames*:
 median, 95 % and longest); *questions* are those for lines, before that and while it is scrolled.
 
-Monitor: for each number of pages that show the machine, the monitor's processor time, and how much later than at the
-earliest a window's report arrives at somebody who follows the event stream (median and largest).
+Monitor: what a page that shows the machine asks for again and again is found out with the browser, which is closed
+then. For each number of browsers that ask for that and hold an event stream each, the monitor's processor time, what
+each stream brings, and how much later than at the earliest a window's report arrives at somebody who follows the event
+stream (median and largest). Nothing is drawn meanwhile, so nothing but the monitor gets slower.
 """
 
 import argparse
+import http.client
 import json
 import os
 import shutil
@@ -30,6 +33,8 @@ from playwright.sync_api import Browser, CDPSession, sync_playwright
 from running_monitor import PLACE, Monitor, monitor
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+EVERY_S = 15.0
+MANY_STREAMS = {"ROTORWATCH_ACCESS__LIMITS__STREAMS_PER_CALLER": "100"}
 TICKS = os.sysconf("SC_CLK_TCK")
 WATCH = """() => {
   window.longest = 0;
@@ -113,31 +118,65 @@ def arrivals(one: Monitor, ended: threading.Event, found: list[tuple[int, float]
                     found.append((seen, time.time()))
 
 
-def pages(browser: Browser, one: Monitor, count: int, seconds: float) -> tuple[float, float, list[float]]:
-    """Share of a core, seconds until a page shows the machine, and lateness of reports with so many pages open."""
-    heard: list[tuple[int, float]] = []
-    ended = threading.Event()
-    listener = threading.Thread(target=arrivals, args=(one, ended, heard))
-    first_s = float("nan")
+def asked_again(browser: Browser, one: Monitor) -> list[str]:
+    """What a page that shows the machine asks for every 15 s."""
+    asked: list[str] = []
     with browser.new_context() as context:
-        for _ in range(count):
-            page = context.new_page()
-            begin_s = time.monotonic()
-            page.goto(f"{one.url}/#/machines/{PLACE}")
-            page.locator("parameter-table table").wait_for(timeout=120_000)
-            first_s = time.monotonic() - begin_s
-        time.sleep(10)
-        listener.start()
-        before_s, begin_s = processor_s(one), time.monotonic()
-        while time.monotonic() - begin_s < seconds:
-            if context.pages:
-                context.pages[0].wait_for_timeout(500)
-            else:
-                time.sleep(0.5)
-        share = (processor_s(one) - before_s) / (time.monotonic() - begin_s)
-        ended.set()
-        listener.join()
-    return share, first_s, [arrived - end_ns / 1e9 for end_ns, arrived in heard[1:]]
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url.removeprefix(one.url)))
+        page.goto(f"{one.url}/#/machines/{PLACE}")
+        page.locator("parameter-table table").wait_for(timeout=120_000)
+        page.wait_for_timeout(1000)
+        asked.clear()
+        page.wait_for_timeout(1000 * EVERY_S)
+    return sorted({url.partition("?")[0]: url for url in asked if url.startswith("/api/")}.values())
+
+
+def asking(one: Monitor, paths: list[str], phase_s: float, ended: threading.Event) -> None:
+    """Ask as a page does."""
+    connection = http.client.HTTPConnection(one.url.removeprefix("http://"), timeout=60)
+    wait_s = phase_s
+    while not ended.wait(wait_s):
+        begin_s = time.monotonic()
+        for path in paths:
+            connection.request("GET", path)
+            connection.getresponse().read()
+        connection.close()  # the monitor would, before it is asked again
+        wait_s = EVERY_S - (time.monotonic() - begin_s)
+
+
+def hearing(one: Monitor, ended: threading.Event, heard: list[int]) -> None:
+    """Listen as a page does; what comes is counted."""
+    connection = http.client.HTTPConnection(one.url.removeprefix("http://"), timeout=60)
+    connection.request("GET", f"/api/v1/events?detail=overview&in_full={PLACE}")
+    answer = connection.getresponse()
+    while not ended.is_set():
+        heard.append(len(answer.readline()))
+    connection.close()
+
+
+def pages(one: Monitor, paths: list[str], count: int, seconds: float) -> tuple[float, float, list[float]]:
+    """Share of a core, bytes per second of a stream, and lateness of reports with so many pages of as many browsers."""
+    arrived: list[tuple[int, float]] = []
+    heard: list[int] = []
+    ended = threading.Event()
+    listener = threading.Thread(target=arrivals, args=(one, ended, arrived))
+    threads = [threading.Thread(target=hearing, args=(one, ended, heard)) for _ in range(count)]
+    phases = [EVERY_S * at / max(count, 1) for at in range(count)]
+    threads += [threading.Thread(target=asking, args=(one, paths, phase_s, ended)) for phase_s in phases]
+    for each in (listener, *threads):
+        each.start()
+    time.sleep(EVERY_S)  # whatever is asked first is not asked again
+    before_s, before, begin_s = processor_s(one), sum(heard), time.monotonic()
+    arrived.clear()
+    time.sleep(seconds)
+    length_s = time.monotonic() - begin_s
+    share, rate = (processor_s(one) - before_s) / length_s, (sum(heard) - before) / length_s / max(count, 1)
+    found = [at_s - end_ns / 1e9 for end_ns, at_s in arrived]
+    ended.set()
+    for each in (listener, *threads):
+        each.join()
+    return share, rate, found
 
 
 def main() -> None:
@@ -152,20 +191,27 @@ def main() -> None:
         print("|---|---|---|---|---|---|---|---|")
         for machines in (25, 50) if small else (50, 500):
             plant(browser, machines, 5.0 if small else 20.0)
-        print("\n| pages | % of a core | of which a page | first view, s | reports | later than the earliest, s |")
-        print("|---|---|---|---|---|---|")
-        with tempfile.TemporaryDirectory() as folder, monitor(Path(folder), 1024, {}) as one:
+        with tempfile.TemporaryDirectory() as folder, monitor(Path(folder), 1024, MANY_STREAMS) as one:
             time.sleep(20 if small else 70)  # the window is full
+            paths = asked_again(browser, one)
+            browser.close()
+            print(
+                "\nevery 15 s a page asks for", ", ".join(path.rpartition("/")[2].partition("?")[0] for path in paths)
+            )
+            print(
+                "\n| pages | % of a core | of which a page | kB/s of a stream | reports | later than the earliest, s |"
+            )
+            print("|---|---|---|---|---|---|")
             # Without pages before and after: what else the computer does changes.
             counts = (0, 1) if small else (0, 1, 20, 0)
-            measured = [(count, *pages(browser, one, count, 15.0 if small else 60.0)) for count in counts]
+            measured = [(count, *pages(one, paths, count, 15.0 if small else 60.0)) for count in counts]
             earliest_s = min(late for _, _, _, lates in measured for late in lates)
             base = statistics.mean(share for count, share, _, _ in measured if not count)
-            for count, share, first_s, lates in measured:
+            for count, share, rate, lates in measured:
                 each = f"{100 * (share - base) / count:.2f}" if count else ""
                 late = [one - earliest_s for one in lates]
                 latest = f"{statistics.median(late):.2f}, {max(late):.2f}"
-                print(f"| {count} | {100 * share:.1f} | {each} | {first_s:.2f} | {len(late)} | {latest} |")
+                print(f"| {count} | {100 * share:.1f} | {each} | {rate / 1e3:.1f} | {len(late)} | {latest} |")
 
 
 if __name__ == "__main__":

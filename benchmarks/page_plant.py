@@ -3,7 +3,6 @@
 import asyncio
 import copy
 import itertools
-import json
 import threading
 import time
 from collections.abc import AsyncIterator, Iterator
@@ -18,6 +17,7 @@ from fastapi.responses import StreamingResponse
 
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
+from service.analysis.overview import overview
 from service.api.routes.page import add_page_routes
 
 SITE = 25
@@ -44,7 +44,7 @@ class Plant:
             part["relative_change"] = np.random.default_rng().normal(0.0, 0.01)
         if number % 20:
             told |= {"state": "healthy", "alarms": []}
-        return f"event: health\ndata: {json.dumps(told)}\n\n"
+        return f"event: overview\ndata: {overview(Health.model_validate(told)).model_dump_json()}\n\n"
 
     async def events(self) -> AsyncIterator[str]:
         """All of them at once, and then a batch again and again."""

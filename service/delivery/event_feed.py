@@ -10,16 +10,19 @@ costs no memory. What is in the history is delivered once, in the order of each 
 """
 
 import asyncio
+import itertools
 import re
 import threading
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Container, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from starlette.concurrency import run_in_threadpool
 
 from models.errors import RotorwatchError
 from rotorwatch.records.health import Health
+from service.analysis.overview import overview
 from service.history.machine import MachineStore
 from service.history.records import StoreError
 
@@ -29,6 +32,7 @@ Cursor = dict[str, int]
 _PAGE = 100
 _KEEP_ALIVE_S = 15.0
 _AGAIN_S = 1.0
+_PAUSE_S = 0.05
 _LAST_S = 2.0
 _RETRY_MS = 2000
 _ENTRY = r"([A-Za-z0-9][A-Za-z0-9_-]{0,63}/[A-Za-z0-9][A-Za-z0-9_-]{0,63})=(-1|[0-9]{1,18})"
@@ -75,23 +79,38 @@ def parsed_cursor(text: str) -> Cursor:
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Listener:
     """How a stream is woken, from any thread."""
 
     loop: asyncio.AbstractEventLoop
     news: asyncio.Event = field(default_factory=asyncio.Event)
+    woken: bool = False
 
     def wake(self) -> None:
-        self.loop.call_soon_threadsafe(self.news.set)
+        if not self.woken:
+            self.woken = True
+            self.loop.call_soon_threadsafe(self.news.set)
+
+    def awake(self) -> None:
+        self.woken = False
+        self.news.clear()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Said:
-    """The latest health of a machine."""
+    """The latest health of a machine, made into text once for all who listen."""
 
     number: int
-    text: str
+    health: Health
+
+    @cached_property
+    def whole(self) -> str:
+        return _told(self.health, in_full=True)
+
+    @cached_property
+    def overview(self) -> str:
+        return _told(self.health, in_full=False)
 
 
 class EventFeed:
@@ -100,7 +119,8 @@ class EventFeed:
     def __init__(self) -> None:
         self._lock = threading.Condition()
         self._listeners: set[_Listener] = set()
-        self._health: dict[str, _Said] = {}
+        self._health: dict[str, _Said] = {}  # in the order in which they were said
+        self._number = 0
         self._closed = False
 
     @property
@@ -118,8 +138,9 @@ class EventFeed:
         """Say that a machine's health has changed."""
         place = f"{health.site}/{health.machine}"
         with self._lock:
-            before = self._health.get(place)
-            self._health[place] = _Said(0 if before is None else before.number + 1, health.model_dump_json())
+            self._number += 1
+            self._health.pop(place, None)
+            self._health[place] = _Said(self._number, health)
             for listener in self._listeners:
                 listener.wake()
 
@@ -135,7 +156,8 @@ class EventFeed:
         logs: Mapping[str, MachineStore],
         cursor: Cursor,
         admitted: Callable[[], Awaitable[bool]],
-        health: Callable[[str], str],
+        health: Callable[[str], Health],
+        whole: Container[str] | None = None,
     ) -> AsyncIterator[str]:
         """Server-sent events from a cursor on, until the service or the right to listen ends.
 
@@ -148,30 +170,36 @@ class EventFeed:
         admitted : callable
             Whether the listener still may; asked every now and then.
         health : callable
-            JSON of a machine's health as it is now: what was said last may be old, and with it the age of the data.
+            A machine's health as it is now: what was said last may be old, and with it the age of the data.
+        whole : container of str, optional
+            Machines whose health is told as it is, and not as an overview; by default all.
         """
         listener = _Listener(asyncio.get_running_loop())
         with self._lock:
             self._listeners.add(listener)
         try:
             yield f"retry: {_RETRY_MS}\nid: {cursor_text(cursor)}\nevent: start\ndata: {{}}\n\n"
-            told: dict[str, int] = {}
+            number, told = 0, dict[str, int]()
             asked_s = time.monotonic()
             while True:
                 closes = self._closed
-                listener.news.clear()
-                waits = False
-                for place, log in logs.items():
-                    async for event in self._committed(place, log, cursor):
+                listener.awake()
+                behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence()]
+                for place in behind:
+                    async for event in self._committed(place, logs[place], cursor):
                         yield event
-                    waits = waits or cursor[place] < log.last_sequence()
-                    said = self._health.get(place)
-                    if said is not None and told.get(place) != said.number:
-                        text = said.text if place in told else await run_in_threadpool(health, place)
-                        told[place] = said.number
-                        yield f"event: health\ndata: {text}\n\n"
+                waits = any(cursor[place] < logs[place].last_sequence() for place in behind)
+                changed = self._said_after(number)
+                for place, said in changed:
+                    number = said.number
+                    if place in logs:
+                        in_full = whole is None or place in whole
+                        async for event in self._changed(place, said, health, told, in_full=in_full):
+                            yield event
                 if closes:
                     return
+                if changed:
+                    await asyncio.sleep(_PAUSE_S)  # the machines of a plant change one after the other
                 quiet = not await _woken(listener.news, _AGAIN_S if waits else _KEEP_ALIVE_S)
                 if quiet:
                     # No empty line: some readers take that for the end of an event without data.
@@ -185,6 +213,25 @@ class EventFeed:
                 self._listeners.discard(listener)
                 self._lock.notify_all()
 
+    def _said_after(self, number: int) -> list[tuple[str, _Said]]:
+        """What was said since, in that order."""
+        with self._lock:
+            newer = itertools.takewhile(lambda one: one[1].number > number, reversed(self._health.items()))
+            return list(newer)[::-1]
+
+    async def _changed(
+        self, place: str, said: _Said, health: Callable[[str], Health], told: dict[str, int], *, in_full: bool
+    ) -> AsyncIterator[str]:
+        """Health of a machine as it was said last, unless that was told; the first time as it is now."""
+        first, latest = place not in told, self._health.get(place, said)
+        if told.get(place) == latest.number:
+            return
+        told[place] = latest.number
+        if first:
+            yield await run_in_threadpool(lambda: _told(health(place), in_full=in_full))
+        else:
+            yield latest.whole if in_full else latest.overview
+
     async def _committed(self, place: str, log: MachineStore, cursor: Cursor) -> AsyncIterator[str]:
         """What is in the log after the cursor, which moves along; nothing while the history cannot be read."""
         while cursor[place] < log.last_sequence():
@@ -197,6 +244,13 @@ class EventFeed:
                 yield f"id: {cursor_text(cursor)}\nevent: alarm\ndata: {event.text}\n\n"
             if not page:
                 return
+
+
+def _told(health: Health, *, in_full: bool) -> str:
+    """Health as an event."""
+    if in_full:
+        return f"event: health\ndata: {health.model_dump_json()}\n\n"
+    return f"event: overview\ndata: {overview(health).model_dump_json()}\n\n"
 
 
 async def _woken(news: asyncio.Event, timeout_s: float) -> bool:

@@ -122,7 +122,7 @@ def kept(page: Page, name: str) -> None:
 def route_events(page: Page, instead: Callable[[Route], None]) -> None:
     """Tell a page something else than the monitor does, and end that."""
     page.add_init_script("delete window.SharedWorker")  # what it asks for cannot be routed
-    page.route("**/api/v1/events", instead)
+    page.route("**/api/v1/events?*", instead)
 
 
 def violations(page: Page) -> list[str]:

@@ -1,5 +1,6 @@
 """The stream of events over HTTP: complete, in order, each once, however often the reader comes back."""
 
+import asyncio
 import itertools
 import json
 import threading
@@ -15,10 +16,13 @@ import numpy as np
 import pytest
 
 from rotorwatch.records.alarms import AlarmCloudEvent
+from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
+from rotorwatch.records.levels import LevelLimits
 from service.access.scopes import Scope
+from service.analysis.overview import overview
 from service.delivery import event_feed
-from service.delivery.event_feed import CursorError, cursor_text, parsed_cursor
+from service.delivery.event_feed import CursorError, EventFeed, cursor_text, parsed_cursor
 from service.history.records import StoreError
 from service.monitor.alarms.operation import OperatorAction
 from service.runtime import Runtime, running
@@ -225,9 +229,91 @@ def test_health_that_changed_and_changed_back_is_told(shared: Runtime) -> None:
                 begun = is_shelved(Health.model_validate_json(reader.next("health").data))
 
 
+def test_whole_health_of_some_machines_and_of_the_others_what_matters_most(shared: Runtime) -> None:
+    """Made into text once each, however many listen."""
+    with reading(shared, f"?detail=overview&in_full={HEAVY}") as reader:
+        told = {
+            (event.event, Health.model_validate_json(event.data).machine)
+            for event in itertools.islice(reader.events, 1, 3)
+        }
+        assert told == {("overview", "lab"), ("health", "heavy")}
+    made: list[str] = []
+
+    class Counted(Health):
+        def model_dump_json(self, **options: Any) -> str:
+            made.append(super().model_dump_json(**options))
+            return made[-1]
+
+    begun = Counted.model_validate(example(Health))
+    later = begun.model_copy(update={"sequence": 7})
+    feed = EventFeed()
+    feed.health(begun)
+
+    async def admitted() -> bool:
+        return True
+
+    async def listen() -> list[str]:
+        logs = {LAB: shared.machines()[0].history}
+        cursor = {LAB: logs[LAB].last_sequence()}
+        streams = [feed.follow(logs, cursor, admitted, lambda _: begun, whole) for whole in 5 * [None, set[str]()]]
+        for stream in streams:
+            assert [(await anext(stream))[:6] for _ in range(2)] == ["retry:", "event:"]
+        made.clear()
+        feed.health(later)
+        return [await anext(stream) for stream in streams]
+
+    heard = asyncio.run(listen())
+    assert sorted(made) == sorted(one.split("data: ")[1].strip() for one in set(heard))
+    assert heard == 5 * [f"event: health\ndata: {later.model_dump_json()}\n\n", heard[1]]
+
+
+@pytest.mark.parametrize(
+    ("alarm", "settled", "vibration", "expected"),
+    [
+        ("k_by", False, 1.0, {"k_by"}),  # what a raised alarm is about, however near others are
+        ("level:y1", False, 1.0, {"y1"}),
+        ("", False, 1.0, {"c_by"}),  # 3 % of what would be seen from 2 %, beside 25 % of 30 %, and 1.93 of 2.8
+        ("", True, 1.0, {"k_by"}),  # of c_by nothing is read
+        ("", True, 2.5, {"z1"}),
+        ("stream-lost", False, 3.0, {"z1"}),  # beyond its limit
+    ],
+)
+def test_what_matters_most_of_a_window(alarm: str, settled: bool, vibration: float, expected: set[str]) -> None:
+    health = Health.model_validate(example(Health))
+    report, raised = health.report, health.alarms[0]
+    assert report is not None
+    assert report.verdict is not None
+    one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
+    read = one.model_copy(update={"name": "c_by", "relative_change": 0.03})
+    level = level.model_copy(update={"channel": "y1", "velocity": 1.0})
+    limit = LevelLimits(measure="velocity", alert=2.8, source="", state="alert" if vibration > 2.8 else "normal")
+    report = report.model_copy(
+        update={
+            "parameters": (one, read.model_copy(update={"relative_change": None})),
+            "detectable": tuple(
+                seen.model_copy(update={"name": name, "loss": -least, "gain": least})
+                for name, least in (("k_by", 0.3), ("c_by", 0.02))
+            ),
+            "verdict": report.verdict.model_copy(update={"settled": settled, "current": (one, read)}),
+            "levels": (level, level.model_copy(update={"channel": "z1", "velocity": vibration, "limits": (limit,)})),
+        }
+    )
+    alarms = (raised.model_copy(update={"name": alarm}),) if alarm else ()
+    found = overview(health.model_copy(update={"report": report, "alarms": alarms}))
+    told = found.report
+    assert told is not None
+    assert told.verdict is not None
+    assert {part.name for part in told.parameters} | {part.channel for part in told.levels} == expected
+    assert [part.name for part in told.detectable] == [part.name for part in told.verdict.current]
+    assert {part.name for part in told.verdict.current} <= expected
+    assert (told.opinions, told.equations, told.verdict.candidates) == ((), (), ())
+    assert (found.state, found.alarms, told.end_ns) == (health.state, alarms, report.end_ns)
+
+
 @pytest.mark.parametrize(
     ("query", "header", "status", "text"),
     [
+        ("?detail=all", "", 422, "detail: Input should be 'whole' or 'overview'"),
         ("?machine=demo/pump", "", 404, "no machine demo/pump; there are: demo/lab, demo/heavy"),
         ("?last_event_id=17", "", 422, "Last-Event-ID: cursor: '17' is not site/machine=sequence"),
         ("?last_event_id=17", "demo/lab=0", 422, "Last-Event-ID: cursor: '17' is not site/machine=sequence"),

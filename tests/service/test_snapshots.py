@@ -2,11 +2,13 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from pydantic import BaseModel
 from scipy.signal import oaconvolve
+from starlette.datastructures import URL
 
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
@@ -23,6 +25,7 @@ from service.analysis.snapshots import machine as machine_module
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.heading import LatestData
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
+from service.api.answers import WindowAnswers
 from simulator.scenario import Event
 from tests.commissioning.rotor_kit import LAB, NOTHING, stream
 from tests.service.snapshotting import (
@@ -371,6 +374,39 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
     assert len(asked) == 1
     made.correlations(latest(K_BY))
     assert len(asked) == 2
+
+
+def test_an_answer_is_made_once_for_all_who_ask_the_same_of_a_window() -> None:
+    now_s, made = 0.0, 0
+    answers, subject = WindowAnswers(lambda: now_s), snapshots_of(LAB)
+
+    def asked(data: LatestData, query: str = "", **of: bool) -> tuple[int, bytes]:
+        def make() -> OrbitSnapshot:
+            nonlocal made
+            made += 1
+            return subject.orbits(data)
+
+        before = made
+        body = answers.of(URL(f"http://here/orbits{query}"), data, make, **of).body
+        return made - before, bytes(body)
+
+    data = latest()
+    later = replace(data, blocks=data.blocks[1:])
+    count, body = asked(data)
+    assert count == 1
+    assert OrbitSnapshot.model_validate_json(body) == subject.orbits(data)
+    assert asked(later) == (0, body)
+    assert asked(replace(data, filled=0.9))[0] == 1
+    assert asked(latest(K_BY))[0] == 1
+    # Samples come all the time, and what holds them is made once a second.
+    assert [asked(one, "?revolutions=8", of_samples=True)[0] for one in (data, later, data)] == [1, 0, 0]
+    now_s = 1.1
+    assert asked(later, "?revolutions=8", of_samples=True)[0] == 1
+    assert asked(latest(K_BY), "?revolutions=8", of_samples=True)[0] == 1
+    assert asked(latest(K_BY))[0] == 0
+    for number in range(64):
+        asked(data, f"?revolutions={number}")
+    assert asked(latest(K_BY))[0] == 1  # not kept for ever
 
 
 @pytest.mark.parametrize("model", [CorrelationSnapshot, SpectrumSnapshot, OrbitSnapshot])

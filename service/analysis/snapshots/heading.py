@@ -33,6 +33,11 @@ class LatestData:
     why_not: str = ""  # why it was not evaluated
     blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
 
+    def is_of_same_window(self, other: "LatestData") -> bool:
+        """Whether nothing but blocks came in between."""
+        same = self.window is other.window and self.parameters is other.parameters
+        return same and (self.filled, self.why_not) == (other.filled, other.why_not)
+
 
 class Heading(Identity):
     """First fields of every snapshot."""

@@ -46,6 +46,7 @@ class RotorwatchPage extends HTMLElement {
   /** @param {boolean} moved */
   async #go(moved) {
     const [name, ...rest] = location.hash.replace(/^#\/?/, "").split("/").map(decodeURIComponent);
+    monitor.look(name === "machines" ? rest.join("/") : "");
     const [tag, load] = VIEWS[name] ?? ["plant-view", async () => {}];
     try {
       await load();

@@ -10,6 +10,7 @@ from starlette.concurrency import run_in_threadpool
 from models.errors import RotorwatchError
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
+from rotorwatch.records.health import Health
 from service.access.guard import Guard
 from service.access.problems import problem_responses
 from service.access.scopes import Caller
@@ -44,6 +45,14 @@ _LastEventIdArgument = Annotated[
 _From = Annotated[
     Literal["now", "beginning"], Query(alias="from", description="where to begin without the id of a last event")
 ]
+_Detail = Annotated[
+    Literal["whole", "overview"],
+    Query(description="of health: all of it, or as event `overview` what an overview of many machines needs"),
+]
+_InFull = Annotated[
+    list[str],
+    Query(max_length=64, description="of this machine whole health all the same, as site/machine; may be repeated"),
+]
 
 
 def stream_example() -> str:
@@ -73,6 +82,8 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
         last_event_id: _LastEventIdArgument = None,
         header: _LastEventId = None,
         from_: _From = "now",
+        detail: _Detail = "whole",
+        in_full: _InFull = [],  # noqa: B006
     ) -> StreamingResponse:
         """Alarm events out of the history, each once and in the order of its machine's log, and changes of health."""
         if service.feed.closed:
@@ -86,11 +97,11 @@ def add_event_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
             except RotorwatchError:  # the database: nothing but health can be told meanwhile
                 return True
 
-        def health(place: str) -> str:
-            return found_machine(service, *place.split("/")).health().model_dump_json()
+        def health(place: str) -> Health:
+            return found_machine(service, *place.split("/")).health()
 
         return StreamingResponse(
-            service.feed.follow(logs, cursor, admitted, health),
+            service.feed.follow(logs, cursor, admitted, health, None if detail == "whole" else frozenset(in_full)),
             media_type="text/event-stream",
             headers={"X-Accel-Buffering": "no"},
         )

@@ -3,13 +3,14 @@
 from typing import Annotated, Any
 
 from fastapi import FastAPI, HTTPException, Query, Request
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, Response
 
 from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot, Units
 from service.access.guard import Guard
 from service.access.problems import problem_answer, responses
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
+from service.api.answers import WindowAnswers
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
 _NONE: list[str] = []
@@ -34,17 +35,32 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         return problem_answer(request, 422, str(error))
 
     common: dict[str, Any] = {"tags": ["snapshots"], "dependencies": [guard.read]}
+    answers = WindowAnswers()
 
-    @app.get(f"{PLACE}/correlations", responses=responses(CorrelationSnapshot, 404, 422), **common)
+    @app.get(
+        f"{PLACE}/correlations",
+        responses=responses(CorrelationSnapshot, 404, 422),
+        response_model=CorrelationSnapshot,
+        **common,
+    )
     def correlations(
-        site: SiteName, machine: MachineName, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
-    ) -> CorrelationSnapshot:
+        request: Request,
+        site: SiteName,
+        machine: MachineName,
+        first: _First = _NONE,
+        second: _Second = _NONE,
+        units: _Units = "channel",
+    ) -> Response:
         """Correlation functions of the latest window, measured and as theory predicts them; a few pairs by default."""
         view = found_machine(service, site, machine)
-        return view.snapshots.correlations(view.latest, first, second, units)
+        data = view.latest
+        return answers.of(request.url, data, lambda: view.snapshots.correlations(data, first, second, units))
 
-    @app.get(f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), **common)
+    @app.get(
+        f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), response_model=SpectrumSnapshot, **common
+    )
     def spectra(
+        request: Request,
         site: SiteName,
         machine: MachineName,
         channel: _Channels = _NONE,
@@ -53,18 +69,22 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         from_hz: Annotated[float | None, Query(ge=0, le=1e6, description="only frequencies from here on")] = None,
         to_hz: Annotated[float | None, Query(ge=0, le=1e6, description="only frequencies up to here")] = None,
         units: _Units = "channel",
-    ) -> SpectrumSnapshot:
+    ) -> Response:
         """Power spectral densities of the latest window, cross-spectra of the pairs asked for, and their theory."""
         view = found_machine(service, site, machine)
         band = None if from_hz is None and to_hz is None else (from_hz or 0.0, 1e6 if to_hz is None else to_hz)
         if band is not None and not band[0] < band[1]:
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
-        return view.snapshots.spectra(view.latest, channel, first, second, band, units)
+        data = view.latest
+        return answers.of(request.url, data, lambda: view.snapshots.spectra(data, channel, first, second, band, units))
 
-    @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), **common)
+    @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), response_model=OrbitSnapshot, **common)
     def orbits(
-        site: SiteName, machine: MachineName, revolutions: _Revolutions = 0, units: _Units = "channel"
-    ) -> OrbitSnapshot:
+        request: Request, site: SiteName, machine: MachineName, revolutions: _Revolutions = 0, units: _Units = "channel"
+    ) -> Response:
         """Orbits of the latest window at running speed, and the newest revolutions as measured."""
         view = found_machine(service, site, machine)
-        return view.snapshots.orbits(view.latest, revolutions, units)
+        data = view.latest
+        return answers.of(
+            request.url, data, lambda: view.snapshots.orbits(data, revolutions, units), of_samples=revolutions > 0
+        )

@@ -16,6 +16,7 @@ class AlarmHistory extends MachineElement {
   #events = [];
   /** @type {number | null} */
   #before = null;
+  needsWhole = false;
   #message = "";
 
   connectedCallback() {

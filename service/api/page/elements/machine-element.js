@@ -5,6 +5,8 @@ import { LiveElement } from "./live-element.js";
 export class MachineElement extends LiveElement {
   /** @type {import("../monitor/records.js").Health | undefined} */
   #instead;
+  /** Whether `show` needs all that is known of the latest window. */
+  needsWhole = true;
 
   connectedCallback() {
     super.connectedCallback();
@@ -25,7 +27,8 @@ export class MachineElement extends LiveElement {
 
   /** What was heard last; undefined before the first. */
   get health() {
-    return this.#instead ?? monitor.machines.get(this.place)?.health;
+    const heard = monitor.machines.get(this.place);
+    return this.#instead ?? (heard && (heard.whole || !this.needsWhole) ? heard.health : undefined);
   }
 
   /** Lay out what is known. */

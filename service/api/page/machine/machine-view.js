@@ -1,7 +1,7 @@
 import { clock } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { pathOf } from "../monitor/monitor.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
 import "../alarms/alarm-history.js";
 import "../alarms/alarm-list.js";
 import "./data-quality.js";
@@ -40,7 +40,7 @@ class MachineView extends MachineElement {
 
   show() {
     const health = this.health;
-    if (!health) return lay(this, html("h1", {}, this.place), html("p", { class: "note" }, "Nothing has been heard of this machine yet."));
+    if (!health) return lay(this, html("h1", {}, this.place), html("p", { class: "note" }, monitor.machines.has(this.place) ? "Loading …" : "Nothing has been heard of this machine yet."));
     if (!this.#built) this.#build();
     const { report, stream } = health;
     const said = report?.verdict && `${report.verdict.text}.${report.suspect ? ` Best explained by: ${report.suspect}.` : ""}`;

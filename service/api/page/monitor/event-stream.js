@@ -1,10 +1,18 @@
-/** @typedef {{kind: "start" | "health" | "alarm" | "lost" | "ended" | "renewed", text: string, at: number}} Told what is told: `at` is when it came, ms since 1970; lost is tried again by the browser, ended is not */
+/** @typedef {{kind: "start" | "overview" | "health" | "alarm" | "lost" | "ended" | "renewed", text: string, at: number}} Told what is told: `at` is when it came, ms since 1970; lost is tried again by the browser, ended is not */
 /** @typedef {(told: Told) => void} Listener */
+/** @typedef {"listen" | "look" | "leave" | "renew"} Order */
 
-/** The monitor's stream of events for several listeners: who comes later is told first what was told last of each machine. */
+/** Machines that everything may be asked of at once. */
+const MOST = 64;
+
+/** The monitor's stream of events for several listeners: who comes later is told first what was told last of each machine, and of the machine that a listener looks at everything. */
 export class EventStream {
-  /** @type {Set<Listener>} */
-  #listeners = new Set();
+  /** @type {Map<Listener, string>} with the machine that each looks at */
+  #listeners = new Map();
+  /** @type {Set<string>} machines that everything is told of */
+  #inFull = new Set();
+  /** How far the stream has been heard. */
+  #heard = "";
   /** @type {EventSource | null} */
   #source = null;
   /** @type {Told | null} whether it is there */
@@ -14,14 +22,23 @@ export class EventStream {
 
   /** Be told of another sign-in. @param {Listener} listener */
   join(listener) {
-    this.#listeners.add(listener);
+    this.#listeners.set(listener, "");
   }
 
-  /** Be told everything, from the beginning. @param {Listener} listener */
-  listen(listener) {
-    this.#listeners.add(listener);
+  /** Be told what happens, from the beginning. @param {Listener} listener @param {string} place */
+  listen(listener, place) {
+    this.#listeners.set(listener, place);
+    if (this.#source && this.#state) for (const told of [this.#state, ...this.#latest.values()]) listener(told);
+    this.look(listener, place);
     if (!this.#source) this.#begin();
-    else if (this.#state) for (const told of [this.#state, ...this.#latest.values()]) listener(told);
+  }
+
+  /** Be told everything of this machine. @param {Listener} listener @param {string} place */
+  look(listener, place) {
+    this.#listeners.set(listener, place);
+    if (!this.#source || !place || this.#inFull.has(place)) return;
+    this.#source.close();
+    this.#begin();
   }
 
   /** @param {Listener} listener */
@@ -34,13 +51,20 @@ export class EventStream {
   renew(listener) {
     this.#end();
     const told = /** @type {Told} */ ({ kind: "renewed", text: "", at: Date.now() });
-    for (const each of this.#listeners) if (each !== listener) each(told);
+    for (const each of this.#listeners.keys()) if (each !== listener) each(told);
   }
 
   #begin() {
-    const source = new EventSource("/api/v1/events");
+    this.#inFull = new Set([...this.#listeners.values()].filter(Boolean).slice(-MOST));
+    const asked = new URLSearchParams([["detail", "overview"], ...[...this.#inFull].map((place) => ["in_full", place])]);
+    if (this.#heard) asked.set("last_event_id", this.#heard);
+    const source = new EventSource(`/api/v1/events?${asked}`);
     this.#source = source;
-    for (const kind of /** @type {const} */ (["start", "health", "alarm"])) source.addEventListener(kind, (event) => this.#tell(kind, event.data));
+    for (const kind of /** @type {const} */ (["start", "overview", "health", "alarm"]))
+      source.addEventListener(kind, (event) => {
+        this.#heard = event.lastEventId;
+        this.#tell(kind, event.data);
+      });
     source.addEventListener("error", () => {
       const ended = source.readyState === EventSource.CLOSED;
       if (ended) this.#end();
@@ -50,7 +74,7 @@ export class EventStream {
 
   #end() {
     this.#source?.close();
-    [this.#source, this.#state] = [null, null];
+    [this.#source, this.#state, this.#heard] = [null, null, ""];
     this.#latest.clear();
   }
 
@@ -58,10 +82,10 @@ export class EventStream {
   #tell(kind, text) {
     const told = { kind, text, at: Date.now() };
     if (kind === "start" || kind === "lost") this.#state = told;
-    if (kind === "health") {
+    if (kind === "overview" || kind === "health") {
       const { site, machine } = JSON.parse(text);
       this.#latest.set(`${site}/${machine}`, told);
     }
-    for (const each of this.#listeners) each(told);
+    for (const each of this.#listeners.keys()) each(told);
   }
 }

@@ -22,16 +22,16 @@ export class Refused extends Error {
 /**
  * The stream of events that all pages of a browser share; of one's own where a browser knows nothing to share it with.
  * @param {import("./event-stream.js").Listener} hear
- * @returns {(order: "listen" | "leave" | "renew") => void}
+ * @returns {(order: import("./event-stream.js").Order, place: string) => void}
  */
 function sharedStream(hear) {
   if (!("SharedWorker" in window)) {
     const own = new EventStream();
-    return (order) => own[order](hear);
+    return (order, place) => own[order](hear, place);
   }
   const { port } = new SharedWorker(new URL("./shared-stream.js", import.meta.url), { type: "module" });
   port.onmessage = ({ data }) => hear(data);
-  return (order) => port.postMessage(order);
+  return (order, place) => port.postMessage({ order, place });
 }
 
 /** @param {string} place */
@@ -41,7 +41,7 @@ export const pathOf = (place) => `${API}/machines/${place}`;
  * Tells `health:SITE/MACHINE`, `health` of any machine but at most ten times a second, `alarm`, `connection`, and `caller` where another one, or nobody, is signed in.
  */
 export class Monitor extends EventTarget {
-  /** @type {Map<string, {health: Health, heard: number}>} */
+  /** What was heard last of each machine: of its latest window everything, or only the reading that matters most. @type {Map<string, {health: Health, heard: number, whole: boolean}>} */
   machines = new Map();
   /** @type {{name: string, scopes: string[]} | null} who is signed in */
   caller = null;
@@ -50,7 +50,8 @@ export class Monitor extends EventTarget {
   connected = false;
   /** @type {number | null} since when nothing is heard */
   lostAt = null;
-  #order = sharedStream((told) => this.#hear(told));
+  #tellStream = sharedStream((told) => this.#hear(told));
+  #looked = "";
   #due = 0;
 
   constructor() {
@@ -72,10 +73,21 @@ export class Monitor extends EventTarget {
     this.#order("listen");
   }
 
+  /** Hear everything of one machine, or with an empty place of none. @param {string} place */
+  look(place) {
+    this.#looked = place;
+    this.#order("look");
+  }
+
+  /** @param {import("./event-stream.js").Order} order */
+  #order(order) {
+    this.#tellStream(order, this.#looked);
+  }
+
   /** @param {import("./event-stream.js").Told} told */
   #hear({ kind, text, at }) {
     if (kind === "start") this.#found();
-    else if (kind === "health") this.#health(JSON.parse(text), at - performance.timeOrigin);
+    else if (kind === "health" || kind === "overview") this.#health(JSON.parse(text), at - performance.timeOrigin, kind === "health");
     else if (kind === "alarm") this.#tell("alarm", JSON.parse(text).data);
     else if (kind === "renewed") {
       this.machines.clear();
@@ -164,10 +176,10 @@ export class Monitor extends EventTarget {
     return known && age !== null && age !== undefined ? age + (performance.now() - known.heard) / 1000 : null;
   }
 
-  /** @param {Health} health @param {number} heard */
-  #health(health, heard) {
+  /** @param {Health} health @param {number} heard @param {boolean} whole */
+  #health(health, heard, whole) {
     const place = `${health.site}/${health.machine}`;
-    this.machines.set(place, { health, heard });
+    this.machines.set(place, { health, heard, whole });
     this.#tell(`health:${place}`, place);
     this.#due ||= setTimeout(() => {
       this.#due = 0;

@@ -7,5 +7,5 @@ addEventListener("connect", (event) => {
   const [port] = /** @type {MessageEvent} */ (event).ports;
   const listener = (/** @type {import("./event-stream.js").Told} */ told) => port.postMessage(told);
   stream.join(listener);
-  port.onmessage = ({ data }) => stream[/** @type {"listen" | "leave" | "renew"} */ (data)](listener);
+  port.onmessage = ({ data }) => stream[/** @type {import("./event-stream.js").Order} */ (data.order)](listener, data.place);
 });

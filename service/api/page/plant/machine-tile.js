@@ -20,6 +20,7 @@ class MachineTile extends MachineElement {
   #line = html("div", { class: "line" });
   #count = html("span");
   #age = html("span", { class: "number" });
+  needsWhole = false;
   #near = false;
   #late = false;
 
