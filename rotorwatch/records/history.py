@@ -5,7 +5,7 @@ from pydantic import Field
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.fields import EXAMPLE_NS, Name, Record, Site
 from rotorwatch.records.health import MEASURES, Report
-from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
+from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, SpectrumSnapshot
 
 
 class ReportList(Record):
@@ -31,11 +31,17 @@ class AlarmEventList(Record):
 
 
 class Picture(Record):
-    """A machine at one window: what was said of it, its spectra and its orbits."""
+    """A machine at one window: what was said of it, its spectra, orbits and correlation functions."""
 
     report: Report
     spectra: SpectrumSnapshot
     orbits: OrbitSnapshot
+    correlations: CorrelationSnapshot | None = Field(
+        default=None,
+        exclude_if=lambda value: value is None,
+        description="of the pairs that are answered with where none is asked for, without predictions; left out of "
+        "what an earlier version kept",
+    )
 
 
 class AlarmEvidence(Record):

@@ -8,11 +8,13 @@ from models.errors import RotorwatchError
 from rotorwatch.records.alarms import Alarm
 from rotorwatch.records.health import Health, HealthState, Report
 from rotorwatch.records.history import AlarmEvidence, Picture
+from rotorwatch.records.snapshots import CorrelationSnapshot
 from service.stream.worker import MachineWorker
 from service.terminal.logs import logger
 
 _CALM = {HealthState.HEALTHY, HealthState.UNCHANGED, HealthState.WATCHING}
 _CALM_NS = 3_600 * 10**9  # between pictures of a machine that nothing is wrong with
+_NOT_KEPT = "predictions are not kept with an alarm"
 _BEFORE = ""  # stands for the alarm where none is meant
 _log = logger(part="evidence")
 
@@ -72,7 +74,23 @@ class EvidenceCollector:
 
     def _picture(self, report: Report) -> Picture:
         latest, snapshots = self._worker.latest, self._worker.snapshots
-        return Picture(report=report, spectra=snapshots.spectra(latest), orbits=snapshots.orbits(latest))
+        return Picture(
+            report=report,
+            spectra=snapshots.spectra(latest),
+            orbits=snapshots.orbits(latest),
+            correlations=_measured(snapshots.correlations(latest)),
+        )
+
+
+def _measured(found: CorrelationSnapshot) -> CorrelationSnapshot:
+    """What was measured, in half the space: how far theory was from it is still told."""
+    theory = found.theory
+    reasons = {
+        "nominal_reason": theory.nominal_reason or _NOT_KEPT,
+        "estimated_reason": theory.estimated_reason or _NOT_KEPT,
+    }
+    pairs = tuple(pair.model_copy(update={"nominal": None, "estimated": None}) for pair in found.pairs)
+    return found.model_copy(update={"pairs": pairs, "theory": theory.model_copy(update=reasons)})
 
 
 def _rests_on_a_window(alarm: Alarm) -> bool:

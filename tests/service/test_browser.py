@@ -158,12 +158,18 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         expect(weighed.first).to_contain_text(re.compile("^bearing stiffness, horizontal.*%"))
         expect(weighed.filter(has_text="nothing changed")).to_contain_text("< 0.1 %")
         expect(why.locator("before-after svg.orbit")).to_have_count(2)
-        expect(why.locator("canvas")).to_have_count(2)
+        expect(why.locator("canvas")).to_have_count(3)
+        expect(why.locator("figcaption", has_text="Correlation of")).to_contain_text("standard errors apart")
+        assert [len(re.findall(rb"/Type\s*/Page[^s]", page.pdf(format=one))) for one in ("A4", "Letter")] == [1, 1]
         why.get_by_role("button", name="Acknowledge").click()
         expect(seen.get_by_role("button", name="Acknowledge")).to_have_count(0)
         assert http.get(f"{PLACE}/alarms/k_by").json()["state"] == "acknowledged"
         until(lambda: "acknowledged by anonymous" in " ".join(plant.heard), "acknowledgement on the topic")
         expect(why.locator("alarm-list")).to_contain_text("acknowledged")
+
+        second.route("**/evidence*", _as_an_earlier_version_kept_it)
+        second.goto(f"{url}/#/why/demo/lab/k_by")
+        expect(second.locator("before-after .note")).to_have_text(re.compile("^Correlation functions were not kept"))
 
         plant.cut.set()
         page.goto(f"{url}/#/")
@@ -294,6 +300,13 @@ def test_machines_stand_by_site_and_only_lines_that_are_seen_are_asked_for(brows
         page.get_by_label("Search machines").fill("m70")
         expect(sites).to_have_count(1)
         assert not violations(page)
+
+
+def _as_an_earlier_version_kept_it(route: Route) -> None:
+    told = route.fetch().json()
+    for picture in filter(None, (told["before"], told["raised"], told["settled"])):
+        del picture["correlations"]
+    route.fulfill(json=told)
 
 
 _WRITTEN = """

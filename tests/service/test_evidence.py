@@ -62,6 +62,9 @@ def test_an_alarm_can_be_understood_long_after_its_window_is_gone(tmp_path: Path
     assert settled.report.start_ns >= begin_ns + (FAULT_S - 5.0) * 1e9
     for picture in (before, settled):
         assert {one.location for one in picture.orbits.orbits} == {"bearing", "disc"}
+        assert picture.correlations is not None
+        assert {len(one.measured) for one in picture.correlations.pairs} == {len(picture.correlations.lags_s)}
+        assert picture.correlations.pairs[0].nominal is None
         assert len(picture.spectra.frequencies_hz) == len(picture.spectra.densities[0].measured) > 10
     read = {one.name: one.relative_change for one in settled.report.parameters}["k_by"]
     assert read is not None

@@ -131,7 +131,7 @@ def add_history_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None
             int | None, Query(ge=1, le=_LARGEST, description="which time its condition began; left out, the latest")
         ] = None,
     ) -> Response:
-        """What an alarm rests on: report, spectra and orbits before it, when it was raised, and after the change."""
+        """What an alarm rests on: report and pictures of before it, when it was raised, and after the change."""
         text = found_machine(service, site, machine).history.evidence(name, occurrence)
         if text is None:
             which = "" if occurrence is None else f"occurrence {occurrence} of "

@@ -1,15 +1,39 @@
-import { printed } from "../monitor/figures.js";
+import { figure, printed } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
+import { measuredLines, pairName } from "../plots/correlation-plot.js";
 import { orbitFigure } from "../plots/orbit-plot.js";
+import { choiceOf, offered } from "../plots/sample-plot.js";
 import { spectrumDrawing } from "../plots/spectrum-plot.js";
 import "../elements/line-chart.js";
 
 /** @typedef {import("../monitor/records.js").Picture} Picture */
+/** @typedef {import("../monitor/records.js").CorrelationPair} Pair */
+/** @typedef {import("../elements/line-chart.js").Line} Line */
 
-/** Orbits and spectra of two windows, one over the other. */
+const HEIGHT = 270;
+const AFTER = { label: "after", colour: "estimated", width: 2 };
+const BEFORE = { label: "before", colour: "nominal", dash: [6, 4], width: 1.5 };
+
+/** How far two correlation functions are apart, in standard errors (rms over the lags); null where that cannot be said. @param {Pair | undefined} was @param {Pair} now */
+function apart(was, now) {
+  if (!was || was.measured.length !== now.measured.length) return null;
+  const squares = now.measured.flatMap((value, at) => {
+    const error = Math.hypot(now.standard_error[at] ?? NaN, was.standard_error[at] ?? NaN);
+    const z = (Number(value) - Number(was.measured[at])) / error;
+    return Number.isFinite(z) ? [z * z] : [];
+  });
+  return squares.length ? Math.sqrt(squares.reduce((sum, one) => sum + one, 0) / squares.length) : null;
+}
+
+/** Orbits, spectra and correlation functions of two windows, one over the other. */
 class BeforeAfter extends HTMLElement {
-  #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Channel of the spectrum", change: () => this.#spectrum() }));
-  #chart = /** @type {any} */ (html("line-chart", { role: "img" }));
+  #channel = choiceOf("Channel of the spectrum", () => this.#spectrum());
+  #spectra = /** @type {any} */ (html("line-chart", { role: "img" }));
+  #pair = choiceOf("Pair of the correlation function", () => this.#correlation());
+  #said = html("small", { class: "number" });
+  #correlations = /** @type {any} */ (html("line-chart", { role: "img" }));
+  /** What is chosen, on paper. */
+  #printed = [html("span", { class: "printed" }), html("span", { class: "printed" })];
   /** @type {Picture | null} */
   #before = null;
   /** @type {Picture | null} */
@@ -20,7 +44,12 @@ class BeforeAfter extends HTMLElement {
     [this.#before, this.#after] = [before, after];
     const orbits = after.orbits.orbits.filter((one) => one.ellipse);
     const channels = after.spectra.densities.map((one) => one.channel);
-    this.#choice.replaceChildren(...channels.map((name) => html("option", { value: name }, name)));
+    const pairs = after.correlations?.pairs ?? [];
+    offered(this.#channel, channels);
+    offered(this.#pair, pairs.map((one, at) => [String(at), pairName(one)]));
+    const distances = pairs.map((one) => apart(this.#was(one), one) ?? -1);
+    this.#pair.value = String(Math.max(0, distances.indexOf(Math.max(...distances)))); // the one that has changed most
+    const missing = [!orbits.length && after.orbits.reason, !channels.length && after.spectra.reason, after.correlations ? after.correlations.reason : "Correlation functions were not kept with this alarm: it is from an earlier version."];
     lay(
       this,
       html(
@@ -30,28 +59,51 @@ class BeforeAfter extends HTMLElement {
           const was = before?.orbits.orbits.find((other) => other.location === one.location)?.ellipse ?? null;
           return orbitFigure({ ...one, nominal: was, estimated: null, path: null }, [], { measured: "after", nominal: "before" });
         }),
-        channels.length > 0 && html("figure", {}, html("figcaption", {}, "Spectrum of ", this.#choice), this.#chart),
+        channels.length > 0 && html("figure", {}, html("figcaption", {}, "Spectrum of ", this.#channel, this.#printed[0]), this.#spectra),
+        pairs.length > 0 && html("figure", {}, html("figcaption", {}, "Correlation of ", this.#pair, this.#printed[1], " ", this.#said), this.#correlations),
       ),
+      html("p", { class: "note" }, [...new Set(missing.filter(Boolean))].join("; ")),
     );
-    if (!orbits.length && !channels.length) lay(this, html("p", { class: "note" }, [after.orbits.reason, after.spectra.reason].filter(Boolean).join("; ")));
   }
 
   connectedCallback() {
     this.#spectrum();
+    this.#correlation();
+  }
+
+  /** The same pair of before. @param {Pair} pair */
+  #was(pair) {
+    return this.#before?.correlations?.pairs.find((one) => one.first === pair.first && one.second === pair.second);
   }
 
   #spectrum() {
-    const name = this.#choice.value;
+    const name = this.#channel.value;
     const now = this.#after?.spectra.densities.find((one) => one.channel === name);
     if (!this.#after || !now) return;
     const was = this.#before?.spectra.densities.find((one) => one.channel === name);
     const drawing = spectrumDrawing(this.#after.spectra, now);
     const same = was && this.#before?.spectra.frequencies_hz.length === drawing.x.length;
-    /** @type {import("../elements/line-chart.js").Line[]} */
-    const lines = [{ label: "after", values: now.measured, colour: "estimated", width: 2 }];
-    if (same) lines.unshift({ label: "before", values: was.measured, colour: "nominal", dash: [6, 4], width: 1.5 });
-    this.#chart.setAttribute("aria-label", `spectrum of ${name} before and after, ${printed(now.unit)}`);
-    this.#chart.draw({ ...drawing, lines, height: 240 });
+    /** @type {Line[]} */
+    const lines = [{ ...AFTER, values: now.measured }];
+    if (same) lines.unshift({ ...BEFORE, values: was.measured });
+    this.#printed[0].textContent = name;
+    this.#spectra.setAttribute("aria-label", `spectrum of ${name} before and after, ${printed(now.unit)}`);
+    this.#spectra.draw({ ...drawing, lines, height: HEIGHT });
+  }
+
+  #correlation() {
+    const found = this.#after?.correlations;
+    const now = found?.pairs[Number(this.#pair.value)];
+    if (!found || !now) return;
+    const was = this.#was(now);
+    const distance = apart(was, now);
+    const lines = measuredLines(now, { ...AFTER, values: now.measured });
+    if (was && distance !== null) lines.push({ ...BEFORE, values: was.measured });
+    const said = distance === null ? "nothing of before to compare with" : `${figure(distance)} standard errors apart (rms)`;
+    this.#said.textContent = said;
+    this.#printed[1].textContent = pairName(now);
+    this.#correlations.setAttribute("aria-label", `correlation function of ${pairName(now)} before and after, ${printed(now.unit)}: ${said}`);
+    this.#correlations.draw({ x: found.lags_s.map((lag) => 1000 * lag), lines, band: [2, 1], marks: [], time: false, include: [0], unit: printed(now.unit), xUnit: "lag, ms", height: HEIGHT });
   }
 }
 

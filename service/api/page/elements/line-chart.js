@@ -42,13 +42,20 @@ class LineChart extends HTMLElement {
     if (this.#given) this.draw(this.#given);
   };
 
+  #print = () => this.#plot?.setSize(this.#size(true)); // what is laid out for paper comes too late to draw
+  #printed = () => this.#plot?.setSize(this.#size(false));
+
   connectedCallback() {
     this.#sized.observe(this);
+    addEventListener("beforeprint", this.#print);
+    addEventListener("afterprint", this.#printed);
     this.#dark.addEventListener("change", this.#again);
   }
 
   disconnectedCallback() {
     this.#sized.disconnect();
+    removeEventListener("beforeprint", this.#print);
+    removeEventListener("afterprint", this.#printed);
     this.#dark.removeEventListener("change", this.#again);
     this.#plot?.destroy();
     this.#plot = null;
@@ -79,8 +86,10 @@ class LineChart extends HTMLElement {
     this.#plot = new uPlot(this.#options(uPlot, drawing), data, this);
   }
 
-  #size() {
-    return { width: Math.max(this.clientWidth, 200), height: this.#drawing?.height ?? 160 };
+  /** That of the page; on paper that which the style sheet says. */
+  #size(paper = matchMedia("print").matches) {
+    const [width, height] = paper ? getComputedStyle(this).getPropertyValue("--on-paper").split(" ").filter(Boolean).map(Number) : [];
+    return width && height ? { width, height } : { width: Math.max(this.clientWidth, 200), height: this.#drawing?.height ?? 160 };
   }
 
   /** @param {string} name */
@@ -106,7 +115,7 @@ class LineChart extends HTMLElement {
       series: [{ label: drawing.time ? "time" : drawing.xUnit, value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : drawing.time ? clock(value * 1e9) : value.toFixed(1)) }, ...lines],
       bands: drawing.band ? [{ series: drawing.band.map((at) => at + 1), fill: this.#colour("band") }] : [],
       scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : drawing.cut ? { dir: -1, range: drawing.cut.slice(0, 2) } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
-      axes: [drawing.time ? { ...axis, space: (/** @type {any} */ _, /** @type {number} */ __, /** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ wide) => (((to - from) * SPACE[0]) / wide < 60 ? SPACE[1] : SPACE[0]), filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}) }],
+      axes: [drawing.time ? { ...axis, space: (/** @type {any} */ _, /** @type {number} */ __, /** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ wide) => (((to - from) * SPACE[0]) / wide < 60 ? SPACE[1] : SPACE[0]), filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, size: 34, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}) }],
       tzDate: (/** @type {number} */ seconds) => (local() ? new Date(seconds * 1e3) : uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC")),
       cursor: { drag: { x: true, y: false } },
       hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)], setLegend: [(/** @type {any} */ plot) => this.#rest(plot)] },
@@ -124,7 +133,9 @@ class LineChart extends HTMLElement {
   /** Without a pointer the legend tells the newest of a trend, and no value of anything else. @param {any} plot */
   #rest(plot) {
     const away = plot.cursor.left < 0;
-    plot.root.classList.toggle("away", away && !this.#drawing?.time);
+    const still = away && !this.#drawing?.time;
+    plot.root.classList.toggle("away", still);
+    plot.root.querySelectorAll(".u-series").forEach((/** @type {Element} */ row, /** @type {number} */ at) => row.classList.toggle("bare", still && (!at || !!this.#drawing?.lines[at - 1]?.hidden)));
     if (away && this.#drawing?.time) plot.setLegend({ idx: Math.max(0, this.#drawing.lines[0].values.findLastIndex((each) => each !== null)) }, false);
   }
 

@@ -32,7 +32,7 @@
  * @typedef {{speed_rad_s: number | null, orbits: PlaceOrbit[], revolutions: number, pulses_s: number[], reason: string, path_reason: string}} Orbits
  * @typedef {{channel: string, quantity: string, unit: string, measured: (number | null)[], nominal: (number | null)[] | null, estimated: (number | null)[] | null, rms: number | null}} Density
  * @typedef {{frequencies_hz: number[], rotation_hz: number | null, left_out_hz: [number, number] | null, densities: Density[], theory: {nominal_reason: string, estimated_reason: string}, reason: string, interval_95: [number, number] | null}} Spectra
- * @typedef {{report: Report, spectra: Spectra, orbits: Orbits}} Picture
+ * @typedef {{report: Report, spectra: Spectra, orbits: Orbits, correlations?: CorrelationSnapshot | null}} Picture
  * @typedef {{site: string, machine: string, name: string, occurrence: number, before: Picture | null, raised: Picture, settled: Picture | null}} AlarmEvidence
  * @typedef {{token_id: string, name: string, scopes: string[], state: string, created_ns: number, expires_ns: number | null, revoked_ns: number | null, last_used_ns: number | null}} TokenEntry
  * @typedef {{number: number, at_ns: number, actor: string, address: string, method: string, path: string, status: number, action: string, machine: string, alarm: string, reason: string}} AuditRecord

@@ -9,6 +9,18 @@ const REFRESH_S = 15;
 
 /** @typedef {import("../monitor/records.js").CorrelationSnapshot} Correlations */
 
+/** @typedef {import("../monitor/records.js").CorrelationPair} Pair */
+
+/** @param {Pair} pair */
+export const pairName = ({ first, second }) => (first === second ? `${first} with itself` : `${first} and ${second}`);
+
+/** What was measured, with its 95 % interval, as lines of which the third and second make a band. @param {Pair} pair @param {import("../elements/line-chart.js").Line} line @returns {import("../elements/line-chart.js").Line[]} */
+export function measuredLines(pair, line) {
+  const errors = pair.standard_error.map((one) => Z95 * (one ?? 0));
+  const edge = (/** @type {number} */ sign) => pair.measured.map((one, at) => (one === null ? null : one + sign * errors[at]));
+  return [line, { label: "low", values: edge(-1), hidden: true }, { label: "high", values: edge(1), hidden: true }];
+}
+
 /** Correlation functions of the latest window beside theory, and the residuals of the equations between them. */
 class CorrelationPlot extends MachineElement {
   #choice = choiceOf("Pair of channels", () => this.#draw());
@@ -32,7 +44,7 @@ class CorrelationPlot extends MachineElement {
   #draw() {
     const found = this.#found;
     if (!found) return;
-    if (this.#choice.options.length !== found.pairs.length) offered(this.#choice, found.pairs.map((one, at) => [String(at), one.first === one.second ? `${one.first} with itself` : `${one.first} and ${one.second}`]));
+    if (this.#choice.options.length !== found.pairs.length) offered(this.#choice, found.pairs.map((one, at) => [String(at), pairName(one)]));
     const pair = found.pairs[Number(this.#choice.value)];
     this.#chart.parentElement.hidden = this.#choice.hidden = !pair;
     const theory = [found.theory.nominal_reason || found.theory.estimated_reason, found.reason].filter(Boolean);
@@ -42,10 +54,7 @@ class CorrelationPlot extends MachineElement {
     }
     const apart = [pair.nominal_z !== null && `nominal ${figure(pair.nominal_z)}`, pair.estimated_z !== null && `estimated ${figure(pair.estimated_z)}`].filter(Boolean);
     this.#said.textContent = [`Window ${stretch(found.start_ns, found.end_ns)}, without mean and 1×`, apart.length && `theory is apart by standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
-    const errors = pair.standard_error.map((one) => Z95 * (one ?? 0));
-    const edge = (/** @type {number} */ sign) => pair.measured.map((one, at) => (one === null ? null : one + sign * errors[at]));
-    /** @type {import("../elements/line-chart.js").Line[]} */
-    const lines = [{ label: "measured", values: pair.measured, width: 2 }, { label: "low", values: edge(-1), hidden: true }, { label: "high", values: edge(1), hidden: true }];
+    const lines = measuredLines(pair, { label: "measured", values: pair.measured, width: 2 });
     if (pair.nominal) lines.push({ label: "as nominal", values: pair.nominal, colour: "nominal", dash: [6, 4] });
     if (pair.estimated) lines.push({ label: "as estimated", values: pair.estimated, colour: "estimated" });
     this.#chart.draw({ x: found.lags_s.map((lag) => 1000 * lag), lines, band: [2, 1], marks: [], time: false, include: [0], unit: printed(pair.unit), xUnit: "lag, ms", height: 240 });
