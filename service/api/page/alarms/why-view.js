@@ -58,7 +58,7 @@ class WhyView extends HTMLElement {
     lay(
       this,
       html("p", { class: "note" }, html("a", { href: `#/machines/${place}` }, place), " · ", html("a", { href: "#/alarms" }, "alarms"), ` · ${name}, occurrence ${found.occurrence}`),
-      html("div", { class: "tools" }, html("h1", {}, stated?.text ?? event?.text ?? name), event && html("state-mark", { state: event.severity }), html("button", { type: "button", class: "print", click: () => print() }, "Print")),
+      html("div", { class: "tools" }, html("h1", {}, stated?.text ?? monitor.machines.get(place)?.health.alarms.find((one) => one.name === name)?.text ?? name), event && html("state-mark", { state: event.severity }), html("button", { type: "button", class: "print", click: () => print() }, "Print")),
       html("p", { class: "verdict" }, this.#sentence(found, read, finding, event)),
       html("alarm-list", { place, alarm: name }),
       html("h2", {}, "Before and after"),
@@ -116,16 +116,20 @@ class WhyView extends HTMLElement {
     const model = verdict?.outside_model
       ? `Not ruled out: the window is outside the model${after.suspect ? `, best explained by ${after.suspect}` : ""}. Take what is named with reserve.`
       : misfit !== null && `Another kind of fault: the model explains the window (misfit ${figure(misfit)} standard deviations).`;
-    const others = after.parameters.flatMap((one) => {
-      const read = one.name === name ? undefined : reading(after, one.name);
-      return read?.interval_95 ? [`${read.text} ${interval(read.interval_95)}`] : [];
-    });
+    const found = new Set(verdict?.changed.map((one) => one.name));
+    const [also, others] = [true, false].map((changed) =>
+      after.parameters.flatMap((one) => {
+        const read = one.name === name || found.has(one.name) !== changed ? undefined : reading(after, one.name);
+        return read?.interval_95 ? [`${read.text} ${interval(read.interval_95)}`] : [];
+      }),
+    );
     const apart = after.opinions.flatMap((opinion) => opinion.agreement.filter((one) => one.name === name && one.verdict === "disagree").map(() => opinion.by));
     const heard = after.opinions.filter((opinion) => opinion.parameters.some((one) => one.name === name && one.relative_change !== null)).map((one) => one.by);
     return [
       model || "",
       after.sensors.length ? `Not ruled out, a sensor: ${after.sensors.map((one) => one.text).join("; ")}.` : "A sensor: none is at fault by the checks of gain, noise, phase and against the others.",
       `Another speed: ${rpm(before)} before, ${rpm(after)} after.`,
+      also.length ? `Not ruled out, what has changed besides, 95 % intervals: ${also.join("; ")}.` : "",
       others.length ? `Other parameters, 95 % intervals: ${others.join("; ")}.` : "",
       apart.length ? `Disagrees: ${apart.join(", ")}.` : heard.length ? `Agrees: ${heard.join(", ")}.` : "",
       after.level_growth ? `Levels: ${after.level_growth.text}.` : "",

@@ -2,7 +2,7 @@ import { html } from "./markup.js";
 import { clock, local, shownIn, ticks } from "../monitor/figures.js";
 
 /** @typedef {{label: string, values: (number | null)[], colour?: string, dash?: number[], hidden?: boolean, width?: number, dots?: boolean}} Line */
-/** @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[]}} Mark */
+/** What a line at a place is called, above it or `below`. @typedef {{at: number, axis: "x" | "y", colour: string, text?: string, dash?: number[], below?: boolean}} Mark */
 /** A stretch of values, such as a zone of a standard; `edge` where it begins with a line. @typedef {{from: number, to: number, text: string, colour?: string, edge?: boolean}} Zone */
 /** @typedef {{x: number[], lines: Line[], band?: [number, number], marks: Mark[], time: boolean, log?: boolean, include?: number[], unit: string, cut?: [number, number, number], xUnit?: string, shaded?: {from: number, to: number, text?: string}[], zones?: Zone[], height: number}} Drawing */
 
@@ -35,6 +35,8 @@ class LineChart extends HTMLElement {
   /** @type {Drawing | null} as it was asked for, before its units became those that are shown */
   #given = null;
   #shape = "";
+  /** Where zones are named. @type {{from: number, to: number, at: number}[]} */
+  #names = [];
   #sized = new ResizeObserver(() => this.#plot?.setSize(this.#size()));
   #dark = matchMedia("(prefers-color-scheme: dark)");
   #again = () => {
@@ -115,7 +117,7 @@ class LineChart extends HTMLElement {
       series: [{ label: drawing.time ? "time" : drawing.xUnit, value: (/** @type {any} */ _, /** @type {number | null} */ value) => (value === null ? "–" : drawing.time ? clock(value * 1e9) : value.toFixed(1)) }, ...lines],
       bands: drawing.band ? [{ series: drawing.band.map((at) => at + 1), fill: this.#colour("band") }] : [],
       scales: { x: { time: drawing.time }, y: drawing.log ? { distr: 3 } : drawing.cut ? { dir: -1, range: drawing.cut.slice(0, 2) } : { range: (/** @type {any} */ _, /** @type {number} */ low, /** @type {number} */ high) => this.#range(low, high) } },
-      axes: [drawing.time ? { ...axis, space: (/** @type {any} */ _, /** @type {number} */ __, /** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ wide) => (((to - from) * SPACE[0]) / wide < 60 ? SPACE[1] : SPACE[0]), filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, size: 34, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}) }],
+      axes: [drawing.time ? { ...axis, space: (/** @type {any} */ _, /** @type {number} */ __, /** @type {number} */ from, /** @type {number} */ to, /** @type {number} */ wide) => (((to - from) * SPACE[0]) / wide < 60 ? SPACE[1] : SPACE[0]), filter: within, values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at, /** @type {any} */ __, /** @type {any} */ ___, /** @type {number} */ step) => ticks(at, step) } : { ...axis, size: 34, label: drawing.xUnit, labelSize: 16 }, { ...axis, size: 56, space: 24, label: drawing.unit, labelSize: 16, ...(drawing.cut ? { incrs: [drawing.cut[2]] } : {}), ...(drawing.log ? { values: (/** @type {any} */ _, /** @type {(number | null)[]} */ at) => at.map((each) => (each === null ? "" : each < 1e-3 ? each.toExponential(0).replace("-", "−") : String(each))) } : {}) }],
       tzDate: (/** @type {number} */ seconds) => (local() ? new Date(seconds * 1e3) : uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC")),
       cursor: { drag: { x: true, y: false } },
       hooks: { drawAxes: [(/** @type {any} */ plot) => this.#shade(plot)], draw: [(/** @type {any} */ plot) => this.#mark(plot)], setLegend: [(/** @type {any} */ plot) => this.#rest(plot)] },
@@ -148,6 +150,7 @@ class LineChart extends HTMLElement {
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
+    this.#names = [];
     for (const { from, to, text, colour, edge } of this.#drawing?.zones ?? []) {
       const { min, max } = plot.scales.y;
       const [low, high] = [Math.max(from, min), Math.min(to, max)];
@@ -158,7 +161,11 @@ class LineChart extends HTMLElement {
       ctx.fillStyle = this.#colour("ink-2");
       if (edge && low === from) ctx.fillRect(bbox.left, bottom, bbox.width, devicePixelRatio);
       ctx.textAlign = "right";
-      if (bottom - top > 13 * devicePixelRatio) ctx.fillText(text, bbox.left + bbox.width - 4 * devicePixelRatio, top + 12 * devicePixelRatio);
+      if (bottom - top > 13 * devicePixelRatio) {
+        const [right, at] = [bbox.left + bbox.width - 4 * devicePixelRatio, top + 12 * devicePixelRatio];
+        ctx.fillText(text, right, at);
+        this.#names.push({ from: right - ctx.measureText(text).width, to: right, at });
+      }
       ctx.textAlign = "left";
     }
     for (const { from, to, text } of this.#drawing?.shaded ?? []) {
@@ -171,9 +178,11 @@ class LineChart extends HTMLElement {
     ctx.restore();
   }
 
-  /** @param {any} plot */
+  /** Lines of limits and moments, and then what they are called: a name stays readable on the line of another one. @param {any} plot */
   #mark(plot) {
     const { ctx, bbox } = plot;
+    const [gap, right] = [3 * devicePixelRatio, bbox.left + bbox.width];
+    const marks = (this.#drawing?.marks ?? []).map((mark) => ({ ...mark, place: plot.valToPos(mark.at, mark.axis, true), upright: mark.axis === "x" }));
     ctx.save();
     ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
     ctx.textAlign = "left";
@@ -181,38 +190,33 @@ class LineChart extends HTMLElement {
     ctx.beginPath();
     ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
     ctx.clip();
-    /** Text that stays readable on a line. @param {string} text @param {number} x @param {number} y */
-    const write = (text, x, y) => {
-      ctx.setLineDash([]);
-      Object.assign(ctx, { strokeStyle: this.#colour("surface"), lineWidth: 3 * devicePixelRatio });
-      ctx.strokeText(text, x, y);
-      ctx.lineWidth = 1.5 * devicePixelRatio;
-      ctx.fillText(text, x, y);
-    };
-    let row = 0;
-    /** @type {{to: number, at: number}[]} labels of limits, which stand beside each other where the limits are close */
-    const said = [];
-    for (const mark of this.#drawing?.marks ?? []) {
-      const place = plot.valToPos(mark.at, mark.axis, true);
-      const upright = mark.axis === "x";
-      ctx.strokeStyle = ctx.fillStyle = this.#colour(mark.colour);
-      ctx.setLineDash((mark.dash ?? []).map((each) => each * devicePixelRatio));
+    for (const { place, upright, colour, dash } of marks) {
+      ctx.strokeStyle = this.#colour(colour);
+      ctx.setLineDash((dash ?? []).map((each) => each * devicePixelRatio));
       ctx.beginPath();
       ctx.moveTo(upright ? place : bbox.left, upright ? bbox.top : place);
-      ctx.lineTo(upright ? place : bbox.left + bbox.width, upright ? bbox.top + bbox.height : place);
+      ctx.lineTo(upright ? place : right, upright ? bbox.top + bbox.height : place);
       ctx.stroke();
-      const gap = 3 * devicePixelRatio;
-      if (!mark.text) continue;
-      const wide = ctx.measureText(mark.text).width;
-      if (upright) {
-        const fits = place + gap + wide < bbox.left + bbox.width;
-        write(mark.text, fits ? place + gap : place - gap - wide, bbox.top + 4 * gap * (1 + (row++ % 3)));
-        continue;
-      }
-      const before = said.filter((each) => Math.abs(each.at - place) < 4 * gap);
-      const from = Math.max(bbox.left + gap, ...before.map((each) => each.to + 3 * gap));
-      said.push({ to: from + wide, at: place });
-      write(mark.text, from, place - gap);
+    }
+    ctx.setLineDash([]);
+    ctx.lineWidth = gap;
+    ctx.strokeStyle = this.#colour("surface");
+    const taken = [...this.#names];
+    const free = (/** @type {number[]} */ [x, y], /** @type {number} */ wide) => x >= bbox.left && x + wide <= right && taken.every(({ from, to, at }) => x > to || x + wide < from || Math.abs(y - at) >= 4 * gap);
+    // Limits first: their names stand at the left, beside each other where the limits are close.
+    for (const { text, place, upright, colour, below } of marks.sort((one, other) => Number(one.upright) - Number(other.upright))) {
+      if (!text) continue;
+      const wide = ctx.measureText(text).width;
+      const rows = upright ? [1, 2, 3, 4, 5, 6].map((row) => bbox.top + 4 * gap * row) : [place + (below && place + 5 * gap < bbox.top + bbox.height ? 4 : -1) * gap];
+      const from = upright ? [place + gap, place - gap - wide] : [bbox.left + gap, ...taken.map(({ to }) => to + 3 * gap)];
+      const places = rows.flatMap((y) => from.map((x) => [x, y]));
+      const found = places.find((each) => free(each, wide)) ?? (upright ? places[0] : null);
+      if (!found) continue; // what is said of a limit stands beside the chart, too
+      const [x, y] = found;
+      taken.push({ from: x, to: x + wide, at: y });
+      ctx.fillStyle = this.#colour(colour);
+      ctx.strokeText(text, x, y);
+      ctx.fillText(text, x, y);
     }
     ctx.restore();
   }

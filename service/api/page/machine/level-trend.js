@@ -19,7 +19,7 @@ function limitsOf({ source, zones, alert, danger, fall }) {
   return [
     ...(alert === null ? [] : [{ at: alert, kind: /** @type {"alert"} */ ("alert"), text: `alert${from}` }]),
     ...(danger === null ? [] : [{ at: danger, kind: /** @type {"danger"} */ ("danger"), text: `danger${from}` }]),
-    ...(fall === null ? [] : [{ at: fall, kind: /** @type {"alert"} */ ("alert"), text: `alert below${from}` }]),
+    ...(fall === null ? [] : [{ at: fall, kind: /** @type {"alert"} */ ("alert"), text: `alert below${from}`, below: true }]),
   ];
 }
 
@@ -53,7 +53,7 @@ export class LevelTrend extends ReadingTrend {
         limits: bounds.flatMap(limitsOf),
         near: 0,
         zones: bounds.flatMap((bound) => (bound.zones ? zonesOf(bound.zones) : [])),
-        said: said.join("; ") || "no limit",
+        said: said.length ? said : ["no limit"],
         zero: true,
         changed,
       };

@@ -2,7 +2,7 @@ import { machineFile } from "./machine-file.js";
 import { ReadingTrend } from "./reading-trend.js";
 
 /** @param {"alert" | "danger"} kind @param {number} limit @returns {import("./reading-trend.js").Limit[]} */
-const both = (kind, limit) => [-100 * limit, 100 * limit].map((at) => ({ at, kind, text: kind }));
+const both = (kind, limit) => [-100 * limit, 100 * limit].map((at) => ({ at, kind, text: kind, below: at < 0 }));
 
 /** Changes of the parameters over time, with their 95 % intervals and the limits of the machine file. */
 export class ParameterTrend extends ReadingTrend {

@@ -9,8 +9,8 @@ const GAP = 2.5;
 
 /** @typedef {import("../monitor/records.js").Bucket} Bucket */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
-/** @typedef {{at: number, kind: "alert" | "danger", text: string}} Limit */
-/** What is shown over time; limits within `near` are always in the picture. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string, zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
+/** @typedef {{at: number, kind: "alert" | "danger", text: string, below?: boolean}} Limit */
+/** What is shown over time; limits within `near` are always in the picture. @typedef {{name: string, alarm: string, title: string, unit: string, scale: number, limits: Limit[], near: number, zones?: import("../elements/line-chart.js").Zone[], said?: string[], zero: boolean, changed: {text: string, since_ns: number, between_ns?: [number, number] | null}[]}} Trended */
 
 /** Readings of a machine over time, a chart each, with interval bands, limits and the times of alarms. */
 export class ReadingTrend extends MachineElement {
@@ -104,7 +104,7 @@ export class ReadingTrend extends MachineElement {
       this.#figures.append(html("figure", {}, html("figcaption", {}), chart));
     }
     const caption = /** @type {HTMLElement} */ (chart.previousElementSibling);
-    lay(caption, one.title, html("small", {}, ` ${one.said ?? ""}`));
+    lay(caption, one.title, ...(one.said ?? []).map((text) => html("small", {}, ` ${text}`)));
     if (!buckets.length) return;
     /** @type {number[]} */
     const x = [];
@@ -134,7 +134,7 @@ export class ReadingTrend extends MachineElement {
     const marks = [
       ...(this.#moment === null ? [] : [{ at: this.#moment / 1e9, axis: /** @type {"x"} */ ("x"), colour: "estimated" }]),
       ...changes.map((each) => ({ at: each.since_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: "ink", text: each.text })),
-      ...one.limits.map(({ at, kind, text }) => ({ at, axis: /** @type {"y"} */ ("y"), colour: `${kind}-line`, text, ...(kind === "alert" ? { dash: [6, 4] } : {}) })),
+      ...one.limits.map(({ at, kind, text, below }) => ({ at, below, axis: /** @type {"y"} */ ("y"), colour: `${kind}-line`, text, ...(kind === "alert" ? { dash: [6, 4] } : {}) })),
       ...events
         .filter((event) => event.name === one.alarm && ["raised", "escalated", "cleared"].includes(event.kind))
         .map((event) => ({ at: event.time_ns / 1e9, axis: /** @type {"x"} */ ("x"), colour: event.kind === "cleared" ? "ink-2" : `${event.severity}-line`, text: event.kind, dash: [2, 3] })),

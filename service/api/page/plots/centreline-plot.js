@@ -1,4 +1,4 @@
-import { quantity, stretch } from "../monitor/figures.js";
+import { quantity, shownIn, stretch } from "../monitor/figures.js";
 import { html, svg } from "../elements/markup.js";
 import { plane, REACH, roundUp } from "./plane.js";
 import { SamplePlot } from "./sample-plot.js";
@@ -21,7 +21,8 @@ class CentrelinePlot extends SamplePlot {
   /** @param {Centrelines["places"][number]} one */
   #place(one) {
     const points = one.y_um.flatMap((y, at) => (y === null || one.z_um[at] === null ? [] : [[y - Number(one.y_um[0]), Number(one.z_um[at]) - Number(one.z_um[0])]]));
-    const reach = roundUp(Math.max(...points.flat().map(Math.abs), 1e-3));
+    const [factor] = shownIn("µm");
+    const reach = roundUp(factor * Math.max(...points.flat().map(Math.abs), 1e-3)) / factor;
     const drawn = points.map(([y, z]) => [(REACH * y) / reach, (-REACH * z) / reach]);
     const [first, last] = [drawn[0], drawn[drawn.length - 1]];
     const moved = points[points.length - 1] ?? [0, 0];

@@ -26,11 +26,12 @@ function marked({ path }, pulses_s) {
 export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured", nominal: "as nominal" }) {
   const { path, ellipse, nominal, estimated, location, unit } = orbit;
   const reach = Math.max(...[ellipse, nominal, estimated].map((one) => one?.semi_major ?? 0), ...(path ? [...path.y, ...path.z].map(Math.abs) : []), 1e-12);
-  const scale = REACH / roundUp(reach);
+  const [factor] = shownIn(printed(unit));
+  const rim = roundUp(reach * factor) / factor;
+  const scale = REACH / rim;
   const oval = (/** @type {Ellipse | null} */ one, /** @type {string} */ kind) =>
     one && svg("ellipse", { class: kind, rx: one.semi_major * scale, ry: one.semi_minor * scale, transform: `rotate(${-one.tilt_deg})` });
   const points = path ? path.y.map((y, at) => `${(y * scale).toFixed(1)},${(-path.z[at] * scale).toFixed(1)}`).join(" ") : "";
-  const [factor] = shownIn(printed(unit));
   const said = ellipse ? `${figure(2 * ellipse.semi_major * factor)} × ${quantity(2 * ellipse.semi_minor, printed(unit))} pp at running speed, ${ellipse.precession ?? ellipse.sense}` : "no ellipse";
   const keys = [path && ["path", "samples"], ellipse && ["measured", called.measured], nominal && ["nominal", called.nominal], estimated && ["estimated", "as estimated"], path && pulses_s.length && ["pulse", "keyphasor"]];
   return html(
@@ -39,7 +40,7 @@ export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured"
     html("figcaption", {}, location, html("small", { class: "number" }, ` ${said}`)),
     plane(
       `orbit at the ${location}: ${said}`,
-      quantity(roundUp(reach) / 2, printed(unit)),
+      quantity(rim / 2, printed(unit)),
       svg("polyline", { class: "path", points }),
       oval(nominal, "nominal"),
       oval(estimated, "estimated"),
