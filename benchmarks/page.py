@@ -34,6 +34,7 @@ from running_monitor import PLACE, Monitor, monitor
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 EVERY_S = 15.0
+STREAM = f"/api/v1/events?detail=overview&in_full={PLACE}"
 MANY_STREAMS = {"ROTORWATCH_ACCESS__LIMITS__STREAMS_PER_CALLER": "100"}
 TICKS = os.sysconf("SC_CLK_TCK")
 WATCH = """() => {
@@ -148,9 +149,9 @@ def asking(one: Monitor, paths: list[str], phase_s: float, ended: threading.Even
 def hearing(one: Monitor, ended: threading.Event, heard: list[int]) -> None:
     """Listen as a page does; what comes is counted."""
     connection = http.client.HTTPConnection(one.url.removeprefix("http://"), timeout=60)
-    connection.request("GET", f"/api/v1/events?detail=overview&in_full={PLACE}")
+    connection.request("GET", STREAM)
     answer = connection.getresponse()
-    while not ended.is_set():
+    while answer.status == httpx.codes.OK and not ended.is_set():
         heard.append(len(answer.readline()))
     connection.close()
 

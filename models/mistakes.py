@@ -59,12 +59,32 @@ def read_toml(path: Path) -> dict[str, object]:
     except OSError as error:
         raise MachineFileError(f"{path}: cannot be read ({error.strerror})") from error
     try:
-        return tomllib.loads(data.decode())
+        text = data.decode()
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise MachineFileError(f"{path}: line {line}: expected UTF-8, save the file in that encoding") from error
+    return parse_toml(text, path)
+
+
+def parse_toml(text: str, place: object) -> dict[str, object]:
+    """Parse TOML.
+
+    Parameters
+    ----------
+    place : object
+        What the message begins with: the file, or the argument.
+
+    Raises
+    ------
+    MachineFileError
+        If it is not TOML; the message names the line where it is known.
+    """
+    try:
+        return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise MachineFileError(f"{path}: {_unreadable(str(error), data.decode())}") from error
+        raise MachineFileError(f"{place}: {_unreadable(str(error), text)}") from error
+    except RecursionError as error:
+        raise MachineFileError(f"{place}: lists or tables are nested too deeply") from error
 
 
 def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
@@ -91,10 +111,7 @@ def changed(fields: dict[str, object], changes: str) -> dict[str, object]:
             return above
         return below | {name: over(below.get(name), one) for name, one in above.items()}
 
-    try:
-        given = tomllib.loads(changes)
-    except tomllib.TOMLDecodeError as error:
-        raise MachineFileError(f"changes: {_unreadable(str(error), changes)}") from error
+    given = parse_toml(changes, "changes")
     return {**fields, **{name: over(fields.get(name), one) for name, one in given.items()}}
 
 
@@ -260,7 +277,7 @@ def _unreadable(message: str, text: str) -> str:
             break
     if re.search(r"=\s*[-+]?\d+,\d", line):
         said = "a number has a decimal point, not a comma"
-    return f"line {number}: {said[0].lower()}{said[1:]}: {line}"
+    return f"line {number}: {said[0].lower()}{said[1:]}: {line[:_LONGEST_SHOWN]}"
 
 
 def _unknown(key: str, above: _Place, model: type[BaseModel], fields: object) -> tuple[str, str | None]:

@@ -90,9 +90,21 @@ class ReplayRequest(BaseModel):
         description="offline: another machine file, as a shipped name or SITE/MACHINE of a monitored one",
         examples=["demo/lab"],
     )
+    machine_file: str | None = Field(
+        default=None,
+        max_length=100_000,
+        description="offline: text of another machine file, of the machine that was recorded; instead of `machine`",
+        examples=[None],
+    )
+    machine_file_name: str = Field(
+        default="sent.toml",
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_. -]{0,94}\.toml$",
+        description="what the replay calls that file",
+        examples=["stricter.toml"],
+    )
     bundle: str | None = Field(
         default=None,
-        description="offline: other trained networks, as a shipped name; needs `machine`",
+        description="offline: other trained networks, as a shipped name; needs `machine` or `machine_file`",
         examples=["lab"],
     )
     changes: tuple[Annotated[str, Field(max_length=500)], ...] = Field(
@@ -126,6 +138,12 @@ class ReplayJob(Record):
     machine: str | None = Field(
         description="machine file and, after @, trained networks it is evaluated with; null: by the recorded name",
         examples=["lab@lab"],
+    )
+    machine_file_sent: bool = Field(
+        default=False,
+        exclude_if=lambda value: not value,
+        description="whether that file was sent with the request; left out otherwise",
+        examples=[True],
     )
     changes: tuple[str, ...] = Field(
         default=(), description="lines that hold instead of the machine file's", examples=[["alarms.on_delay_s=60.0"]]

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Page, expect
@@ -114,7 +115,15 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         chosen(page, url)
         page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
         page.get_by_label("Other lines").fill("alarms.limits.danger_above = 0.9")
+        text = Path(runtime.settings.machines[0].file).read_bytes()
+        sent = page.get_by_label("Or another one of this computer")
+        sent.set_input_files({"name": "calm.toml", "mimeType": "application/toml", "buffer": text})
+        expect(page.get_by_label(re.compile("^Machine file"))).to_be_disabled()
+        kept(page, "replay-order-file")
         page.get_by_role("button", name="Start replay").click()
+        expect(page.locator(".replay-banner")).to_contain_text(
+            "with another machine file, calm.toml. Nothing on this view is live"
+        )
         expect(view.get_by_role("status").first).to_contain_text("raised at the end: none")
         expect(page.locator("alarm-comparison tbody tr").first).to_contain_text("live only")
         page.get_by_label("Beside it").select_option(index=1)

@@ -13,6 +13,7 @@ import httpx
 import pytest
 from pydantic import BaseModel
 
+import models.machine
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
 from service.api.routes.replays import ReplayDesk
@@ -30,6 +31,11 @@ RECORDINGS, REPLAYS = "/api/v1/recordings", "/api/v1/replays"
 QUICK = "demo/lab/20270101T000000Z.mcap"
 DAY_NS = 86_400 * 10**9
 ENDED = ("finished", "stopped", "failed")
+
+
+def machine_text(name: str) -> str:
+    """A shipped machine file."""
+    return (Path(models.machine.__file__).parent / "machines" / f"{name}.toml").read_text(encoding="utf-8")
 
 
 def plan(directory: Path | None, **replay: object) -> ServiceSettings:
@@ -252,10 +258,37 @@ def test_what_would_have_been_raised_with_another_limit(client: httpx.Client) ->
     assert found.summary.machine_hash != as_it_was.summary.machine_hash
 
 
+def test_what_would_have_been_raised_with_a_machine_file_that_is_sent(client: httpx.Client) -> None:
+    text = machine_text("lab") + "\n[alarms.parameters.c_bz]\nraise_above = 0.8\ndanger_above = 0.9\n"
+    job = start(client, machine_file=text, machine_file_name="calm.toml", changes=["alarms.on_delay_s = 5"])
+    assert (job.machine, job.machine_file_sent) == ("calm.toml", True)
+    found = ended(client, job)
+    assert (found.state, found.error) == ("finished", "")
+    assert found.summary is not None
+    assert (found.summary.raised, found.summary.bundle) == ((), None)
+    assert found.summary.limits["c_bz"].raise_above == 0.8
+    assert (found.summary.site, found.summary.machine) == ("demo", "lab")
+    with_networks = start(client, machine_file=text, bundle="heavy")
+    assert with_networks.machine == "sent.toml"
+    failed = ended(client, with_networks)  # those of another machine
+    assert failed.state == "failed"
+    assert "trained for another machine" in failed.error
+
+
 @pytest.mark.parametrize(
     ("changes", "status", "detail"),
     [
         ({"recordings": []}, 422, "recordings: "),
+        ({"machine_file": machine_text("heavy")}, 422, "machine_file: of demo/heavy, the recordings are of demo/lab"),
+        ({"machine_file": machine_text("lab") + "\n[paths]\n"}, 422, "machine_file: paths: unknown"),
+        ({"machine_file": machine_text("lab").replace("rate_hz", "rate hz", 1)}, 422, "machine_file: line "),
+        ({"machine_file": "x = " + "[" * 50_000}, 422, "machine_file: lists or tables are nested too deeply"),
+        ({"machine_file": "." * 100_001}, 422, "machine_file: "),
+        ({"machine_file": "", "machine": "lab"}, 422, "machine_file: is given beside machine"),
+        ({"machine_file": "", "mode": "paced"}, 422, "machine_file: nothing is evaluated"),
+        ({"machine_file": machine_text("lab"), "machine_file_name": "../lab.toml"}, 422, "machine_file_name: "),
+        ({"machine_file": machine_text("lab"), "bundle": "/etc"}, 422, "is not the name of shipped networks"),
+        ({"machine_file": machine_text("lab"), "changes": ["alarms.on_delay_s = -1"]}, 422, "alarms.on_delay_s"),
         ({"recordings": ["demo/pump/20260101T020000Z.mcap.part"]}, 409, "incomplete"),
         ({"machine": "../lab.toml"}, 422, "neither shipped nor monitored; monitored are demo/lab"),
         ({"machine": "lab", "bundle": "/etc"}, 422, "is not the name of shipped networks"),

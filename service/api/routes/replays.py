@@ -10,6 +10,7 @@ from fastapi import Body, Depends, FastAPI, HTTPException, Query
 from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
+from models.commissioning.commissioned import FILE as COMMISSIONED
 from models.errors import MachineFileError
 from models.machine import load_machine_file
 from models.mistakes import changed
@@ -31,7 +32,7 @@ from service.access.problems import problem_responses, responses
 from service.api.routes.recordings import found_recording
 from service.recordings.catalogue import Catalogue
 from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
-from service.recordings.replay.machine import is_shipped_bundle, is_shipped_machine
+from service.recordings.replay.machine import check_sent, is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
 
 _PLACE = "/api/v1/replays"
@@ -92,14 +93,17 @@ class ReplayDesk:
         if len(machines) != 1:
             raise HTTPException(422, f"recordings: of several machines ({', '.join(machines)}), expected one")
         offline = request.mode == "offline"
-        machine = self._machine(request, machines[0]) if offline else None
+        sent = request.machine_file is not None
+        machine = self._machine(request, machines[0]) if offline and not sent else None
+        bundle = self._beside_sent(request, machines[0])
         _check_changes(request, machine)
         job = ReplayJob(
             id=(job_id := jobs.new_id()),
             state="running",
             mode=request.mode,
             recordings=request.recordings,
-            machine=machine,
+            machine=request.machine_file_name if sent else machine,
+            machine_file_sent=sent,
             changes=request.changes,
             from_ns=request.from_ns,
             to_ns=request.to_ns,
@@ -121,7 +125,7 @@ class ReplayDesk:
             arguments += ["--pace", f"{request.pace:g}", "--prefix", job.prefix]
             arguments += [part for end in _endpoints(self._settings.link) for part in ("--connect", end)]
         try:
-            return jobs.start(JobPlan(job, tuple(arguments)))
+            return jobs.start(JobPlan(job, tuple(arguments), request.machine_file or "", bundle))
         except TooManyReplaysError as error:
             raise HTTPException(429, str(error)) from error
         except ReplayJobError as error:
@@ -138,7 +142,7 @@ class ReplayDesk:
         name, bundle = request.machine, request.bundle
         if name is None:
             if bundle is not None:
-                raise HTTPException(422, "bundle: needs machine beside it")
+                raise HTTPException(422, "bundle: needs machine or machine_file beside it")
             entry = monitored.get(recorded)
             return None if entry is None else _spec(entry.file, entry.bundle)
         if bundle is not None and not is_shipped_bundle(bundle):
@@ -150,6 +154,26 @@ class ReplayDesk:
         raise HTTPException(
             422, f"machine: {name!r} is neither shipped nor monitored; monitored are {', '.join(monitored)}"
         )
+
+    def _beside_sent(self, request: ReplayRequest, recorded: str) -> str | None:
+        """What a machine file that was sent is evaluated with: networks by name, or what was commissioned."""
+        if request.machine_file is None:
+            return None
+        if request.mode != "offline":
+            raise HTTPException(422, "machine_file: nothing is evaluated in a paced replay")
+        if request.machine is not None:
+            raise HTTPException(422, "machine_file: is given beside machine, expected one of them")
+        try:
+            check_sent(request.machine_file, "\n".join(request.changes), recorded)
+        except MachineFileError as error:
+            raise HTTPException(422, str(error)) from error
+        if request.bundle is not None:
+            if not is_shipped_bundle(request.bundle):
+                raise HTTPException(422, f"bundle: {request.bundle!r} is not the name of shipped networks")
+            return request.bundle
+        entry = self._monitored().get(recorded)
+        bundle = None if entry is None or entry.bundle is None else Path(entry.bundle)
+        return None if bundle is None or not (bundle / COMMISSIONED).is_file() else str(bundle.resolve())
 
     def _monitored(self) -> dict[str, MachineEntry]:
         if self._entries is None:

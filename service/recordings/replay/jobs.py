@@ -25,6 +25,7 @@ from service.terminal.logs import logger
 REPLAYS = ".replays"
 _RESULTS = "results.jsonl"
 _MESSAGES = "messages.txt"
+_MACHINE = "machine.toml"
 _STOP_S = 5.0
 _ERROR_CHARACTERS = 2000
 _FOLDER = re.compile(r"[0-9a-f]{12}")
@@ -44,7 +45,9 @@ class JobPlan:
     """A job as it is to be started."""
 
     job: ReplayJob  # what the API says of it; id, state, times and results are filled in
-    arguments: tuple[str, ...]  # of ``rotorwatch replay``: files and options other than those for the output
+    arguments: tuple[str, ...]  # of ``rotorwatch replay``: files and options other than those below
+    machine_file: str = ""  # text of a machine file that was sent
+    bundle: str | None = None  # what goes with that
 
 
 class ReplayJobs:
@@ -97,6 +100,8 @@ class ReplayJobs:
             folder = self._folder / plan.job.id
             try:
                 folder.mkdir(parents=True)
+                if plan.machine_file:
+                    (folder / _MACHINE).write_text(plan.machine_file, encoding="utf-8")
                 self._make_room()
                 job = self._jobs[plan.job.id] = _Job(plan, folder, self._nice)
             except OSError as error:
@@ -223,6 +228,8 @@ class _Job:
     def _command(self, plan: JobPlan, nice: int) -> Sequence[str]:
         command = [sys.executable, "-m", "service.rotorwatch", "replay", *plan.arguments]
         command += ["--progress", "json", "--control", "--nice", str(nice)]
+        if plan.machine_file:
+            command += ["--machine", f"{self.folder / _MACHINE}{'' if plan.bundle is None else f'@{plan.bundle}'}"]
         return command + (["--out", str(self.folder / _RESULTS)] if plan.job.mode == "offline" else [])
 
     def _listen(self) -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from models.commissioning.commissioned import Installed, install
 from models.errors import MachineFileError
-from models.machine import load_machine_file
+from models.machine import MachineFile, load_machine_file
+from models.mistakes import changed, checked, parse_toml
 from models.signals.keys import MachineKeys
 
 
@@ -39,6 +40,20 @@ def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> 
         f"the recording is of {keys.site}/{keys.machine}, and none of the shipped machines ({shipped}) has this site "
         "and name: name its machine file, as --machine FILE or --machine FILE@BUNDLE"
     )
+
+
+def check_sent(text: str, changes: str, recorded: str) -> None:
+    """Check the text of a machine file that is to be used for a recorded machine.
+
+    Raises
+    ------
+    MachineFileError
+        Naming the field, the value found and what was expected; also if it is of another machine than ``site/name``.
+    """
+    place = "machine_file"
+    machine = checked(MachineFile, changed(parse_toml(text, place), changes), place)
+    if f"{machine.site}/{machine.name}" != recorded:
+        raise MachineFileError(f"{place}: of {machine.site}/{machine.name}, the recordings are of {recorded}")
 
 
 def is_shipped_machine(name: str) -> bool:

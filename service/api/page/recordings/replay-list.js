@@ -8,7 +8,7 @@ const REFRESH_S = 10;
 /** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
 
 /** How a replay differs from what was live. @param {ReplayJob} job */
-export const differences = (job) => [job.machine && `machine file ${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");
+export const differences = (job) => [job.machine && `${job.machine_file_sent ? "another machine file, " : "machine file "}${job.machine.split("/").pop()}`, ...(job.changes ?? [])].filter(Boolean).join("; ");
 
 /** @param {number} count @param {string} word */
 export const counted = (count, word) => `${count} ${word}${count === 1 ? "" : "s"}`;

@@ -3,15 +3,18 @@ import { html, lay } from "../elements/markup.js";
 import { API, monitor } from "../monitor/monitor.js";
 import { counted } from "./replay-list.js";
 
+const LARGEST = 100_000;
+
 /** @typedef {import("../monitor/records.js").RecordingEntry} RecordingEntry */
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
 /** @typedef {import("./recordings-view.js").Chosen} Chosen */
 
-/** A form that starts a replay of what is chosen: as it was, or with another machine file or another limit. */
+/** A form that starts a replay of what is chosen: as it was, or with another machine file, also one of this computer, or another limit. */
 class ReplayOrder extends HTMLElement {
   #what = html("p", { role: "status" });
   #message = html("p", { class: "message", role: "alert" });
   #machine = /** @type {HTMLSelectElement} */ (html("select"));
+  #file = /** @type {HTMLInputElement} */ (html("input", { type: "file", accept: ".toml", change: () => this.#offer() }));
   #raise = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0.1, max: 99, step: "any", placeholder: "as in the file" }));
   #delay = /** @type {HTMLInputElement} */ (html("input", { type: "number", min: 0, max: 86400, step: "any", placeholder: "as in the file" }));
   #lines = /** @type {HTMLTextAreaElement} */ (html("textarea", { rows: 2, spellcheck: "false", placeholder: "alarms.parameters.k_by.raise_above = 0.2" }));
@@ -28,6 +31,7 @@ class ReplayOrder extends HTMLElement {
     lay(
       this.#offline,
       html("label", {}, "Machine file", this.#machine),
+      html("label", {}, "Or another one of this computer (TOML)", this.#file),
       html("label", {}, "Alert when a parameter changed by more than, %", this.#raise),
       html("label", {}, "Alarm when that has lasted, s", this.#delay),
       html("label", { class: "lines" }, "Other lines instead of the machine file's, one each", this.#lines),
@@ -39,6 +43,7 @@ class ReplayOrder extends HTMLElement {
   #offer() {
     this.#offline.hidden = this.#mode.value !== "offline";
     this.#paced.hidden = !this.#offline.hidden;
+    this.#machine.disabled = Boolean(this.#file.files?.length);
   }
 
   /** @param {string} place @param {RecordingEntry[]} _recordings @param {AlarmEvent[]} _alarms @param {Chosen} chosen */
@@ -68,14 +73,23 @@ class ReplayOrder extends HTMLElement {
     return [...limits, ...delay, ...this.#lines.value.split("\n").map((one) => one.trim()).filter(Boolean)];
   }
 
+  /** Which machine file, if it is not that of the machine. @returns {Promise<Record<string, string>>} */
+  async #machineFile() {
+    const [file] = this.#file.files ?? [];
+    if (!file) return this.#machine.value ? { machine: this.#machine.value } : {};
+    if (file.size > LARGEST) throw new Error(`${file.name} is too large for a machine file.`);
+    const name = file.name.replace(/\.toml$/i, "").replace(/[^A-Za-z0-9_. -]/g, "_").slice(0, 90);
+    return { machine_file: await file.text(), machine_file_name: `${/^[A-Za-z0-9]/.test(name) ? "" : "file"}${name}.toml` };
+  }
+
   /** @param {Event} event */
   async #submit(event) {
     event.preventDefault();
     const mode = this.#mode.value;
     const times = this.#chosen.stretch ? { from_ns: this.#chosen.stretch[0], to_ns: this.#chosen.stretch[1] } : {};
-    const how = mode === "paced" ? { pace: Number(this.#pace.value) } : { ...(this.#machine.value ? { machine: this.#machine.value } : {}), changes: this.#changes() };
     this.#start.disabled = true;
     try {
+      const how = mode === "paced" ? { pace: Number(this.#pace.value) } : { ...(await this.#machineFile()), changes: this.#changes() };
       const job = await monitor.order(`${API}/replays`, { recordings: [...this.#chosen.ids], mode, ...times, ...how });
       location.hash = `#/replays/${job.id}`;
     } catch (error) {
