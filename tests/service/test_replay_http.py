@@ -214,10 +214,12 @@ def test_a_paced_replay_is_paused_moved_and_stopped(client: httpx.Client, runtim
     assert job.id in limit.detail
     assert ReplayJob.model_validate_json(client.post(f"{place}/pause", json={}).content).state == "paused"
     client.post(f"{place}/seek", json={"to_ns": START_NS + 50 * 10**9}).raise_for_status()
-    assert position_s() < 50
+    until(lambda: position_s() == 50, "the place, told though paused")
     client.post(f"{place}/seek", json={"by_s": 10.0}).raise_for_status()
+    until(lambda: position_s() == 60, "ten seconds later")
+    assert get(client, place, ReplayJob).state == "paused"
     assert ReplayJob.model_validate_json(client.post(f"{place}/resume", json={}).content).state == "running"
-    until(lambda: position_s() >= 60, "the place")
+    until(lambda: position_s() > 60, "the place")
     problem(client.get(f"{place}/reports"), 404)
     for wrong in ({}, {"to_ns": 1, "by_s": 1.0}, {"to_ns": -1}):
         problem(client.post(f"{place}/seek", json=wrong), 422)

@@ -1,16 +1,20 @@
 """Recordings as one stream, and the player: order, repetitions, seeking, pausing, stopping."""
 
+import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from models.errors import MachineFileError, RecordingError
 from models.signals.recording import RecordedMessage
+from rotorwatch.records.replays import ReplayProgress
 from service.recordings.replay.console import obey
 from service.recordings.replay.control import Control
 from service.recordings.replay.player import PlayPlan, play
 from service.recordings.replay.source import RecordingSource, parse_moment
+from tests.service.live import until
 from tests.service.replaying import write
 
 SECOND = 10**9
@@ -149,6 +153,21 @@ def test_seeking_stays_within_what_is_replayed(tmp_path: Path) -> None:
     taker = Taker(4.0, lambda: control.seek_by(60.0))
     play(source, taker, plan(from_s=3.0, to_s=5.0), control)
     assert taker.times == [at / 10 for at in range(30, 41)]
+
+
+def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp_path: Path) -> None:
+    source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
+    taker, told = Taker(2.0, control.pause), list[ReplayProgress]()
+    thread = threading.Thread(target=play, args=(source, taker, plan(to_s=10.0), control, told.append))
+    thread.start()
+    until(lambda: control.paused, "the pause")
+    for place_s in (10, 9):
+        control.seek(place_s * SECOND)
+        until(partial(lambda place_ns: told[-1].position_ns == place_ns, place_s * SECOND), "the place")
+        assert told[-1].paused
+    control.resume()
+    thread.join()
+    assert taker.times == [at / 10 for at in (*range(21), *range(90, 100))]
 
 
 def test_stopping_ends_before_the_next_message(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ def _seldom(take: Show) -> Iterator[Show]:
         nonlocal due_s
         latest[:] = [progress]
         now_s = time.monotonic()
-        if now_s >= due_s:
+        if now_s >= due_s or progress.paused:  # nothing may come after that for long
             due_s = now_s + _EVERY_S
             take(progress)
             latest.clear()

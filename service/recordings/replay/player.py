@@ -67,12 +67,16 @@ def play(
             count += 1
             if on_progress is not None:
                 on_progress(_progress(plan, control, time_ns, count))
+        else:
+            control.wait_until(None)  # who has paused may still go back
         if control.stopped:
             break
         seek_ns = control.take_seek()
         begin_ns = None if seek_ns is None else min(max(seek_ns, plan.from_ns), plan.to_ns)
         if begin_ns is not None:
             control.at(begin_ns)
+            if on_progress is not None:
+                on_progress(_progress(plan, control, begin_ns, count))
     if on_progress is not None and not control.stopped:
         on_progress(_progress(plan, control, plan.to_ns - 1, count))
     return count

@@ -38,10 +38,15 @@ class PacedControl extends HTMLElement {
     this.#pause.textContent = job.state === "paused" ? "Resume" : "Pause";
     lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${counted(job.progress.messages, "message")} sent.` : ".");
     if (first) await this.#measure(job);
-    if (!this.#held && !this.#waiting && job.progress && this.#span) {
-      this.#seek.value = String((job.progress.position_ns - this.#span[0]) / (this.#span[1] - this.#span[0]));
-      this.#tell();
-    }
+    this.#stand();
+  }
+
+  /** Put the slider where the replay is, unless somebody is moving it. */
+  #stand() {
+    const progress = this.#job?.progress;
+    if (this.#held || this.#waiting || !progress || !this.#span) return;
+    this.#seek.value = String((progress.position_ns - this.#span[0]) / (this.#span[1] - this.#span[0]));
+    this.#tell();
   }
 
   /** From when to when the data are. @param {ReplayJob} job */
@@ -68,15 +73,20 @@ class PacedControl extends HTMLElement {
 
   /** @param {string} kind @param {unknown} [order] */
   #order(kind, order) {
+    const before = this.#job?.progress;
     this.#held = false;
     this.#waiting += 1;
     this.#orders = this.#orders
-      .then(() => monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order).finally(() => { this.#waiting -= 1; }))
+      .then(() => monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order))
       .then((job) => {
         this.#message.textContent = "";
-        return this.show(job);
+        return this.show({ ...job, progress: this.#job?.progress ?? null }); // an answer does not know yet where that is
       })
-      .catch((error) => { this.#message.textContent = error instanceof Error ? error.message : String(error); });
+      .catch((error) => { this.#message.textContent = error instanceof Error ? error.message : String(error); })
+      .finally(() => {
+        this.#waiting -= 1;
+        if (this.#job?.progress !== before) this.#stand();
+      });
   }
 }
 
