@@ -1,5 +1,6 @@
 """The plots of a machine in a browser: loaded when they are opened, of what is live and of recordings."""
 
+import importlib
 import json
 import re
 from collections.abc import Iterator
@@ -14,6 +15,7 @@ from rotorwatch.records.health import Health
 from rotorwatch.records.windows import SensorFault, UnbalanceVector
 from service.runtime import Runtime
 from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, route_events, violations
+from tests.service.live import ROOT
 from tests.service.monitored import faulty
 from tests.service.replaying import recording
 from tests.service.run_up import BLOCKS
@@ -132,3 +134,11 @@ def test_the_drawing_turns_the_unbalance_with_the_shaft_and_names_the_sensor_at_
         assert angles == pytest.approx([-30.0, 60.0])  # on the screen angles count clockwise
         expect(drawing.locator("g.sensor.data-health")).to_contain_text("y1 ⬢ sensor at fault")
         expect(drawing.locator("g.part", has_text="c_by")).to_contain_text("too little data yet")
+
+
+def test_the_measurement_of_a_plant_still_runs(
+    browser: Browser, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    importlib.import_module("page").plant(browser, 5, 1.0)
+    assert re.fullmatch(r"\| 5 \|.*\| 1, 0 \|\n", capsys.readouterr().out)  # the lines of all, asked for together
