@@ -1,7 +1,7 @@
 """What the page costs: a browser with a plant of many machines, and a monitor with many pages.
 
-Run: ``python benchmarks/page.py`` (about six minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM`` names),
-``--small`` for a minute.
+Run: ``python benchmarks/page.py`` (about eight minutes, with a Chromium, or what ``ROTORWATCH_CHROMIUM`` names),
+``--small`` for three.
 
 Plant: for each number of machines, all in one run, a server tells the page of each machine's health in batches. *Batch*
 is the processor time of the browser's main thread, over the number of batches: reading, elements, style, layout and
