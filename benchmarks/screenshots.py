@@ -8,6 +8,7 @@ import argparse
 import io
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
 
@@ -23,6 +24,8 @@ VIEWS = {
     "alarms": ("alarms", "alarm-history table", 530),
     "why": (f"why/{PLACE}/k_by", "why-view canvas", 1250),
     "recordings": (f"recordings/{PLACE}", "recording-table table", 755),
+    "replay": (f"recordings/{PLACE}", "recording-table table", 1100),
+    "administration": ("administration", "service-load table", 900),
 }
 FAULT = "k_by=-0.25@140"
 WIDTH, MOST_BYTES, PACE = 1280, 150_000, "6"
@@ -55,6 +58,13 @@ def look(one: Monitor, folder: Path) -> None:
             if name == "plant":
                 page.reload()  # lines as they are by now
             page.locator(there).first.wait_for()
+            if name == "replay":
+                page.get_by_role("button", name=re.compile("Choose ten minutes before and after .*k_by")).click()
+                page.get_by_label("Alarm when that has lasted, s").fill("20")
+                page.get_by_role("button", name="Start replay").click()
+                page.locator("replay-parameters canvas").first.wait_for()
+                page.get_by_role("slider", name="Window").focus()
+                page.keyboard.press("End")
             picture(page, folder / f"page-{name}.png", height)
 
 

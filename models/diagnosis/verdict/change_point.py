@@ -87,26 +87,57 @@ def read_changes(windows: Sequence[Stretch], named: Sequence[int], hop_ns: int, 
     others = [at for at in range(len(known)) if at not in first]
     weights, means, variances = [], [], []
     for count in range(min(_MOST, len(others)) + 1):
-        for further in combinations(others, count):
-            basis, scale = np.linalg.qr(whiten[:, [*first, *further]])
-            back = np.linalg.inv(scale)  # from what is seen along the basis to the set's parameters
-            gain = back @ basis.T @ whiten
-            common = gain @ shared @ gain.T
-            unit = float(np.mean(np.diag(back @ back.T)))
-            mine, n = right @ basis, len(first)
-            for spread in (_HELD**2 + float(np.mean(np.diag(common))), _SIZE**2):
-                prior = np.diag([unit / spread, unit / _SIZE**2, 1 / bent])
-                inverse = np.linalg.inv(gram + prior)
-                best = inverse @ mine
-                occam = (n + count) / 2 * np.log(np.linalg.det(inverse) * np.linalg.det(prior))
-                weights.append(before + np.sum(mine * best, axis=(-1, -2)) / 2 + occam + count * np.log(_ODDS))
-                means.append(best[..., 1, :] @ back.T[:, :n])
-                variances.append(inverse[..., 1, 1, None] * np.diag(gain @ own @ gain.T)[:n] + np.diag(common)[:n])
-    weight, every = np.exp(np.array(weights) - np.max(weights))[..., None], np.array(means)
+        sets = np.array([[*first, *further] for further in combinations(others, count)])
+        basis, scale = np.linalg.qr(np.moveaxis(whiten[:, sets], 0, 1))  # (n_sets, m, n), (n_sets, n, n)
+        back = np.linalg.inv(scale)  # from what is seen along the basis to the set's parameters
+        gain = back @ np.swapaxes(basis, -1, -2) @ whiten
+        common, errors = (np.sum(gain @ side * gain, axis=-1) for side in (shared, own))
+        unit = np.mean(np.sum(back**2, axis=-1), axis=-1)
+        spread = np.stack([_HELD**2 + np.mean(common, axis=-1), np.full(unit.size, _SIZE**2)])
+        prior = np.stack(np.broadcast_arrays(unit / spread, unit / _SIZE**2, 1 / bent), axis=-1)
+        fit, best, variance = _fitted(gram, right[:, :, None] @ basis, prior[:, None, None])
+        weights.append(before[:, None] + fit + count * np.log(_ODDS))
+        means.append((best[..., None, :] @ np.swapaxes(back, -1, -2))[..., 0, : len(first)])
+        variances.append(variance[..., None] * errors[:, : len(first)] + common[:, : len(first)])
+    log_weight, every = np.concatenate(weights, axis=-1)[..., None], np.concatenate(means, axis=-2)
+    weight = np.exp(log_weight - np.max(log_weight))
     weight /= weight.sum()
-    mean = np.sum(weight * every, axis=(0, 1, 2))
-    variance = np.sum(weight * (np.array(variances) + (every - mean) ** 2), axis=(0, 1, 2))
-    passed = np.cumsum(weight.sum(axis=(0, 1, 3)))
+    mean = np.sum(weight * every, axis=(0, 1, 2, 3))
+    variance = np.sum(weight * (np.concatenate(variances, axis=-2) + (every - mean) ** 2), axis=(0, 1, 2, 3))
+    passed = np.cumsum(weight.sum(axis=(0, 1, 3, 4)))
     at = np.minimum(np.searchsorted(passed, _QUANTILES), moments.size - 1)
     middle, low, high = (round(moment) for moment in (moments[at] + np.array([0, -0.5, 0.5]) * hop_ns).tolist())
     return Changes(mean, np.sqrt(variance), None if middle < starts[0] else (middle, low, high))
+
+
+def _fitted(gram: FloatArray, right: FloatArray, prior: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit the values before, after and of the mixture, in closed form: the one after is eliminated last.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n_powers, n_moments, 3, 3)
+    right : ndarray, shape (n_powers, n_moments, n_sets, 3, n)
+    prior : ndarray, shape (2, 1, 1, n_sets, 3)
+        Inverse variances of the three.
+
+    Returns
+    -------
+    tuple
+        Log likelihood over that without any values, shape (2, n_powers, n_moments, n_sets); the value after, the same
+        and n; its variance in units of what is seen, without n.
+    """
+    before, after, mixed = 0, 1, 2
+    own = gram[..., None, :, :]
+    pivot = own[..., before, before] + prior[..., before]
+    to_mixed, to_after = own[..., before, mixed] / pivot, own[..., before, after] / pivot
+    mixed_pivot = own[..., mixed, mixed] + prior[..., mixed] - to_mixed * own[..., before, mixed]
+    between = own[..., mixed, after] - to_mixed * own[..., before, after]
+    last = own[..., after, after] + prior[..., after] - to_after * own[..., before, after] - between**2 / mixed_pivot
+    of_before = right[..., before, :]
+    of_mixed = right[..., mixed, :] - to_mixed[..., None] * of_before
+    of_after = right[..., after, :] - to_after[..., None] * of_before - (between / mixed_pivot)[..., None] * of_mixed
+    fit = sum(
+        np.sum(one**2, axis=-1) / by for one, by in ((of_before, pivot), (of_mixed, mixed_pivot), (of_after, last))
+    )
+    occam = right.shape[-1] * (np.sum(np.log(prior), axis=-1) - np.log(pivot * mixed_pivot * last))
+    return (fit + occam) / 2, of_after / last[..., None], 1 / last
