@@ -46,8 +46,8 @@ class WindowAnswers:
                 del self._kept[next(iter(self._kept))]
         with kept.lock:
             late = of_samples and self._clock() - kept.made_s > _SAMPLES_HOLD_S
-            if kept.data is None or late or not data.is_of_same_window(kept.data):
+            if kept.data is None or late or not data.goes_on_from(kept.data, samples=of_samples):
                 kept.made_s = self._clock()
                 kept.body = make().model_dump_json().encode()
-                kept.data = replace(data, blocks=())
+                kept.data = replace(data, blocks=data.blocks[-1:])
             return Response(kept.body, media_type="application/json")

@@ -33,10 +33,16 @@ class LatestData:
     why_not: str = ""  # why it was not evaluated
     blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
 
-    def is_of_same_window(self, other: "LatestData") -> bool:
-        """Whether nothing but blocks came in between."""
-        same = self.window is other.window and self.parameters is other.parameters
-        return same and (self.filled, self.why_not) == (other.filled, other.why_not)
+    def goes_on_from(self, earlier: "LatestData", *, samples: bool) -> bool:
+        """Whether nothing but blocks came in between, and, where samples matter, no gap."""
+        same = self.window is earlier.window and self.parameters is earlier.parameters
+        if not same or (self.filled, self.why_not) != (earlier.filled, earlier.why_not):
+            return False
+        if not samples:
+            return True
+        if not (self.blocks and earlier.blocks):
+            return self.blocks == earlier.blocks
+        return self.blocks[0].start_ns <= earlier.blocks[-1].start_ns
 
 
 class Heading(Identity):

@@ -68,7 +68,8 @@ def play(
             if on_progress is not None:
                 on_progress(_progress(plan, control, time_ns, count))
         else:
-            control.wait_until(None)  # who has paused may still go back
+            if control.paused:
+                control.wait_until(None)  # whoever paused may still go back
         if control.stopped:
             break
         seek_ns = control.take_seek()
