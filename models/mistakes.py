@@ -20,6 +20,7 @@ from models.errors import MachineFileError
 _Model = TypeVar("_Model", bound=BaseModel)
 _Place = tuple[int | str, ...]
 _LONGEST_SHOWN = 80
+_MOST_TOLD = 20
 _TYPES = {
     "float": "a number",
     "int": "a whole number",
@@ -83,6 +84,8 @@ def parse_toml(text: str, place: object) -> dict[str, object]:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise MachineFileError(f"{place}: {_unreadable(str(error), text)}") from error
+    except ValueError as error:
+        raise MachineFileError(f"{place}: a number has too many digits") from error
     except RecursionError as error:
         raise MachineFileError(f"{place}: lists or tables are nested too deeply") from error
 
@@ -131,7 +134,10 @@ def checked(model: type[_Model], fields: object, place: object) -> _Model:
     try:
         return model.model_validate(fields)
     except ValidationError as error:
-        raise MachineFileError("\n".join(f"{place}: {text}" for _, text in mistakes(error, model, fields))) from error
+        told = [text for _, text in mistakes(error, model, fields)]
+        more = error.error_count() - _MOST_TOLD
+        told += [f"and {more} more mistakes"] if more > 0 else []
+        raise MachineFileError("\n".join(f"{place}: {text}" for text in told)) from error
 
 
 def in_folder(model: _Model, folder: Path) -> _Model:
@@ -148,7 +154,7 @@ def in_folder(model: _Model, folder: Path) -> _Model:
 
 
 def mistakes(error: ValidationError, model: type[BaseModel], fields: object = None) -> tuple[tuple[_Place, str], ...]:
-    """What is wrong, mistake by mistake.
+    """What is wrong, mistake by mistake; the first ones, if there are very many.
 
     Parameters
     ----------
@@ -160,7 +166,7 @@ def mistakes(error: ValidationError, model: type[BaseModel], fields: object = No
     tuple of (place, text)
         The place as a path of names and numbers; the text begins with it.
     """
-    found = error.errors(include_url=False)
+    found = error.errors(include_url=False)[:_MOST_TOLD]
     texts: dict[_Place, list[str]] = {}
     meant: set[_Place] = set()
     for one in found:
@@ -381,5 +387,8 @@ def _named(place: _Place, fields: object) -> str:
 def _shown(fault: ErrorDetails) -> str:
     """The value found, as it stands in a file; nothing long, and no address, which may hold a password."""
     value = fault["input"]
-    text = str(value).lower() if isinstance(value, bool) else repr(value)
+    try:
+        text = str(value).lower() if isinstance(value, bool) else repr(value)
+    except ValueError:  # a number of thousands of digits
+        return ""
     return "" if isinstance(value, Mapping) or "://" in text or len(text) > _LONGEST_SHOWN else f" (found {text})"

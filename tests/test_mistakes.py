@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from models.machine import load_machine
+from models.errors import MachineFileError
+from models.machine import load_machine, load_machine_file
 from service.rotorwatch import app as rotorwatch
 from simulator.rotorsim import app as rotorsim
 from simulator.rotortrain import app as rotortrain
@@ -119,3 +120,12 @@ def test_a_mistake_is_told_in_the_words_of_who_made_it(
 def test_there_is_nothing_to_say_about_the_files_before_a_mistake_is_made(ports: dict[str, str]) -> None:
     for kind in ("machine", "settings"):
         assert CliRunner().invoke(rotorwatch, shlex.split(GOOD[kind][0])[1:]).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("number", "told"), [("9" * 5000, "too many digits"), (f"0x{'f' * 5000}", "rate_hz: expected")]
+)
+def test_a_number_of_thousands_of_digits_is_refused(number: str, told: str, tmp_path: Path) -> None:
+    (tmp_path / "machine.toml").write_text(f"rate_hz = {number}\n", encoding="utf-8")
+    with pytest.raises(MachineFileError, match=told):
+        load_machine_file(tmp_path / "machine.toml")

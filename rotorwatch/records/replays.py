@@ -93,7 +93,8 @@ class ReplayRequest(BaseModel):
     machine_file: str | None = Field(
         default=None,
         max_length=100_000,
-        description="offline: text of another machine file, of the machine that was recorded; instead of `machine`",
+        description="offline: text of another machine file, of the machine that was recorded; instead of `machine`. "
+        "What the monitored machine was commissioned with goes with it, trained networks only as `bundle` names them",
         examples=[None],
     )
     machine_file_name: str = Field(

@@ -1,6 +1,7 @@
 """Times are those of the data: streams that came faster than real time, publishers that were started again."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -167,9 +168,9 @@ class Timed(Control):
         super().__init__()
         self.due_s: list[float] = []
 
-    def wait_until(self, deadline_s: float | None) -> bool:
+    def wait_until(self, deadline_s: float | None, on_pause: Callable[[], None] | None = None) -> bool:
         self.due_s.append(deadline_s or 0.0)
-        return super().wait_until(None)
+        return super().wait_until(None, on_pause)
 
     def now_s(self) -> float:
         return 100.0

@@ -271,7 +271,7 @@ def test_what_would_have_been_raised_with_a_machine_file_that_is_sent(client: ht
     assert found.summary.limits["c_bz"].raise_above == 0.8
     assert (found.summary.site, found.summary.machine) == ("demo", "lab")
     with_networks = start(client, machine_file=text, bundle="heavy")
-    assert with_networks.machine == "sent.toml"
+    assert with_networks.machine == "sent.toml@heavy"
     failed = ended(client, with_networks)  # those of another machine
     assert failed.state == "failed"
     assert "trained for another machine" in failed.error
@@ -284,8 +284,11 @@ def test_what_would_have_been_raised_with_a_machine_file_that_is_sent(client: ht
         ({"machine_file": machine_text("heavy")}, 422, "machine_file: of demo/heavy, the recordings are of demo/lab"),
         ({"machine_file": machine_text("lab") + "\n[paths]\n"}, 422, "machine_file: paths: unknown"),
         ({"machine_file": machine_text("lab").replace("rate_hz", "rate hz", 1)}, 422, "machine_file: line "),
-        ({"machine_file": "x = " + "[" * 50_000}, 422, "machine_file: lists or tables are nested too deeply"),
+        ({"machine_file": "x = " + "[\n" * 40_000}, 422, "machine_file: lists or tables are nested too deeply"),
         ({"machine_file": "." * 100_001}, 422, "machine_file: "),
+        ({"machine_file": f"{'a.' * 40_000}a = 1"}, 422, "machine_file: line 1 has 80005 characters, at most 500 are"),
+        ({"machine_file": f"x = [\n{'9' * 400}\n]"}, 422, "machine_file: x: unknown"),
+        ({"machine_file": "\n".join(f"k{n} = 1" for n in range(6000))}, 422, "more mistakes"),
         ({"machine_file": "", "machine": "lab"}, 422, "machine_file: is given beside machine"),
         ({"machine_file": "", "mode": "paced"}, 422, "machine_file: nothing is evaluated"),
         ({"machine_file": machine_text("lab"), "machine_file_name": "../lab.toml"}, 422, "machine_file_name: "),

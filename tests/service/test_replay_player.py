@@ -158,9 +158,10 @@ def test_seeking_stays_within_what_is_replayed(tmp_path: Path) -> None:
 def test_a_paused_replay_says_where_it_was_moved_and_does_not_end_at_the_end(tmp_path: Path) -> None:
     source, control = RecordingSource([tens(tmp_path / "a.mcap", 0, 100)]), Control()
     taker, told = Taker(2.0, control.pause), list[ReplayProgress]()
-    thread = threading.Thread(target=play, args=(source, taker, plan(to_s=10.0), control, told.append))
+    thread = threading.Thread(target=play, args=(source, taker, plan(to_s=10.0), control, told.append), daemon=True)
     thread.start()
-    until(lambda: control.paused, "the pause")
+    until(lambda: bool(told) and told[-1].paused, "the pause")
+    assert told[-1].position_ns == 2 * SECOND
     for place_s in (10, 9):
         control.seek(place_s * SECOND)
         until(partial(lambda place_ns: told[-1].position_ns == place_ns, place_s * SECOND), "the place")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 from scipy.signal import oaconvolve
-from starlette.datastructures import URL
 
 from models.diagnosis.window import WindowStatistics
 from models.machine import Machine
@@ -377,17 +376,19 @@ def test_the_theory_of_a_window_is_computed_once(monkeypatch: pytest.MonkeyPatch
 
 
 def test_an_answer_is_made_once_for_all_who_ask_the_same_of_a_window() -> None:
-    now_s, made = 0.0, 0
+    now_s, made, fails = 0.0, 0, False
     answers, subject = WindowAnswers(lambda: now_s), snapshots_of(LAB)
 
-    def asked(data: LatestData, query: str = "", **of: bool) -> tuple[int, bytes]:
+    def asked(data: LatestData, question: str = "", **of: bool) -> tuple[int, bytes]:
         def make() -> OrbitSnapshot:
             nonlocal made
             made += 1
+            if fails:
+                raise SnapshotError("not now")
             return subject.orbits(data)
 
         before = made
-        body = answers.of(URL(f"http://here/orbits{query}"), data, make, **of).body
+        body = answers.of(question, data, make, **of).body
         return made - before, bytes(body)
 
     data = latest()
@@ -399,13 +400,17 @@ def test_an_answer_is_made_once_for_all_who_ask_the_same_of_a_window() -> None:
     assert asked(replace(data, filled=0.9))[0] == 1
     assert asked(latest(K_BY))[0] == 1
     # Samples come all the time, and what holds them is made once a second.
-    assert [asked(one, "?revolutions=8", of_samples=True)[0] for one in (data, later, data)] == [1, 0, 0]
-    now_s = 1.1
-    assert asked(later, "?revolutions=8", of_samples=True)[0] == 1
-    assert asked(latest(K_BY), "?revolutions=8", of_samples=True)[0] == 1
+    assert [asked(one, "newest", of_samples=True)[0] for one in (data, later, data)] == [1, 0, 0]
+    now_s, fails = 1.1, True
+    for _ in range(2):  # what was made before is no answer any more
+        with pytest.raises(SnapshotError):
+            asked(later, "newest", of_samples=True)
+    fails = False
+    assert asked(later, "newest", of_samples=True)[0] == 1
+    assert asked(latest(K_BY), "newest", of_samples=True)[0] == 1
     assert asked(latest(K_BY))[0] == 0
     for number in range(64):
-        asked(data, f"?revolutions={number}")
+        asked(data, f"{number} revolutions")
     assert asked(latest(K_BY))[0] == 1  # not kept for ever
 
 

@@ -33,16 +33,9 @@ class LatestData:
     why_not: str = ""  # why it was not evaluated
     blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
 
-    def goes_on_from(self, earlier: "LatestData", *, samples: bool) -> bool:
-        """Whether nothing but blocks came in between, and, where samples matter, no gap."""
-        same = self.window is earlier.window and self.parameters is earlier.parameters
-        if not same or (self.filled, self.why_not) != (earlier.filled, earlier.why_not):
-            return False
-        if not samples:
-            return True
-        if not (self.blocks and earlier.blocks):
-            return self.blocks == earlier.blocks
-        return self.blocks[0].start_ns <= earlier.blocks[-1].start_ns
+    def mark(self) -> tuple[object, ...]:
+        """What an answer about the window depends on; short, so that it may be kept."""
+        return None if self.window is None else self.window.end_ns, self.parameters, self.filled, self.why_not
 
 
 class Heading(Identity):

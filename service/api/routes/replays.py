@@ -102,7 +102,7 @@ class ReplayDesk:
             state="running",
             mode=request.mode,
             recordings=request.recordings,
-            machine=request.machine_file_name if sent else machine,
+            machine="@".join(filter(None, (request.machine_file_name, request.bundle))) if sent else machine,
             machine_file_sent=sent,
             changes=request.changes,
             from_ns=request.from_ns,

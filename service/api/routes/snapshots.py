@@ -44,23 +44,18 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         **common,
     )
     def correlations(
-        request: Request,
-        site: SiteName,
-        machine: MachineName,
-        first: _First = _NONE,
-        second: _Second = _NONE,
-        units: _Units = "channel",
+        site: SiteName, machine: MachineName, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
     ) -> Response:
         """Correlation functions of the latest window, measured and as theory predicts them; a few pairs by default."""
         view = found_machine(service, site, machine)
         data = view.latest
-        return answers.of(request.url, data, lambda: view.snapshots.correlations(data, first, second, units))
+        asked = ("correlations", site, machine, tuple(first), tuple(second), units)
+        return answers.of(asked, data, lambda: view.snapshots.correlations(data, first, second, units))
 
     @app.get(
         f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), response_model=SpectrumSnapshot, **common
     )
     def spectra(
-        request: Request,
         site: SiteName,
         machine: MachineName,
         channel: _Channels = _NONE,
@@ -76,15 +71,17 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         if band is not None and not band[0] < band[1]:
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
         data = view.latest
-        return answers.of(request.url, data, lambda: view.snapshots.spectra(data, channel, first, second, band, units))
+        asked = ("spectra", site, machine, tuple(channel), tuple(first), tuple(second), band, units)
+        return answers.of(asked, data, lambda: view.snapshots.spectra(data, channel, first, second, band, units))
 
     @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), response_model=OrbitSnapshot, **common)
     def orbits(
-        request: Request, site: SiteName, machine: MachineName, revolutions: _Revolutions = 0, units: _Units = "channel"
+        site: SiteName, machine: MachineName, revolutions: _Revolutions = 0, units: _Units = "channel"
     ) -> Response:
         """Orbits of the latest window at running speed, and the newest revolutions as measured."""
         view = found_machine(service, site, machine)
         data = view.latest
+        asked = ("orbits", site, machine, revolutions, units)
         return answers.of(
-            request.url, data, lambda: view.snapshots.orbits(data, revolutions, units), of_samples=revolutions > 0
+            asked, data, lambda: view.snapshots.orbits(data, revolutions, units), of_samples=revolutions > 0
         )

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 
 # The main thread must do something now and then: Python runs signal handlers nowhere else.
 _SLICE_S = 0.25
@@ -36,6 +37,11 @@ class Control:
     def paused(self) -> bool:
         """Whether the replay is paused."""
         return self._paused_since_s is not None
+
+    @property
+    def position_ns(self) -> int:
+        """Where the replay is."""
+        return self._position_ns
 
     def now_s(self) -> float:
         """Seconds of a clock that stands still while the replay is paused."""
@@ -82,8 +88,13 @@ class Control:
         with self._changed:
             self._position_ns = position_ns
 
-    def wait_until(self, deadline_s: float | None) -> bool:
+    def wait_until(self, deadline_s: float | None, on_pause: Callable[[], None] | None = None) -> bool:
         """Wait until a moment of `now_s`, or not at all; while paused, wait on.
+
+        Parameters
+        ----------
+        on_pause : callable, optional
+            Called once when the replay is found paused.
 
         Returns
         -------
@@ -93,6 +104,9 @@ class Control:
         with self._changed:
             while not (self._stopped or self._seek_ns is not None):
                 if self._paused_since_s is not None:
+                    if on_pause is not None:
+                        on_pause()
+                        on_pause = None
                     self._changed.wait(_SLICE_S)
                     continue
                 left_s = 0.0 if deadline_s is None else deadline_s - self.now_s()

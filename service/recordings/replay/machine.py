@@ -9,6 +9,8 @@ from models.machine import MachineFile, load_machine_file
 from models.mistakes import changed, checked, parse_toml
 from models.signals.keys import MachineKeys
 
+_LONGEST_LINE = 500
+
 
 def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> Installed:
     """Load the machine file, and what was trained or commissioned, for a recorded machine.
@@ -29,7 +31,11 @@ def choose_machine(keys: MachineKeys, wanted: str | None, changes: str = "") -> 
         If the bundle cannot be used, or the machine needs one that was commissioned.
     """
     if wanted is not None:
-        file, _, name = wanted.partition("@")
+        before, found, name = wanted.partition(".toml@")  # the name of a folder may hold an @ as well
+        if found or before.endswith(".toml"):
+            file = before + found.removesuffix("@")
+        else:
+            file, _, name = wanted.partition("@")
         return install(load_machine_file(file, changes), name or None)
     for path in _shipped_files():
         machine = load_machine_file(path)
@@ -51,6 +57,11 @@ def check_sent(text: str, changes: str, recorded: str) -> None:
         Naming the field, the value found and what was expected; also if it is of another machine than ``site/name``.
     """
     place = "machine_file"
+    for number, line in enumerate(text.splitlines(), start=1):
+        if len(line) > _LONGEST_LINE:  # reading it may take long: as the square of the length
+            raise MachineFileError(
+                f"{place}: line {number} has {len(line)} characters, at most {_LONGEST_LINE} are read"
+            )
     machine = checked(MachineFile, changed(parse_toml(text, place), changes), place)
     if f"{machine.site}/{machine.name}" != recorded:
         raise MachineFileError(f"{place}: of {machine.site}/{machine.name}, the recordings are of {recorded}")

@@ -52,6 +52,11 @@ def play(
     """
     count = 0
     begin_ns: int | None = plan.from_ns
+
+    def tell(at_ns: int) -> None:
+        if on_progress is not None:
+            on_progress(_progress(plan, control, at_ns, count))
+
     control.at(plan.from_ns)
     while begin_ns is not None:
         timetables: dict[str, _Timetable] = {}
@@ -60,26 +65,24 @@ def play(
             if plan.pace is not None:
                 machine = timetables.setdefault(place_of(message.key), _Timetable(plan.pace, time_ns, control.now_s()))
                 due_s = machine.due_s(time_ns)
-            if not control.wait_until(due_s):
+            if not control.wait_until(due_s, lambda: tell(control.position_ns)):
                 break
             control.at(time_ns)
             sink.put(message)
             count += 1
-            if on_progress is not None:
-                on_progress(_progress(plan, control, time_ns, count))
+            tell(time_ns)
         else:
             if control.paused:
-                control.wait_until(None)  # whoever paused may still go back
+                control.wait_until(None, lambda: tell(control.position_ns))  # whoever paused may still go back
         if control.stopped:
             break
         seek_ns = control.take_seek()
         begin_ns = None if seek_ns is None else min(max(seek_ns, plan.from_ns), plan.to_ns)
         if begin_ns is not None:
             control.at(begin_ns)
-            if on_progress is not None:
-                on_progress(_progress(plan, control, begin_ns, count))
-    if on_progress is not None and not control.stopped:
-        on_progress(_progress(plan, control, plan.to_ns - 1, count))
+            tell(begin_ns)
+    if not control.stopped:
+        tell(plan.to_ns - 1)
     return count
 
 

@@ -7,7 +7,8 @@ import "./alarm-list.js";
 /** Alarms of the whole plant: those that are not normal, and the history of one machine. */
 class AlarmsView extends HTMLElement {
   #gone = new AbortController();
-  #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Machine", change: () => this.#show() }));
+  #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Machine", change: () => this.#choose() }));
+  #chosen = "";
   #history = html("div");
   #rights = html("p", { class: "note" });
 
@@ -27,9 +28,14 @@ class AlarmsView extends HTMLElement {
   #offer() {
     this.#rights.textContent = !monitor.connected || monitor.may("operate") ? "" : "You may look: whoever acknowledges or shelves needs the scope operate.";
     if (this.#choice.options.length === monitor.machines.size) return;
-    const chosen = this.#choice.value || standing()[0]?.place;
+    const chosen = this.#chosen || standing()[0]?.place; // machines are heard of one after the other
     this.#choice.replaceChildren(...[...monitor.machines.keys()].sort().map((place) => html("option", { value: place, selected: place === chosen }, place)));
     if (this.#history.firstElementChild?.getAttribute("place") !== this.#choice.value) this.#show();
+  }
+
+  #choose() {
+    this.#chosen = this.#choice.value;
+    this.#show();
   }
 
   #show() {

@@ -4,6 +4,8 @@
 
 /** Machines that everything may be asked of at once. */
 const MOST = 64;
+/** Characters of what has been heard that are sent along: it names every machine, and an address may not be any length. Health is told anew without, too. */
+const LONGEST = 4000;
 
 /** The monitor's stream of events for several listeners: who comes later is told first what was told last of each machine, and of the machine that a listener looks at everything. */
 export class EventStream {
@@ -35,6 +37,7 @@ export class EventStream {
 
   /** Be told everything of this machine. @param {Listener} listener @param {string} place */
   look(listener, place) {
+    this.#listeners.delete(listener); // to the end: of very many places, the latest are told in full
     this.#listeners.set(listener, place);
     if (!this.#source || !place || this.#inFull.has(place)) return;
     this.#source.close();
@@ -55,9 +58,9 @@ export class EventStream {
   }
 
   #begin() {
-    this.#inFull = new Set([...this.#listeners.values()].filter(Boolean).slice(-MOST));
+    this.#inFull = new Set([...new Set([...this.#listeners.values()].filter(Boolean))].slice(-MOST));
     const asked = new URLSearchParams([["detail", "overview"], ...[...this.#inFull].map((place) => ["in_full", place])]);
-    if (this.#heard) asked.set("last_event_id", this.#heard);
+    if (this.#heard && this.#heard.length <= LONGEST) asked.set("last_event_id", this.#heard);
     const source = new EventSource(`/api/v1/events?${asked}`);
     this.#source = source;
     for (const kind of /** @type {const} */ (["start", "overview", "health", "alarm"]))

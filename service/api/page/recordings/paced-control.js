@@ -73,16 +73,20 @@ class PacedControl extends HTMLElement {
 
   /** @param {string} kind @param {unknown} [order] */
   #order(kind, order) {
-    const before = this.#job?.progress;
+    let before = this.#job?.progress;
     this.#held = false;
     this.#waiting += 1;
     this.#orders = this.#orders
       .then(() => monitor.order(`${API}/replays/${this.#job?.id}/${kind}`, order))
       .then((job) => {
         this.#message.textContent = "";
-        return this.show({ ...job, progress: this.#job?.progress ?? null }); // an answer does not know yet where that is
+        const { state, progress } = this.#job ?? job; // an answer does not know yet where that is
+        return state === "running" || state === "paused" ? this.show({ ...job, progress }) : undefined;
       })
-      .catch((error) => { this.#message.textContent = error instanceof Error ? error.message : String(error); })
+      .catch((error) => {
+        this.#message.textContent = error instanceof Error ? error.message : String(error);
+        before = undefined;
+      })
       .finally(() => {
         this.#waiting -= 1;
         if (this.#job?.progress !== before) this.#stand();
