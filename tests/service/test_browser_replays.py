@@ -116,7 +116,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
         page.get_by_label("Alert when a parameter changed by more than, %").fill("80")
         page.get_by_label("Other lines").fill("alarms.limits.danger_above = 0.9")
         text = Path(runtime.settings.machines[0].file).read_bytes()
-        sent = page.get_by_label("Or another one of this computer")
+        sent = page.get_by_label("Or a file from this computer")
         sent.set_input_files({"name": "calm.toml", "mimeType": "application/toml", "buffer": text})
         expect(page.get_by_label(re.compile("^Machine file"))).to_be_disabled()
         kept(page, "replay-order-file")

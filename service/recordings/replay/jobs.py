@@ -47,7 +47,7 @@ class JobPlan:
     job: ReplayJob  # what the API says of it; id, state, times and results are filled in
     arguments: tuple[str, ...]  # of ``rotorwatch replay``: files and options other than those below
     machine_file: str = ""  # text of a machine file that was sent
-    bundle: str | None = None  # what goes with that
+    bundle: str | None = None  # networks, or what was commissioned, that it is evaluated with
 
 
 class ReplayJobs:

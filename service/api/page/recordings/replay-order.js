@@ -31,7 +31,7 @@ class ReplayOrder extends HTMLElement {
     lay(
       this.#offline,
       html("label", {}, "Machine file", this.#machine),
-      html("label", {}, "Or another one of this computer (TOML)", this.#file),
+      html("label", {}, "Or a file from this computer (TOML)", this.#file),
       html("label", {}, "Alert when a parameter changed by more than, %", this.#raise),
       html("label", {}, "Alarm when that has lasted, s", this.#delay),
       html("label", { class: "lines" }, "Other lines instead of the machine file's, one each", this.#lines),
