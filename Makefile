@@ -27,7 +27,9 @@ export MALLOC_TRIM_THRESHOLD_ := 268435456
 # Tests start many programs; what they import is compiled once.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: setup demo test quick long lint types contracts tests format wheels floors train clean
+BROWSERS := chromium chromium-browser google-chrome google-chrome-stable chrome
+
+.PHONY: setup demo test quick long lint types contracts browser tests format wheels floors train clean
 
 setup: $(READY)
 
@@ -62,7 +64,16 @@ types: $(READY)
 contracts: $(READY)
 	$(BIN)/lint-imports
 
-tests: $(READY)
+# The tests of the page need a real one; Debian's is installed where it may be.
+browser:
+	@for one in "$$ROTORWATCH_CHROMIUM" $(BROWSERS); do command -v "$$one" >/dev/null && exit 0; done; \
+	if test "$$(id -u)" = 0 && command -v apt-get >/dev/null; then \
+		echo "installing Chromium, for the tests of the page ..."; \
+		(timeout 60 apt-get update && timeout 300 apt-get install --yes --no-install-recommends chromium) >/dev/null 2>&1 && exit 0; \
+	fi; \
+	echo "NO BROWSER: tests/service/test_browser*.py are left out; install Chromium, or name one in ROTORWATCH_CHROMIUM"
+
+tests: $(READY) browser
 	$(BIN)/pytest -n $(WORKERS)
 
 # These compute more than they wait.
