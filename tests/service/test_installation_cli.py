@@ -101,7 +101,9 @@ def test_the_doctor_says_what_arrives(tmp_path: Path) -> None:
         done = run("doctor", "--machine", str(tmp_path / "fan.toml"), "--listen", address, "--seconds", "2")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "sampling rate 2560 Hz, expected 2560" in done.stdout
-    assert "DE-H 0.057" in done.stdout
+    # Of however many blocks arrived: a busy computer gives fewer, and noise does the rest.
+    said = float(done.stdout.split("DE-H ")[1].split()[0])
+    assert said == pytest.approx(np.hypot(0.04 / np.sqrt(2), 0.05), rel=0.05)
     assert "zone" in done.stdout
 
 
