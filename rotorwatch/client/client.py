@@ -263,13 +263,31 @@ class Client:
     # What the monitor holds now
 
     def correlations(
-        self, place: str, pairs: Sequence[tuple[str, str]] = (), *, units: Units = "channel"
+        self,
+        place: str,
+        pairs: Sequence[tuple[str, str]] = (),
+        *,
+        units: Units = "channel",
+        recordings: Sequence[str] = (),
+        replay: str | None = None,
+        until_ns: int | None = None,
     ) -> CorrelationSnapshot:
-        """Correlation functions of the latest window, measured and as theory predicts them."""
-        first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
-        return self._get(CorrelationSnapshot, place, "correlations", first=first, second=second, units=units)
+        """Correlation functions of a window, measured and as theory predicts them.
 
-    def spectra(
+        Parameters
+        ----------
+        recordings : sequence of str
+            File names of recordings of the machine, instead of what is live.
+        replay : str, optional
+            Id of a replay of the machine, instead of its recordings: theory is that of what it read.
+        until_ns : int, optional
+            The window of them that ends then; the last one without it.
+        """
+        first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+        wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
+        return self._get(CorrelationSnapshot, place, "correlations", first=first, second=second, units=units, **wanted)
+
+    def spectra(  # noqa: PLR0913  # what may be asked for
         self,
         place: str,
         channels: Sequence[str] = (),
@@ -278,15 +296,29 @@ class Client:
         from_hz: float | None = None,
         to_hz: float | None = None,
         units: Units = "channel",
+        recordings: Sequence[str] = (),
+        replay: str | None = None,
+        until_ns: int | None = None,
     ) -> SpectrumSnapshot:
-        """Power spectral densities of the latest window, cross-spectra of the pairs, and their theory."""
+        """Power spectral densities of a window, live or as `correlations` has it, cross-spectra and theory."""
         first, second = [pair[0] for pair in pairs], [pair[1] for pair in pairs]
         chosen: dict[str, _Parameter] = {"channel": channels, "first": first, "second": second, "units": units}
-        return self._get(SpectrumSnapshot, place, "spectra", from_hz=from_hz, to_hz=to_hz, **chosen)
+        wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
+        return self._get(SpectrumSnapshot, place, "spectra", from_hz=from_hz, to_hz=to_hz, **chosen, **wanted)
 
-    def orbits(self, place: str, *, revolutions: int = 0, units: Units = "channel") -> OrbitSnapshot:
-        """Orbits of the latest window at running speed, and some of the newest revolutions as measured."""
-        return self._get(OrbitSnapshot, place, "orbits", revolutions=revolutions, units=units)
+    def orbits(
+        self,
+        place: str,
+        *,
+        revolutions: int = 0,
+        units: Units = "channel",
+        recordings: Sequence[str] = (),
+        replay: str | None = None,
+        until_ns: int | None = None,
+    ) -> OrbitSnapshot:
+        """Orbits at running speed of a window, live or as `correlations` has it, and some revolutions as measured."""
+        wanted: dict[str, _Parameter] = {"recording": recordings, "replay": replay, "until_ns": until_ns}
+        return self._get(OrbitSnapshot, place, "orbits", revolutions=revolutions, units=units, **wanted)
 
     # What happens
 

@@ -1,4 +1,4 @@
-"""Snapshots of a live machine.
+"""Snapshots of a machine: of what is live, or of a window that was recorded.
 
 What has the unit of a channel, or of two channels' product, says in `unit` which that is. Arrays that belong together
 have one length, which their descriptions name. Numbers have six significant digits; null stands for what is not known.
@@ -93,7 +93,7 @@ class CorrelationPair(Record):
 
 
 class CorrelationSnapshot(Record):
-    """Correlation functions of the latest window, measured and predicted."""
+    """Correlation functions of a window, measured and predicted."""
 
     site: Site
     machine: Name
@@ -164,7 +164,7 @@ class CrossSpectrum(Record):
 
 
 class SpectrumSnapshot(Record):
-    """Power spectral densities of the latest window, measured and predicted."""
+    """Power spectral densities of a window, measured and predicted."""
 
     site: Site
     machine: Name

@@ -27,6 +27,7 @@ from service.api.routes.service import add_service_routes
 from service.api.routes.session import add_session_routes
 from service.api.routes.snapshots import add_snapshot_routes
 from service.api.routes.tokens import add_token_routes
+from service.api.samples import SampleReader
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
@@ -40,7 +41,7 @@ _TAGS = [
     {"name": "history", "description": "What has happened and was read, and who asked for what."},
     {
         "name": "snapshots",
-        "description": "What the monitor holds now: correlations, spectra, orbits; and the values of plots.",
+        "description": "What the monitor holds now, or what was recorded: correlations, spectra, orbits, plots.",
     },
     {"name": "events", "description": "What happens, as it happens."},
     {"name": "recordings", "description": "Recorded streams."},
@@ -94,8 +95,9 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
     _add_machine_routes(app, service, guard)
     add_history_routes(app, service, guard)
     add_operation_routes(app, service, guard)
-    add_snapshot_routes(app, service, guard)
-    add_plot_routes(app, service, guard)
+    reader = SampleReader(service)
+    add_snapshot_routes(app, service, reader, guard)
+    add_plot_routes(app, service, reader, guard)
     add_event_routes(app, service, guard)
     add_recording_routes(app, service.catalogue, guard)
     add_replay_routes(app, service.replays, guard)

@@ -21,7 +21,7 @@ from service.analysis.past import Past
 from service.analysis.recorded import Sampled
 from service.analysis.snapshots.run_up import centreline_series, vector_series
 from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
-from service.api.routes import plots
+from service.api import samples
 from service.runtime import Runtime
 from tests.service.live import LAB, START_NS
 from tests.service.monitored import PLACE, answered, client, faulty, problem
@@ -186,10 +186,10 @@ def test_recordings_are_read_for_one_at_a_time_and_not_too_many(
 ) -> None:
     path = f"{PLACE}/waterfalls?recording=run-up.mcap"
     with monkeypatch.context() as patched:
-        patched.setattr(plots, "_MOST_BYTES", 1000)
+        patched.setattr(samples, "_MOST_BYTES", 1000)
         assert "expected at most" in problem(http.get(path), 422).detail
-    monkeypatch.setattr(plots, "_PATIENCE_S", 0.01)
-    with plots._ONE_AT_A_TIME:
+    monkeypatch.setattr(samples, "_PATIENCE_S", 0.01)
+    with samples._ONE_AT_A_TIME:
         assert "for somebody else" in problem(http.get(path), 503).detail
     assert answered(http.get(path), WaterfallSnapshot).rows
 

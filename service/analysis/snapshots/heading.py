@@ -32,6 +32,7 @@ class LatestData:
     parameters: tuple[Parameter, ...] = ()
     why_not: str = ""  # why it was not evaluated
     blocks: tuple[SampleBlock, ...] = ()  # the newest blocks, without a gap
+    lacking: str = ""  # why there is no window, where it is not that one is still filling
 
     def mark(self) -> tuple[object, ...]:
         """What an answer about the window depends on; short, so that it may be kept."""
@@ -62,6 +63,8 @@ def heading(subject: Subject, data: LatestData) -> Heading:
 
 def no_window(machine: MachineFile, data: LatestData) -> str:
     """Why nothing can be shown: before the first window is full, or where only levels are watched."""
+    if data.lacking:
+        return data.lacking
     if data.window is not None:
         return f"{machine.site}/{machine.name}: only levels are watched at the places of its channels"
     return (

@@ -1,8 +1,6 @@
 """Values of plots over HTTP: of the newest samples, the history, or recordings."""
 
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import FastAPI, HTTPException, Query
@@ -17,35 +15,23 @@ from rotorwatch.records.plots import (
 )
 from service.access.guard import Guard
 from service.access.problems import responses
-from service.analysis.held import Held
 from service.analysis.past import Past
-from service.analysis.recorded import Recorded, Sampled
+from service.analysis.recorded import Sampled
 from service.analysis.snapshots.channels import SnapshotError, chosen_channels
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.analysis.snapshots.run_up import centreline_series, vector_series
 from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
-from service.api.routes.recordings import found_recording
+from service.api.samples import Chosen, ChosenSamples, ChosenWindow, Recordings, SampleReader
 from service.api.views import PLACE, MachineName, ServiceView, SinceNs, SiteName, UntilNs, found_machine
-from service.recordings.replay.source import RecordingSource
 from service.stream.worker import MachineWorker
 
-_MOST_BYTES = 600_000_000
 _MOST_REPORTS = 400
-_PATIENCE_S = 10.0
-_ONE_AT_A_TIME = threading.Lock()
-_NO_SAMPLES = "no samples have come in"
+_SOON_S = 120.0
+"""Before the end of a time that was chosen: the newest revolutions and seconds are in it."""
 _NO_ANGLE = "the shaft angle is not measured (keyphasor), and without it vibration has no phase"
 
 _NONE: list[str] = []
 
-_Recordings = Annotated[
-    list[Annotated[str, Query(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap$")]],
-    Query(
-        alias="recording",
-        max_length=12,
-        description="file name of a recording of this machine to read; may be repeated",
-    ),
-]
 _Channels = Annotated[
     list[str], Query(alias="channel", max_length=64, description="by name; may be repeated; all displacements without")
 ]
@@ -64,42 +50,20 @@ _Values = TypeVar("_Values", WaveformSnapshot, FullSpectrumSnapshot, WaterfallSn
 class _Data:
     """What values are made of: the newest samples, recordings, or the history of a machine."""
 
-    def __init__(self, service: ServiceView) -> None:
-        self._service = service
-
-    @contextmanager
-    def _samples(self, view: MachineWorker, names: list[str]) -> Iterator[Sampled]:
-        """Samples of recordings, which are read for one caller at a time; without names the newest."""
-        if not names:
-            if not view.latest.blocks:
-                raise RotorwatchError(_NO_SAMPLES)
-            yield Held(view.machine, view.latest.blocks)
-            return
-        place = f"{view.machine.site}/{view.machine.name}"
-        found = [found_recording(self._service.catalogue, f"{place}/{name}") for name in dict.fromkeys(names)]
-        size = sum(one.size_bytes for one in found)
-        if size > _MOST_BYTES:
-            most = f"expected at most {_MOST_BYTES / 1e6:.0f} MB at once"
-            raise HTTPException(422, f"recording: {size / 1e6:.0f} MB, {most}")
-        if not _ONE_AT_A_TIME.acquire(timeout=_PATIENCE_S):
-            raise HTTPException(503, "recordings are being read for somebody else; ask again")
-        try:
-            source = RecordingSource([one.path for one in found])
-            keys = source.machine(place)
-            yield Recorded(source, keys, *source.between(None, None, keys))
-        finally:
-            _ONE_AT_A_TIME.release()
+    def __init__(self, reader: SampleReader) -> None:
+        self._reader = reader
 
     def of_samples(
         self,
         view: MachineWorker,
-        names: list[str],
+        chosen: Chosen,
         make: Callable[[Sampled], _Values],
         without: Callable[[str], _Values],
+        reach_s: float | None = None,
     ) -> _Values:
         """What is made of samples; where there is nothing to make it of, why."""
         try:
-            with self._samples(view, names) as data:
+            with self._reader.samples(view, chosen, reach_s) as data:
                 return make(data)
         except SnapshotError:
             raise
@@ -116,16 +80,16 @@ class _Data:
     ) -> _Values:
         """What is made of recordings, or without names of the history, every so many windows of a long time."""
         if names:
-            return self.of_samples(view, names, make, without)
+            return self.of_samples(view, Chosen(tuple(names), None, *between), make, without)
         try:
             return make(Past.of(view.machine, view.history.report_log, *between, _MOST_REPORTS))
         except RotorwatchError as error:
             return without(str(error))
 
 
-def add_plot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+def add_plot_routes(app: FastAPI, service: ServiceView, reader: SampleReader, guard: Guard) -> None:
     """Add the routes."""
-    data = _Data(service)
+    data = _Data(reader)
     common: dict[str, Any] = {"tags": ["snapshots"], "dependencies": [guard.read]}
     _add_sample_routes(app, service, data, common)
     _add_speed_routes(app, service, data, common)
@@ -136,57 +100,59 @@ def _add_sample_routes(app: FastAPI, service: ServiceView, data: _Data, common: 
     def waveforms(
         site: SiteName,
         machine: MachineName,
+        chosen: ChosenWindow,
         channel: _Channels = _NONE,
         revolutions: Annotated[int, Query(ge=1, le=MOST_REVOLUTIONS, description="newest revolutions to show")] = 8,
-        recording: _Recordings = _NONE,
     ) -> WaveformSnapshot:
         """The newest revolutions of channels, sample by sample, with the phase reference's pulses."""
         view = found_machine(service, site, machine)
         names = [one.name for one in chosen_channels(view.machine, channel)]
         window = view.latest.window
-        speed = None if window is None or recording else window.speed_rad_s
+        speed = None if window is None or chosen.recorded else window.speed_rad_s
         return data.of_samples(
             view,
-            recording,
+            chosen,
             lambda found: waveform_snapshot(found, found.channels(names), revolutions, speed),
-            lambda why: WaveformSnapshot(site=site, machine=machine, source=_source(recording), reason=why),
+            lambda why: WaveformSnapshot(site=site, machine=machine, source=_source(chosen), reason=why),
+            _SOON_S,
         )
 
     @app.get(f"{PLACE}/full-spectra", responses=responses(FullSpectrumSnapshot, 404, 422), **common)
-    def full_spectra(site: SiteName, machine: MachineName, recording: _Recordings = _NONE) -> FullSpectrumSnapshot:
+    def full_spectra(site: SiteName, machine: MachineName, chosen: ChosenWindow) -> FullSpectrumSnapshot:
         """Full spectra of the newest seconds: forward precession and reverse, at each place with two displacements."""
         view = found_machine(service, site, machine)
         return data.of_samples(
             view,
-            recording,
+            chosen,
             full_spectrum_snapshot,
-            lambda why: FullSpectrumSnapshot(site=site, machine=machine, source=_source(recording), reason=why),
+            lambda why: FullSpectrumSnapshot(site=site, machine=machine, source=_source(chosen), reason=why),
+            _SOON_S,
         )
 
     @app.get(f"{PLACE}/waterfalls", responses=responses(WaterfallSnapshot, 404, 422), **common)
     def waterfalls(
         site: SiteName,
         machine: MachineName,
+        chosen: ChosenSamples,
         channel: Annotated[
             str | None, Query(max_length=64, description="by name; the first that vibrates without")
         ] = None,
         over: Annotated[Literal["time", "speed"], Query(description="what the rows go over")] = "time",
-        recording: _Recordings = _NONE,
     ) -> WaterfallSnapshot:
         """Spectra of one channel, one after the other, over time or speed."""
         view = found_machine(service, site, machine)
-        chosen = chosen_channels(view.machine, [] if channel is None else [channel])
+        shown = chosen_channels(view.machine, [] if channel is None else [channel])
 
         def made(found: Sampled) -> WaterfallSnapshot:
-            if not chosen:
+            if not shown:
                 raise RotorwatchError("no channel measures a vibration")
-            return waterfall_snapshot(found, found.channels([chosen[0].name])[0], over)
+            return waterfall_snapshot(found, found.channels([shown[0].name])[0], over)
 
         return data.of_samples(
             view,
-            recording,
+            chosen,
             made,
-            lambda why: WaterfallSnapshot(site=site, machine=machine, source=_source(recording), over=over, reason=why),
+            lambda why: WaterfallSnapshot(site=site, machine=machine, source=_source(chosen), over=over, reason=why),
         )
 
 
@@ -201,7 +167,7 @@ def _add_speed_routes(app: FastAPI, service: ServiceView, data: _Data, common: d
         until_ns: UntilNs = None,
         revolutions: _EachRevolutions = 8,
         slow_roll_rpm: _SlowRoll = None,
-        recording: _Recordings = _NONE,
+        recording: Recordings = _NONE,
     ) -> VectorSeries:
         """Amplitude and phase at an order over time and speed (Bode, polar), from the history or recordings."""
         view = found_machine(service, site, machine)
@@ -225,7 +191,7 @@ def _add_speed_routes(app: FastAPI, service: ServiceView, data: _Data, common: d
         machine: MachineName,
         since_ns: SinceNs = None,
         until_ns: UntilNs = None,
-        recording: _Recordings = _NONE,
+        recording: Recordings = _NONE,
     ) -> CentrelineSeries:
         """Where the shaft was on average, over time and speed, from the history or recordings."""
         view = found_machine(service, site, machine)
@@ -239,8 +205,8 @@ def _add_speed_routes(app: FastAPI, service: ServiceView, data: _Data, common: d
         )
 
 
-def _source(recording: list[str]) -> Literal["newest samples", "recordings"]:
-    return "recordings" if recording else "newest samples"
+def _source(chosen: Chosen) -> Literal["newest samples", "recordings"]:
+    return "recordings" if chosen.recorded else "newest samples"
 
 
 def _past(recording: list[str]) -> Literal["history", "recordings"]:

@@ -11,9 +11,11 @@ from fastapi.responses import StreamingResponse
 from pydantic import BaseModel
 
 from models.commissioning.commissioned import FILE as COMMISSIONED
-from models.errors import MachineFileError
+from models.commissioning.commissioned import Installed
+from models.errors import MachineFileError, RotorwatchError
 from models.machine import load_machine_file
 from models.mistakes import changed
+from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings, is_loopback
 from rotorwatch.records.alarms import AlarmCloudEvent
 from rotorwatch.records.example import example
@@ -32,11 +34,14 @@ from service.access.problems import problem_responses, responses
 from service.api.routes.recordings import found_recording
 from service.recordings.catalogue import Catalogue
 from service.recordings.replay.jobs import REPLAYS, JobPlan, ReplayJobError, ReplayJobs, TooManyReplaysError, now_ns
-from service.recordings.replay.machine import check_sent, is_shipped_bundle, is_shipped_machine
+from service.recordings.replay.machine import check_sent, choose_machine, is_shipped_bundle, is_shipped_machine
 from service.settings.service import MachineEntry, ServiceSettings
 
 _PLACE = "/api/v1/replays"
 _JOB = f"{_PLACE}/{{replay_id}}"
+_END = re.compile(r'"end_ns":(\d+)')
+_SAME_NS = 1000
+"""Numbers of JavaScript hold times of today to 256 ns."""
 _LOOK_S = 0.25
 _QUIET_S = 15.0
 _UNSPECIFIED = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}  # noqa: S104  # what to connect to, nothing listens there
@@ -130,6 +135,39 @@ class ReplayDesk:
             raise HTTPException(429, str(error)) from error
         except ReplayJobError as error:
             raise HTTPException(503, str(error)) from error
+
+    def job(self, replay_id: str) -> ReplayJob:
+        """One replay.
+
+        Raises
+        ------
+        HTTPException
+            404 if there is none.
+        """
+        return _job(self, replay_id)
+
+    def installed(self, job: ReplayJob) -> Installed:
+        """What an offline replay is evaluated with.
+
+        Raises
+        ------
+        HTTPException
+            409 if that cannot be read any more.
+        """
+        keys = MachineKeys(*job.recordings[0].split("/")[:2])
+        sent = None if self.jobs is None else self.jobs.machine_file(job.id)
+        try:
+            return choose_machine(keys, sent or job.machine, "\n".join(job.changes))
+        except RotorwatchError as error:  # where the file is concerns nobody who asks over HTTP
+            raise HTTPException(409, f"what replay {job.id} was evaluated with cannot be read any more") from error
+
+    def report(self, job: ReplayJob, end_ns: int) -> Report | None:
+        """What an offline replay found in the window that ends at a time, which may be rounded to a microsecond."""
+        for message in _messages(None if self.jobs is None else self.jobs.results(job.id), "/report"):
+            end = _END.search(message)
+            if end is not None and abs(int(end[1]) - end_ns) < _SAME_NS:
+                return Report.model_validate_json(message)
+        return None
 
     def close(self) -> None:
         """End every replay."""

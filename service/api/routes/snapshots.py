@@ -1,4 +1,4 @@
-"""What the monitor holds now, over HTTP: correlations and spectra beside theory, and orbits."""
+"""Windows over HTTP, the latest one or one that was recorded: correlations and spectra beside theory, and orbits."""
 
 from typing import Annotated, Any
 
@@ -11,6 +11,7 @@ from service.access.problems import problem_answer, responses
 from service.analysis.snapshots.channels import SnapshotError
 from service.analysis.snapshots.orbit import MOST_REVOLUTIONS
 from service.api.answers import WindowAnswers
+from service.api.samples import ChosenWindow, SampleReader
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
 
 _NONE: list[str] = []
@@ -27,7 +28,7 @@ _Revolutions = Annotated[
 ]
 
 
-def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> None:
+def add_snapshot_routes(app: FastAPI, service: ServiceView, reader: SampleReader, guard: Guard) -> None:
     """Add the routes."""
 
     @app.exception_handler(SnapshotError)
@@ -44,13 +45,17 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         **common,
     )
     def correlations(
-        site: SiteName, machine: MachineName, first: _First = _NONE, second: _Second = _NONE, units: _Units = "channel"
+        site: SiteName,
+        machine: MachineName,
+        chosen: ChosenWindow,
+        first: _First = _NONE,
+        second: _Second = _NONE,
+        units: _Units = "channel",
     ) -> Response:
-        """Correlation functions of the latest window, measured and as theory predicts them; a few pairs by default."""
-        view = found_machine(service, site, machine)
-        data = view.latest
-        asked = ("correlations", site, machine, tuple(first), tuple(second), units)
-        return answers.of(asked, data, lambda: view.snapshots.correlations(data, first, second, units))
+        """Correlation functions of the latest window, or one that was recorded, and theory; a few pairs by default."""
+        shown, data = reader.window(found_machine(service, site, machine), chosen)
+        asked = ("correlations", site, machine, chosen, tuple(first), tuple(second), units)
+        return answers.of(asked, data, lambda: shown.correlations(data, first, second, units))
 
     @app.get(
         f"{PLACE}/spectra", responses=responses(SpectrumSnapshot, 404, 422), response_model=SpectrumSnapshot, **common
@@ -58,6 +63,7 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
     def spectra(
         site: SiteName,
         machine: MachineName,
+        chosen: ChosenWindow,
         channel: _Channels = _NONE,
         first: _First = _NONE,
         second: _Second = _NONE,
@@ -65,23 +71,24 @@ def add_snapshot_routes(app: FastAPI, service: ServiceView, guard: Guard) -> Non
         to_hz: Annotated[float | None, Query(ge=0, le=1e6, description="only frequencies up to here")] = None,
         units: _Units = "channel",
     ) -> Response:
-        """Power spectral densities of the latest window, cross-spectra of the pairs asked for, and their theory."""
+        """Power spectral densities of the latest window, or one that was recorded, cross-spectra, and theory."""
         view = found_machine(service, site, machine)
         band = None if from_hz is None and to_hz is None else (from_hz or 0.0, 1e6 if to_hz is None else to_hz)
         if band is not None and not band[0] < band[1]:
             raise HTTPException(422, f"to_hz: {band[1]:g} is not above from_hz {band[0]:g}")
-        data = view.latest
-        asked = ("spectra", site, machine, tuple(channel), tuple(first), tuple(second), band, units)
-        return answers.of(asked, data, lambda: view.snapshots.spectra(data, channel, first, second, band, units))
+        shown, data = reader.window(view, chosen)
+        asked = ("spectra", site, machine, chosen, tuple(channel), tuple(first), tuple(second), band, units)
+        return answers.of(asked, data, lambda: shown.spectra(data, channel, first, second, band, units))
 
     @app.get(f"{PLACE}/orbits", responses=responses(OrbitSnapshot, 404, 422), response_model=OrbitSnapshot, **common)
     def orbits(
-        site: SiteName, machine: MachineName, revolutions: _Revolutions = 0, units: _Units = "channel"
+        site: SiteName,
+        machine: MachineName,
+        chosen: ChosenWindow,
+        revolutions: _Revolutions = 0,
+        units: _Units = "channel",
     ) -> Response:
-        """Orbits of the latest window at running speed, and the newest revolutions as measured."""
-        view = found_machine(service, site, machine)
-        data = view.latest
-        asked = ("orbits", site, machine, revolutions, units)
-        return answers.of(
-            asked, data, lambda: view.snapshots.orbits(data, revolutions, units), of_samples=revolutions > 0
-        )
+        """Orbits at running speed of the latest window, or one that was recorded, and revolutions as measured."""
+        shown, data = reader.window(found_machine(service, site, machine), chosen)
+        asked = ("orbits", site, machine, chosen, revolutions, units)
+        return answers.of(asked, data, lambda: shown.orbits(data, revolutions, units), of_samples=revolutions > 0)

@@ -126,6 +126,12 @@ class ReplayJobs:
             found = self._jobs.get(job_id)
         return None if found is None else found.folder / _RESULTS
 
+    def machine_file(self, job_id: str) -> str | None:
+        """Machine file that was sent with a job, where it was put, with what it is evaluated with; None if none was."""
+        with self._lock:
+            found = self._jobs.get(job_id)
+        return None if found is None else found.machine_file
+
     def order(self, job_id: str, *orders: str) -> ReplayJob | None:
         """Hand orders to a job's process, see `service.recordings.replay.console`; one that has ended hears none."""
         with self._lock:
@@ -175,6 +181,8 @@ class _Job:
         self._lock = threading.Lock()
         self._stop_asked = False
         self._view = plan.job
+        bundle = "" if plan.bundle is None else f"@{plan.bundle}"
+        self.machine_file = f"{folder / _MACHINE}{bundle}" if plan.machine_file else None
         with (folder / _MESSAGES).open("wb") as messages:
             self._process = subprocess.Popen(  # noqa: S603  # our own program; every argument is checked by the caller
                 self._command(plan, nice),
@@ -228,8 +236,8 @@ class _Job:
     def _command(self, plan: JobPlan, nice: int) -> Sequence[str]:
         command = [sys.executable, "-m", "service.rotorwatch", "replay", *plan.arguments]
         command += ["--progress", "json", "--control", "--nice", str(nice)]
-        if plan.machine_file:
-            command += ["--machine", f"{self.folder / _MACHINE}{'' if plan.bundle is None else f'@{plan.bundle}'}"]
+        if self.machine_file is not None:
+            command += ["--machine", self.machine_file]
         return command + (["--out", str(self.folder / _RESULTS)] if plan.job.mode == "offline" else [])
 
     def _listen(self) -> None:

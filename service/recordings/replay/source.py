@@ -56,6 +56,10 @@ class RecordingSource:
         """Files in time order."""
         return tuple(file.path for file in self._files)
 
+    def paths_between(self, from_ns: int | None, to_ns: int | None) -> tuple[Path, ...]:
+        """Files that have data between two times, in time order."""
+        return tuple(file.path for file in self._files if self._touches(file, None, from_ns, to_ns))
+
     @property
     def keys(self) -> frozenset[str]:
         """Every key that occurs."""

@@ -1,0 +1,104 @@
+"""A window of recorded samples, as the monitor held it when they were live."""
+
+from collections import deque
+
+import numpy as np
+
+from models.diagnosis.moments import Plan, plan_for
+from models.diagnosis.window import SlidingWindow
+from models.errors import RotorwatchError
+from models.machine import MachineFile
+from models.signals.block import SampleBlock
+from models.signals.channels import ChannelDescriptor
+from rotorwatch.records.health import Report
+from service.analysis.recorded import Recorded
+from service.analysis.revolutions import Excerpt
+from service.analysis.snapshots.heading import LatestData
+from service.recordings.replay.source import RecordingSource
+
+_LEAD_S = 10.0
+"""How long before the window blocks are looked for: the first one that is needed may have begun before it."""
+_NEWEST_SAMPLES = 20_000
+_NOT_EVALUATED = "recorded samples are not evaluated here: a replay reads the parameters"
+
+
+def recorded_window(
+    source: RecordingSource,
+    machine: MachineFile,
+    recorded: str,
+    until_ns: int | None,
+    report: Report | None,
+    *,
+    lagged: bool,
+) -> LatestData:
+    """The window of a recording that ends at a time.
+
+    Parameters
+    ----------
+    machine : MachineFile
+        What it is evaluated with.
+    recorded : str
+        ``SITE/MACHINE``, whose samples they are.
+    until_ns : int or None
+        End of the window; None is the end of the recording.
+    report : Report or None
+        What was read of this window: then it has the same samples to the last one, and theory is that of its readings.
+    lagged : bool
+        Whether correlations are to be made of samples, or of spectra.
+
+    Raises
+    ------
+    RotorwatchError
+        If nothing was recorded before that time, or with other channels than the machine file has.
+    """
+    keys = source.machine(recorded)
+    plan = plan_for(machine, lagged=lagged)
+    end_ns = report.end_ns if report is not None else source.span(keys).end_ns if until_ns is None else until_ns
+    first_ns = _first_ns(plan, end_ns, report)
+    begin_ns = max(0, first_ns - round(_LEAD_S * 1e9))
+    data = Recorded(source, keys, *source.between(f"{begin_ns}ns", f"{end_ns}ns", keys))
+    _check(data.descriptor, machine, data.place)
+    window = SlidingWindow(plan)
+    newest: Excerpt | None = None
+    for stretch in data.stretches(data.descriptor.channels):
+        part = _between(stretch, first_ns, end_ns)
+        if not part.samples.size:
+            continue
+        newest = part
+        window.gap()
+        deque(window.feed(plan.to_si(part.samples), part.start_ns), maxlen=0)
+    return LatestData(
+        window=window.statistics(),
+        filled=window.filled if report is None else report.filled,
+        parameters=() if report is None else report.parameters,
+        why_not=_NOT_EVALUATED if report is None else report.reason,
+        blocks=() if newest is None else (_block(newest),),
+    )
+
+
+def _first_ns(plan: Plan, end_ns: int, report: Report | None) -> int:
+    """Time of the first sample that the window is made of."""
+    if report is not None and report.start_ns < report.end_ns:  # a window that is not full says no start
+        return report.start_ns - round((plan.need - plan.fresh) * 1e9 / plan.rate_hz)
+    return end_ns - round(((plan.hops - 1) * plan.stride + plan.need) * 1e9 / plan.rate_hz)
+
+
+def _between(stretch: Excerpt, first_ns: int, end_ns: int) -> Excerpt:
+    size = stretch.samples.shape[0]
+    first, end = (round((one - stretch.start_ns) * stretch.rate_hz / 1e9) for one in (first_ns, end_ns))
+    return stretch.part(min(max(first, 0), size), min(max(end, 0), size))
+
+
+def _block(stretch: Excerpt) -> SampleBlock:
+    newest = stretch.part(max(0, stretch.samples.shape[0] - _NEWEST_SAMPLES), stretch.samples.shape[0])
+    return SampleBlock(newest.start_ns, 0, 0, newest.rate_hz, np.asarray(newest.samples, dtype=np.float64))
+
+
+def _check(found: ChannelDescriptor, machine: MachineFile, place: str) -> None:
+    expected = machine.descriptor
+    if found.channels != expected.channels or found.rate_hz != expected.rate_hz:
+        raise RotorwatchError(
+            f"{machine.site}/{machine.name}: {place} was recorded with {', '.join(one.name for one in found.channels)} "
+            f"at {found.rate_hz:g} Hz, or other units; expected those of the machine file, "
+            f"{', '.join(one.name for one in expected.channels)} at {expected.rate_hz:g} Hz"
+        )

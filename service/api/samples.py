@@ -1,0 +1,225 @@
+"""Which samples an answer is made of: what a monitor holds now, those of recordings, or those of a replay."""
+
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import Depends, HTTPException, Query
+
+from models.errors import RotorwatchError
+from rotorwatch.records.replays import ReplayJob
+from service.analysis.held import Held
+from service.analysis.recorded import Recorded, Sampled
+from service.analysis.recorded_window import recorded_window
+from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import MachineSnapshots
+from service.api.routes.recordings import found_recording
+from service.api.views import ServiceView
+from service.monitor.evaluation import evaluator_for
+from service.monitor.reports import identity_of
+from service.recordings.replay.source import RecordingSource
+from service.stream.worker import MachineWorker
+
+_MOST_BYTES = 600_000_000
+_PATIENCE_S = 10.0
+_WINDOWS = 4
+_SOURCES = 4
+_ONE_AT_A_TIME = threading.Lock()
+_NO_SAMPLES = "no samples have come in"
+_NONE: list[str] = []
+_Files = tuple[tuple[Path, int], ...]
+
+Recordings = Annotated[
+    list[Annotated[str, Query(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,199}\.mcap$")]],
+    Query(
+        alias="recording",
+        max_length=12,
+        description="file name of a recording of this machine to read; may be repeated",
+    ),
+]
+_Replay = Annotated[
+    str | None,
+    Query(
+        pattern="^[0-9a-f]{12}$",
+        description="id of a replay of this machine, for its recordings, machine file and what it read",
+    ),
+]
+_From = Annotated[
+    int | None,
+    Query(ge=0, le=2**63 - 1, description="of recorded samples, those from this time on, ns since 1970-01-01 UTC"),
+]
+_To = Annotated[
+    int | None,
+    Query(ge=0, le=2**63 - 1, description="of recorded samples, those before this time, ns since 1970-01-01 UTC"),
+]
+_End = Annotated[
+    int | None, Query(ge=0, le=2**63 - 1, description="of recorded samples, what ends then, ns since 1970-01-01 UTC")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """What was asked for; without recordings and a replay what is live."""
+
+    recordings: tuple[str, ...] = ()
+    replay: str | None = None
+    since_ns: int | None = None
+    until_ns: int | None = None
+
+    @property
+    def recorded(self) -> bool:
+        """Whether it is not what is live."""
+        return bool(self.recordings) or self.replay is not None
+
+
+def _chosen_window(recording: Recordings = _NONE, replay: _Replay = None, until_ns: _End = None) -> Chosen:
+    """What a window is to be of, as query arguments.
+
+    Raises
+    ------
+    HTTPException
+        422 if they contradict each other.
+    """
+    return _chosen_samples(recording, replay, None, until_ns)
+
+
+def _chosen_samples(
+    recording: Recordings = _NONE, replay: _Replay = None, since_ns: _From = None, until_ns: _To = None
+) -> Chosen:
+    if recording and replay is not None:
+        raise HTTPException(422, "replay: is given beside recording, expected one of them")
+    found = Chosen(tuple(dict.fromkeys(recording)), replay, since_ns, until_ns)
+    for name, value in (("since_ns", since_ns), ("until_ns", until_ns)):
+        if value is not None and not found.recorded:
+            raise HTTPException(422, f"{name}: needs recorded samples, so name a recording or a replay")
+    return found
+
+
+ChosenWindow = Annotated[Chosen, Depends(_chosen_window)]
+ChosenSamples = Annotated[Chosen, Depends(_chosen_samples)]
+
+
+class SampleReader:
+    """Reads recorded samples for one caller at a time; any thread may ask."""
+
+    def __init__(self, service: ServiceView) -> None:
+        self._service = service
+        self._windows: OrderedDict[object, tuple[MachineSnapshots, LatestData]] = OrderedDict()
+
+    @contextmanager
+    def samples(self, view: MachineWorker, chosen: Chosen, reach_s: float | None = None) -> Iterator[Sampled]:
+        """Samples as they were chosen.
+
+        Parameters
+        ----------
+        reach_s : float, optional
+            How much before `Chosen.until_ns` is wanted, where nothing else says it.
+
+        Raises
+        ------
+        RotorwatchError
+            If there are none.
+        HTTPException
+            If there is no such recording or replay, or too much to be read.
+        """
+        if not chosen.recorded:
+            if not view.latest.blocks:
+                raise RotorwatchError(_NO_SAMPLES)
+            yield Held(view.machine, view.latest.blocks)
+            return
+        found = self._files(view, chosen)
+        since_ns, until_ns = chosen.since_ns, chosen.until_ns
+        if since_ns is None and until_ns is not None and reach_s is not None:
+            since_ns = max(0, until_ns - round(reach_s * 1e9))
+        with _taking_turns():
+            source = _source(found)
+            _check_size(source, since_ns, until_ns)
+            keys = source.machine(_place(view))
+            yield Recorded(source, keys, *source.between(_moment(since_ns), _moment(until_ns), keys))
+
+    def window(self, view: MachineWorker, chosen: Chosen) -> tuple[MachineSnapshots, LatestData]:
+        """A window as it was chosen, and what shows it; of those that were recorded the newest few are kept.
+
+        Raises
+        ------
+        HTTPException
+            If there is no such recording or replay, or too much to be read.
+        """
+        if not chosen.recorded:
+            return view.snapshots, view.latest
+        job = None if chosen.replay is None else self._job(view, chosen.replay)
+        asked = (_place(view), chosen, None if job is None else job.state)
+        found = self._files(view, chosen)
+        with _taking_turns():
+            kept = self._windows.pop(asked, None) or self._read(view, chosen, job, found)
+            self._windows[asked] = kept
+            while len(self._windows) > _WINDOWS:
+                self._windows.popitem(last=False)
+            return kept
+
+    def _read(
+        self, view: MachineWorker, chosen: Chosen, job: ReplayJob | None, found: _Files
+    ) -> tuple[MachineSnapshots, LatestData]:
+        installed, report, until_ns = view.snapshots.installed, None, chosen.until_ns
+        if job is not None and job.mode == "offline":
+            installed = self._service.replays.installed(job)
+            report = None if until_ns is None else self._service.replays.report(job, until_ns)
+        try:
+            source = _source(found)
+            if until_ns is not None:
+                _check_size(source, until_ns - round(installed.machine.window.length_s * 1e9), until_ns)
+            lagged = evaluator_for(installed).needs_lags
+            data = recorded_window(source, installed.machine, _place(view), until_ns, report, lagged=lagged)
+        except RotorwatchError as error:
+            data = LatestData(lacking=str(error))
+        return MachineSnapshots(installed, identity_of(installed)), data
+
+    def _files(self, view: MachineWorker, chosen: Chosen) -> _Files:
+        ids = [f"{_place(view)}/{name}" for name in chosen.recordings]
+        if chosen.replay is not None:
+            ids = list(self._job(view, chosen.replay).recordings)
+        found = [found_recording(self._service.catalogue, one) for one in dict.fromkeys(ids)]
+        return tuple((one.path, one.size_bytes) for one in found)
+
+    def _job(self, view: MachineWorker, replay_id: str) -> ReplayJob:
+        job = self._service.replays.job(replay_id)
+        machine = job.recordings[0].rpartition("/")[0]
+        if machine != _place(view):
+            raise HTTPException(422, f"replay: {replay_id} is of {machine}, expected one of {_place(view)}")
+        return job
+
+
+@contextmanager
+def _taking_turns() -> Iterator[None]:
+    if not _ONE_AT_A_TIME.acquire(timeout=_PATIENCE_S):
+        raise HTTPException(503, "recordings are being read for somebody else; ask again")
+    try:
+        yield
+    finally:
+        _ONE_AT_A_TIME.release()
+
+
+@lru_cache(maxsize=_SOURCES)
+def _source(files: _Files) -> RecordingSource:
+    """Files, whose indexes are read once; with their sizes, which change with them."""
+    return RecordingSource([path for path, _ in files])
+
+
+def _check_size(source: RecordingSource, since_ns: int | None, until_ns: int | None) -> None:
+    size = sum(path.stat().st_size for path in source.paths_between(since_ns, until_ns))
+    if size > _MOST_BYTES:
+        most = f"expected at most {_MOST_BYTES / 1e6:.0f} MB at once"
+        raise HTTPException(422, f"recording: {size / 1e6:.0f} MB, {most}")
+
+
+def _place(view: MachineWorker) -> str:
+    return f"{view.machine.site}/{view.machine.name}"
+
+
+def _moment(time_ns: int | None) -> str | None:
+    return None if time_ns is None else f"{time_ns}ns"
