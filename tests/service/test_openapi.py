@@ -56,6 +56,8 @@ CASES = int(os.environ.get("ROTORWATCH_API_CASES", "0"))
 DEPENDENT = {
     "GET /api/v1/events",
     "GET /api/v1/machines/{site}/{machine}/correlations",
+    "GET /api/v1/machines/{site}/{machine}/full-spectra",
+    "GET /api/v1/machines/{site}/{machine}/orbits",
     "GET /api/v1/machines/{site}/{machine}/readings",
     "GET /api/v1/machines/{site}/{machine}/spectra",
     "GET /api/v1/machines/{site}/{machine}/vectors",

@@ -152,14 +152,14 @@ class ReplayDesk:
         Raises
         ------
         HTTPException
-            409 if that cannot be read any more.
+            404 if that cannot be read any more.
         """
         keys = MachineKeys(*job.recordings[0].split("/")[:2])
         sent = None if self.jobs is None else self.jobs.machine_file(job.id)
         try:
             return choose_machine(keys, sent or job.machine, "\n".join(job.changes))
         except RotorwatchError as error:  # where the file is concerns nobody who asks over HTTP
-            raise HTTPException(409, f"what replay {job.id} was evaluated with cannot be read any more") from error
+            raise HTTPException(404, f"what replay {job.id} was evaluated with cannot be read any more") from error
 
     def report(self, job: ReplayJob, end_ns: int) -> Report | None:
         """What an offline replay found in the window that ends at a time, which may be rounded to a microsecond."""
