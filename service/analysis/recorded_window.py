@@ -19,7 +19,7 @@ from service.recordings.replay.source import RecordingSource
 _LEAD_S = 10.0
 """How long before the window blocks are looked for: the first one that is needed may have begun before it."""
 _NEWEST_SAMPLES = 20_000
-_NOT_EVALUATED = "recorded samples are not evaluated here: a replay reads the parameters"
+_NOT_EVALUATED = "no estimate: recorded samples are evaluated by an offline replay alone"
 
 
 def recorded_window(

@@ -8,13 +8,14 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 from models.machine import load_machine
-from rotorwatch.records.replays import ReplayJob
+from rotorwatch.records.replays import ReplayJob, ReplayReportList
+from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
 from service.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
 from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations
 from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, send, settings, until
-from tests.service.monitored import client
+from tests.service.monitored import PLACE, answered, client
 from tests.service.replaying import recording
 
 ID = "demo/lab/20260101T000000Z.mcap"
@@ -158,6 +159,104 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
 
 
+# A hand that takes the scrubber over all windows up to one.
+_DRAGGED = """(scrub, to) => {
+    for (let at = 0; at <= to; at += 1) {
+        scrub.value = String(at);
+        scrub.dispatchEvent(new Event("input"));
+    }
+}"""
+ORBITS, SPECTRUM = "Orbits of this window", "Spectrum of this window"
+FOLDS = (
+    ORBITS,
+    SPECTRUM,
+    "Waveform at its end",
+    "Full spectrum at its end",
+    "Correlations and residuals of the equations",
+)
+
+
+def unfolded(page: Page, *headings: str) -> None:
+    for heading in headings:
+        page.locator("window-plots summary").filter(has_text=heading).click()
+
+
+def diameters(snapshot: OrbitSnapshot) -> list[float]:
+    """Long axes of the orbits, as the page writes them."""
+    return [2 * one.ellipse.semi_major for one in snapshot.orbits if one.ellipse is not None]
+
+
+def test_orbits_and_spectra_of_any_window_of_a_replay(browser: Browser, runtime: Runtime) -> None:
+    url = runtime.http_url
+    expect.set_options(timeout=PATIENCE_MS)
+    with client(runtime) as http:
+        answer = http.post("/api/v1/replays", json={"recordings": [ID]}).raise_for_status()
+        job_id = ReplayJob.model_validate_json(answer.content).id
+
+        def state() -> str:
+            return ReplayJob.model_validate_json(http.get(f"/api/v1/replays/{job_id}").content).state
+
+        until(lambda: state() == "finished", "end of the replay")
+        listed = http.get(f"/api/v1/replays/{job_id}/reports", params={"limit": 1000})
+        reports = answered(listed, ReplayReportList).reports
+        early = max(at for at, one in enumerate(reports) if one.filled == 1 and one.end_ns < START_NS + FAULT_S * 1e9)
+
+        def asked_of(at: int) -> dict[str, str | int]:
+            return {"replay": job_id, "until_ns": reports[at].end_ns}
+
+        with looking(browser, url) as page:
+            asked: list[str] = []
+            page.on("request", lambda request: asked.append(request.url.partition(PLACE)[2]))
+            page.goto(f"{url}/#/replays/{job_id}")
+            scrub = page.get_by_role("slider", name="Window")
+            expect(page.locator("window-plots summary")).to_have_count(len(FOLDS))
+            scrub.focus()
+            page.keyboard.press("ArrowLeft")
+            page.wait_for_timeout(1000)
+            assert not [one for one in asked if one.startswith(("/orbits", "/spectra", "/correlations", "/waveforms"))]
+            unfolded(page, ORBITS, SPECTRUM)
+            orbits, spectrum = page.locator("window-plots orbit-plot"), page.locator("window-plots spectrum-plot")
+            expect(spectrum).to_contain_text("Replay, window")
+            seen: dict[int, list[str]] = {}
+            for at in (early, len(reports) - 1):
+                asked.clear()
+                scrub.evaluate(_DRAGGED, at)
+                api = answered(http.get(f"{PLACE}/orbits", params=asked_of(at)), OrbitSnapshot)
+                for drawn, long in zip(orbits.locator("figcaption").all(), diameters(api), strict=True):
+                    expect(drawn).to_contain_text(f" {float(f'{long:.3g}'):g} × ")
+                expect(orbits).to_contain_text("Replay, window 2026-01-01 00:00:")
+                expect(orbits.locator("ellipse.nominal")).to_have_count(len(diameters(api)))
+                expect(orbits.locator("ellipse.estimated")).to_have_count(len(diameters(api)))
+                density = answered(http.get(f"{PLACE}/spectra", params=asked_of(at)), SpectrumSnapshot).densities[0]
+                # The element says the level of the density it has drawn.
+                expect(spectrum.locator("line-chart")).to_have_attribute(
+                    "aria-label", f"spectrum of {density.channel}, rms {float(f'{density.rms or 0:.3g}'):g}"
+                )
+                expect(spectrum).to_contain_text("Replay, window 2026-01-01 00:00:")
+                # Of windows that are passed over nothing is asked for.
+                assert len([one for one in asked if one.startswith("/spectra")]) == 1
+                seen[at] = orbits.locator("figcaption").all_inner_texts()
+                kept(page, f"replay-window-{at}")
+            assert seen[early] != seen[len(reports) - 1]
+            unfolded(page, *FOLDS[2:])
+            expect(page.locator("window-plots waveform-plot")).to_contain_text(
+                "Replay; recordings, 8 revolutions of 2026"
+            )
+            expect(page.locator("window-plots full-spectrum-plot")).to_contain_text("Replay; recordings, 2026")
+            expect(page.locator("window-plots correlation-plot")).to_contain_text("Replay, window 2026-01-01 00:00:")
+            assert not violations(page)
+            kept(page, "replay-window-all")
+        for kind, phone, dark in (("dark", False, True), ("phone", True, False), ("phone-dark", True, True)):
+            with looking(browser, url, phone=phone, dark=dark) as page:
+                page.goto(f"{url}/#/replays/{job_id}")
+                expect(page.locator("window-plots summary")).to_have_count(len(FOLDS))
+                unfolded(page, *FOLDS)
+                expect(page.locator("window-plots canvas")).to_have_count(8)
+                kept(page, f"replay-window-{kind}")
+                assert not violations(page)
+                assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
+
+
 def test_a_paced_replay_is_paused_and_moved(browser: Browser, runtime: Runtime) -> None:
     url = runtime.http_url
     expect.set_options(timeout=PATIENCE_MS)
@@ -195,6 +294,11 @@ def test_a_paced_replay_is_paused_and_moved(browser: Browser, runtime: Runtime) 
         expect(slider).to_have_attribute("aria-valuetext", re.compile("^2026-01-01 00:01:"))
         control.get_by_role("button", name="− 10 s").click()
         expect(slider).to_have_attribute("aria-valuetext", re.compile("^2026-01-01 00:01:0"))
+        unfolded(page, ORBITS, SPECTRUM, FOLDS[4])
+        expect(page.locator("window-plots orbit-plot")).to_contain_text("Replay, window 2026-01-01 00:00:4")
+        expect(page.locator("window-plots orbit-plot ellipse.nominal")).to_have_count(2)
+        expect(page.locator("window-plots spectrum-plot")).to_contain_text("evaluated by an offline replay alone")
+        expect(page.locator("window-plots correlation-plot")).to_contain_text("a paced replay evaluates nothing")
         kept(page, "replay-paced")
         assert not violations(page)
         page.get_by_role("button", name="Stop").click()

@@ -160,7 +160,7 @@ def test_windows_of_recordings_alone_and_of_a_paced_replay(http: httpx.Client, r
     read = spectra(at)
     assert read.end_ns == at
     assert read.theory.nominal_reason == ""
-    assert "a replay reads the parameters" in read.theory.estimated_reason
+    assert "evaluated by an offline replay alone" in read.theory.estimated_reason
     assert answered(http.get(f"{PLACE}/spectra"), SpectrumSnapshot).start_ns is None  # nothing is live
     early = answered(
         http.get(f"{PLACE}/spectra", params={"recording": NAME, "until_ns": START_NS + S}), SpectrumSnapshot

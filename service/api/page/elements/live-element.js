@@ -4,6 +4,7 @@ import { monitor } from "../monitor/monitor.js";
 export class LiveElement extends HTMLElement {
   #gone = new AbortController();
   #loading = false;
+  #again = false;
   #unseen = false;
 
   connectedCallback() {
@@ -34,9 +35,10 @@ export class LiveElement extends HTMLElement {
     this.load();
   }
 
-  /** Ask for what is shown: never twice at once, nor while nobody looks. */
+  /** Ask for what is shown: never twice at once, nor while nobody looks. What is wanted meanwhile is asked for afterwards. */
   async load() {
     this.#unseen = document.hidden;
+    this.#again = this.#loading;
     if (this.#loading || document.hidden) return;
     this.#loading = true;
     try {
@@ -45,6 +47,7 @@ export class LiveElement extends HTMLElement {
       this.refused(error instanceof Error ? error.message : String(error));
     } finally {
       this.#loading = false;
+      if (this.#again && this.isConnected) this.load();
     }
   }
 

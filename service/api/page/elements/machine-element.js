@@ -1,8 +1,13 @@
-import { monitor } from "../monitor/monitor.js";
+import { stretch } from "../monitor/figures.js";
+import { monitor, pathOf } from "../monitor/monitor.js";
 import { LiveElement } from "./live-element.js";
 
-/** An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. */
+/**
+ * An element about the machine that its attribute `place` names; `show` is called whenever that is heard of. With an attribute `recorded`, what it asks for is
+ * of a recorded window instead of what is live: arguments of the API such as `replay=ID&until_ns=TIME`.
+ */
 export class MachineElement extends LiveElement {
+  static observedAttributes = ["recorded"];
   /** @type {import("../monitor/records.js").Health | undefined} */
   #instead;
   /** Whether `show` needs all that is known of the latest window. */
@@ -12,6 +17,31 @@ export class MachineElement extends LiveElement {
     super.connectedCallback();
     this.follow(`health:${this.place}`, () => this.show());
     this.show();
+  }
+
+  attributeChangedCallback() {
+    if (this.isConnected) this.load();
+  }
+
+  /** What is recorded does not change, and is asked for once. @param {number} every_s */
+  keepLoading(every_s) {
+    this.repeat(every_s, () => this.recorded || this.load());
+    this.load();
+  }
+
+  get recorded() {
+    return this.getAttribute("recorded") ?? "";
+  }
+
+  /** What the API has of the machine, live or recorded. @param {string} route @param {string} [wanted] */
+  askFor(route, wanted = "") {
+    return monitor.ask(`${pathOf(this.place)}/${route}?${[wanted, this.recorded].filter(Boolean).join("&")}`);
+  }
+
+  /** Says of a recorded window that it is one, and which. @param {{start_ns: number | null, end_ns: number | null}} found */
+  windowText({ start_ns, end_ns }) {
+    if (!this.recorded) return "";
+    return start_ns === null || end_ns === null ? "Replay" : `Replay, window ${stretch(start_ns, end_ns)}`;
   }
 
   /** `site/machine` */
@@ -25,9 +55,9 @@ export class MachineElement extends LiveElement {
     this.show();
   }
 
-  /** What was heard last; undefined before the first. */
+  /** What was heard last, or what is shown instead; undefined before the first. */
   get health() {
-    const heard = monitor.machines.get(this.place);
+    const heard = this.recorded ? undefined : monitor.machines.get(this.place);
     return this.#instead ?? (heard && (heard.whole || !this.needsWhole) ? heard.health : undefined);
   }
 

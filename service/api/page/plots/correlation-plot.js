@@ -1,7 +1,6 @@
 import { figure, printed, stretch, within, Z95 } from "../monitor/figures.js";
 import { html, table } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { monitor, pathOf } from "../monitor/monitor.js";
 import { choiceOf, offered } from "./sample-plot.js";
 import "../elements/line-chart.js";
 
@@ -21,7 +20,7 @@ export function measuredLines(pair, line) {
   return [line, { label: "low", values: edge(-1), hidden: true }, { label: "high", values: edge(1), hidden: true }];
 }
 
-/** Correlation functions of the latest window beside theory, and the residuals of the equations between them. */
+/** Correlation functions of a window beside theory, and the residuals of the equations between them. */
 class CorrelationPlot extends MachineElement {
   #choice = choiceOf("Pair of channels", () => this.#draw());
   /** @type {Correlations | null} */
@@ -37,7 +36,7 @@ class CorrelationPlot extends MachineElement {
   }
 
   async ask() {
-    this.#found = await monitor.ask(`${pathOf(this.place)}/correlations`);
+    this.#found = await this.askFor("correlations");
     this.#draw();
   }
 
@@ -49,11 +48,11 @@ class CorrelationPlot extends MachineElement {
     this.#chart.parentElement.hidden = this.#choice.hidden = !pair;
     const theory = [found.theory.nominal_reason || found.theory.estimated_reason, found.reason].filter(Boolean);
     if (!pair || !found.start_ns || !found.end_ns) {
-      this.#said.textContent = theory.join("; ");
+      this.#said.textContent = [this.windowText(found), ...theory].filter(Boolean).join("; ");
       return;
     }
     const apart = [pair.nominal_z !== null && `nominal ${figure(pair.nominal_z)}`, pair.estimated_z !== null && `estimated ${figure(pair.estimated_z)}`].filter(Boolean);
-    this.#said.textContent = [`Window ${stretch(found.start_ns, found.end_ns)}, without mean and 1×`, apart.length && `theory is apart by standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
+    this.#said.textContent = [`${this.windowText(found) || `Window ${stretch(found.start_ns, found.end_ns)}`}, without mean and 1×`, apart.length && `theory is apart by standard errors (rms): ${apart.join(", ")}`, ...theory].filter(Boolean).join("; ");
     const lines = measuredLines(pair, { label: "measured", values: pair.measured, width: 2 });
     if (pair.nominal) lines.push({ label: "as nominal", values: pair.nominal, colour: "nominal", dash: [6, 4] });
     if (pair.estimated) lines.push({ label: "as estimated", values: pair.estimated, colour: "estimated" });
@@ -79,7 +78,7 @@ class CorrelationPlot extends MachineElement {
       ],
     }));
     const heads = ["equation", "about", "mean squared difference", "healthy", "times healthy", "read of it"];
-    this.#residuals.replaceChildren(found.length ? table(heads, rows, "Residuals of the compatibility equations") : html("p", { class: "note" }, "No residuals: the compatibility equations need trained networks."));
+    this.#residuals.replaceChildren(found.length ? table(heads, rows, "Residuals of the compatibility equations") : html("p", { class: "note" }, this.recorded && !this.health ? "No residuals: a paced replay evaluates nothing." : "No residuals: the compatibility equations need trained networks."));
   }
 }
 

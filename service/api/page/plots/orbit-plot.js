@@ -1,7 +1,6 @@
 import { figure, printed, quantity, shownIn } from "../monitor/figures.js";
 import { html, svg } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { monitor, pathOf } from "../monitor/monitor.js";
 import { plane, REACH, roundUp } from "./plane.js";
 
 const [REFRESH_S, REVOLUTIONS] = [15, 8];
@@ -51,7 +50,7 @@ export function orbitFigure(orbit, pulses_s, called = { measured: "1× measured"
   );
 }
 
-/** Orbits of the live window: samples, the ellipse at running speed, theory, and the keyphasor's mark. */
+/** Orbits of a window: samples, the ellipse at running speed, theory, and the keyphasor's mark. */
 class OrbitPlot extends MachineElement {
   connectedCallback() {
     super.connectedCallback();
@@ -59,9 +58,9 @@ class OrbitPlot extends MachineElement {
   }
 
   async ask() {
-    const found = /** @type {Orbits} */ (await monitor.ask(`${pathOf(this.place)}/orbits?revolutions=${REVOLUTIONS}`));
+    const found = /** @type {Orbits} */ (await this.askFor("orbits", `revolutions=${REVOLUTIONS}`));
     const drawn = found.orbits.filter((one) => one.ellipse || one.path);
-    const reasons = [found.reason, found.path_reason].filter(Boolean).join("; ");
+    const reasons = [this.windowText(found), found.reason, found.path_reason].filter(Boolean).join("; ");
     this.replaceChildren(html("h2", {}, "Orbits"), html("div", { class: "charts" }, ...drawn.map((one) => orbitFigure(one, found.pulses_s))), html("p", { class: "note" }, reasons));
   }
 

@@ -2,22 +2,45 @@ import { html } from "../elements/markup.js";
 
 /**
  * Something that is not always needed, folded: `<plot-fold place shows="plots/waveform-plot" heading>`, with `open` not at first. It is loaded when it is
- * opened, and asks for nothing once it is closed again.
+ * opened, and asks for nothing once it is closed again. `recorded` is handed on, also when it becomes another one.
  */
 class PlotFold extends HTMLElement {
+  static observedAttributes = ["recorded"];
+  #inside = html("div");
+  /** @type {import("../monitor/records.js").Health | null} */
+  #fed = null;
+
   connectedCallback() {
-    const [shows, place] = [this.getAttribute("shows") ?? "", this.getAttribute("place")];
-    const inside = html("div");
+    const shows = this.getAttribute("shows") ?? "";
     const toggled = async (/** @type {{target: HTMLDetailsElement}} */ { target }) => {
-      if (!target.open) return inside.replaceChildren();
+      if (!target.open) return this.#inside.replaceChildren();
       try {
         await import(`../${shows}.js`);
-        if (target.open) inside.replaceChildren(html(shows.slice(shows.indexOf("/") + 1), { place, hours: this.getAttribute("hours") }));
+        if (target.open) this.#fill(shows.slice(shows.indexOf("/") + 1));
       } catch {
-        inside.replaceChildren(html("p", { class: "note" }, "The monitor serves another page by now: load this one again."));
+        this.#inside.replaceChildren(html("p", { class: "note" }, "The monitor serves another page by now: load this one again."));
       }
     };
-    this.replaceChildren(html("details", { toggle: toggled, open: this.hasAttribute("open") }, html("summary", {}, html("h2", {}, this.getAttribute("heading"))), inside));
+    this.replaceChildren(html("details", { toggle: toggled, open: this.hasAttribute("open") }, html("summary", {}, html("h2", {}, this.getAttribute("heading"))), this.#inside));
+  }
+
+  /** @param {string} _name @param {string | null} _old @param {string | null} recorded */
+  attributeChangedCallback(_name, _old, recorded) {
+    if (recorded !== null) this.#inside.firstElementChild?.setAttribute("recorded", recorded);
+  }
+
+  /** Show this and nothing that is live, see `MachineElement`. @param {import("../monitor/records.js").Health} health */
+  feed(health) {
+    this.#fed = health;
+    /** @type {any} */ (this.#inside.firstElementChild)?.feed?.(health);
+  }
+
+  /** @param {string} tag */
+  #fill(tag) {
+    const [place, hours, recorded] = ["place", "hours", "recorded"].map((name) => this.getAttribute(name));
+    const made = /** @type {any} */ (html(tag, { place, hours, recorded }));
+    if (this.#fed) made.feed?.(this.#fed);
+    this.#inside.replaceChildren(made);
   }
 }
 

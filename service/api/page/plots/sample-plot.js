@@ -1,7 +1,7 @@
 import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { stretch } from "../monitor/figures.js";
-import { monitor, pathOf } from "../monitor/monitor.js";
+import { monitor } from "../monitor/monitor.js";
 import { machineFile } from "../machine/machine-file.js";
 
 const RECORDINGS = 40;
@@ -10,8 +10,8 @@ const RECORDINGS = 40;
 /** @typedef {{source: string, reason: string}} Values */
 
 /**
- * A plot of what is live, or of a recording of the machine: says in one line what is shown and from when. A recording does
- * not change, and is asked for once.
+ * A plot of what is live, of a recording of the machine or before the end of a recorded window: says in one line what is shown and from when. A recording
+ * does not change, and is asked for once.
  * @template {Values} T
  */
 export class SamplePlot extends MachineElement {
@@ -34,7 +34,7 @@ export class SamplePlot extends MachineElement {
     this.#source.replaceChildren(html("option", { value: "" }, this.live));
     this.#source.hidden = true;
     this.replaceChildren(html("div", { class: "tools" }, ...this.choices(), this.#source), this.#said, this.body);
-    this.#offer();
+    if (!this.recorded) this.#offer();
     this.keepLoading(this.refreshS);
   }
 
@@ -83,10 +83,10 @@ export class SamplePlot extends MachineElement {
     const asked = this.#wanted();
     if (this.#source.value && asked === this.#shown) return;
     if (this.#source.value) this.#said.textContent = "The recording is being read …";
-    const found = /** @type {T} */ (await monitor.ask(`${pathOf(this.place)}/${this.route}?${asked}`));
+    const found = /** @type {T} */ (await this.askFor(this.route, asked));
     if (asked !== this.#wanted()) return this.ask(); // something else was chosen meanwhile
     this.#shown = asked;
-    const said = [this.draw(found), found.reason].filter(Boolean).join("; ");
+    const said = [this.recorded && "Replay", this.draw(found), found.reason].filter(Boolean).join("; ");
     this.#said.textContent = said.charAt(0).toUpperCase() + said.slice(1);
   }
 

@@ -1,7 +1,6 @@
 import { figure, printed } from "../monitor/figures.js";
 import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { monitor, pathOf } from "../monitor/monitor.js";
 import "../elements/line-chart.js";
 
 const [REFRESH_S, ORDERS] = [15, 5];
@@ -30,7 +29,7 @@ export function spectrumDrawing(found, shown) {
   };
 }
 
-/** Power spectral densities of the live window beside theory, with the orders of the running speed. */
+/** Power spectral densities of a window beside theory, with the orders of the running speed. */
 class SpectrumPlot extends MachineElement {
   #message = html("p", { class: "note" });
   #choice = /** @type {HTMLSelectElement} */ (html("select", { "aria-label": "Channel", change: () => this.load() }));
@@ -43,7 +42,7 @@ class SpectrumPlot extends MachineElement {
   }
 
   async ask() {
-    this.#draw(await monitor.ask(`${pathOf(this.place)}/spectra`));
+    this.#draw(await this.askFor("spectra"));
   }
 
   /** @param {string} why */
@@ -58,7 +57,7 @@ class SpectrumPlot extends MachineElement {
     const shown = found.densities.find((one) => one.channel === this.#choice.value) ?? found.densities[0];
     this.#chart.hidden = this.#choice.hidden = !shown;
     const theory = found.theory;
-    this.#message.textContent = [found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
+    this.#message.textContent = [this.windowText(found), found.reason, theory.nominal_reason || theory.estimated_reason].filter(Boolean).join("; ");
     if (!shown) return;
     this.#chart.setAttribute("aria-label", `spectrum of ${shown.channel}, rms ${figure(shown.rms)}`);
     this.#chart.draw(spectrumDrawing(found, shown));

@@ -7,6 +7,7 @@ import "../machine/parameter-table.js";
 import "./alarm-comparison.js";
 import "./replay-trend.js";
 import "./state-strip.js";
+import "./window-plots.js";
 
 const [WINDOWS, EVENTS, WAIT_MS] = [600, 1000, 120];
 const RAISED = new Set(["raised", "escalated"]);
@@ -35,9 +36,15 @@ class OfflineResult extends HTMLElement {
   #tables = /** @type {any[]} */ ([html("parameter-table"), html("level-table")]);
   #trends = /** @type {any[]} */ ([html("replay-parameters"), html("replay-levels")]);
   #alarms = /** @type {any} */ (html("alarm-comparison"));
+  #plots = /** @type {any} */ (null);
 
   get #path() {
     return `${API}/replays/${this.getAttribute("replay")}`;
+  }
+
+  /** Whose recordings they are: `site/machine`. */
+  get #machine() {
+    return this.#job?.recordings[0].split("/").slice(0, 2).join("/") ?? "";
   }
 
   /** @param {ReplayJob} job */
@@ -68,6 +75,7 @@ class OfflineResult extends HTMLElement {
       trend.feed(this.#health(read));
     }
     const jump = (/** @type {number} */ direction, /** @type {string} */ text) => html("button", { type: "button", click: () => this.#next(direction) }, text);
+    this.#plots = html("window-plots", { place: this.#machine, replay: this.getAttribute("replay") });
     lay(
       this,
       this.#facts,
@@ -78,6 +86,7 @@ class OfflineResult extends HTMLElement {
       this.#message,
       this.#window,
       ...this.#tables,
+      this.#plots,
       ...this.#trends,
       html("p", { class: "note" }, "As the API tells it: ", html("a", { href: this.#path }, "replay"), ", ", html("a", { href: `${this.#path}/reports` }, "reports"), ", ", html("a", { href: `${this.#path}/alarms` }, "alarms")),
     );
@@ -103,7 +112,7 @@ class OfflineResult extends HTMLElement {
 
   /** A window as health tells what is live, with the alarms as they would have stood. @param {Report} report @returns {Health} */
   #health(report) {
-    const [site, machine] = /** @type {ReplayJob} */ (this.#job).recordings[0].split("/");
+    const [site, machine] = this.#machine.split("/");
     const latest = new Map(this.#events.filter((one) => one.time_ns <= report.end_ns && (RAISED.has(one.kind) || one.kind === "cleared")).map((one) => [one.name, one]));
     const alarms = [...latest.values()].map((one) => ({ ...one, raised: RAISED.has(one.kind) }));
     return /** @type {Health} */ (/** @type {unknown} */ ({ site, machine, state: report.state, reason: report.reason, filled: report.filled, report, alarms }));
@@ -145,6 +154,7 @@ class OfflineResult extends HTMLElement {
       html("p", {}, standing.length ? "Raised in the replay by then: " : "No alarm raised in the replay by then.", standing.map((one) => `${one.name} (${one.severity}${one.relative_change === null ? "" : `, ${percent(one.relative_change)}`})`).join(", ")),
     );
     for (const one of this.#tables) one.feed(health);
+    this.#plots.stand(report.end_ns, health);
     for (const one of [this.#strip, ...this.#trends]) one.mark(report.end_ns);
   }
 

@@ -2,6 +2,9 @@ import { clock, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { API, monitor } from "../monitor/monitor.js";
 import { counted } from "./replay-list.js";
+import "./window-plots.js";
+
+const FOLLOW_MS = 15_000;
 
 /** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
 
@@ -9,10 +12,12 @@ import { counted } from "./replay-list.js";
 class PacedControl extends HTMLElement {
   #said = html("p", { class: "number" });
   #pause = html("button", { type: "button", click: () => this.#order(this.#job?.state === "paused" ? "resume" : "pause") });
-  #seek = /** @type {HTMLInputElement} */ (html("input", { type: "range", min: 0, max: 1, step: "any", "aria-label": "Place in the data", input: () => this.#tell(), change: () => this.#order("seek", { to_ns: Math.round(this.#at()) }) }));
+  #seek = /** @type {HTMLInputElement} */ (html("input", { type: "range", min: 0, max: 1, step: "any", "aria-label": "Place in the data", input: () => { this.#tell(); this.#follow(true); }, change: () => this.#order("seek", { to_ns: Math.round(this.#at()) }) }));
   #place = html("output", { class: "number" });
   #message = html("p", { class: "message", role: "alert" });
   #tools = html("div", { class: "scrubber" });
+  #plots = /** @type {any} */ (null);
+  #followed = -Infinity;
   /** @type {ReplayJob | null} */
   #job = null;
   /** First and last data. @type {[number, number] | null} */
@@ -26,7 +31,7 @@ class PacedControl extends HTMLElement {
     const step = (/** @type {number} */ by_s, /** @type {string} */ text) => html("button", { type: "button", click: () => this.#order("seek", { by_s }) }, text);
     lay(this.#tools, this.#pause, step(-10, "− 10 s"), step(10, "+ 10 s"), this.#seek, this.#place);
     for (const [kind, held] of /** @type {[string, boolean][]} */ ([["pointerdown", true], ["pointerup", false], ["pointercancel", false]])) this.#seek.addEventListener(kind, () => { this.#held = held; });
-    lay(this, this.#said, this.#tools, this.#message);
+    lay(this, this.#said, this.#tools, this.#message, html("h2", {}, "Where it stands"));
   }
 
   /** @param {ReplayJob} job */
@@ -37,7 +42,10 @@ class PacedControl extends HTMLElement {
     this.#tools.hidden = !running || !monitor.may("operate");
     this.#pause.textContent = job.state === "paused" ? "Resume" : "Pause";
     lay(this.#said, `It publishes below ${job.prefix}, at ${job.pace} seconds of data per second, and evaluates nothing. A monitor for it: `, html("code", {}, `rotorwatch run --namespace ${job.prefix}`), job.progress ? `. It stands at ${clock(job.progress.position_ns)}, ${counted(job.progress.messages, "message")} sent.` : ".");
-    if (first) await this.#measure(job);
+    if (first) {
+      this.append((this.#plots = html("window-plots", { place: job.recordings[0].split("/").slice(0, 2).join("/"), replay: job.id })));
+      await this.#measure(job);
+    }
     this.#stand();
   }
 
@@ -47,6 +55,14 @@ class PacedControl extends HTMLElement {
     if (this.#held || this.#waiting || !progress || !this.#span) return;
     this.#seek.value = String((progress.position_ns - this.#span[0]) / (this.#span[1] - this.#span[0]));
     this.#tell();
+    this.#follow(this.#job?.state !== "running");
+  }
+
+  /** Show the window that ends where it stands; while it goes on only now and then. @param {boolean} rests */
+  #follow(rests) {
+    if (!this.#span || (!rests && performance.now() - this.#followed < FOLLOW_MS)) return;
+    this.#followed = performance.now();
+    this.#plots?.stand(this.#at());
   }
 
   /** From when to when the data are. @param {ReplayJob} job */
