@@ -83,7 +83,7 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
     resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (files, files))
     publisher = started(send, published, Path(os.devnull), dict(os.environ))
     try:
-        found = Monitor(process, publisher, _url(process, out, log), endpoint, log, published)
+        found = Monitor(process, publisher, url_of(process, out, log), endpoint, log, published)
         while found.blocks()[0] < 20:
             time.sleep(0.1)
         yield found
@@ -102,7 +102,8 @@ def started(arguments: list[str], out: Path, err: Path, environment: dict[str, s
         )
 
 
-def _url(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:
+def url_of(process: subprocess.Popen[bytes], out: Path, log: Path) -> str:
+    """Where a monitor that was started says it answers."""
     while process.poll() is None:
         if (told := re.search(r"HTTP API (http\S+)\s", out.read_text(encoding="utf-8"))) is not None:
             return told[1]

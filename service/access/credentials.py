@@ -14,7 +14,7 @@ from service.access.scopes import Caller
 COOKIE = "rotorwatch_token"
 """In which a browser keeps the token of who has signed in."""
 
-NEEDED = "an access token is needed, as header Authorization: Bearer rw_…"
+NEEDED = "an access token is needed; programs send it as header Authorization: Bearer rw_…"
 BEARER = 'Bearer realm="rotorwatch"'
 _BASIC = 'Basic realm="rotorwatch", charset="UTF-8"'
 _V6_NETWORK = 64

@@ -32,7 +32,7 @@ _HEADERS: dict[int, dict[str, Any]] = {
 _TITLES = {413: "Content Too Large", 416: "Range Not Satisfiable", 422: "Unprocessable Content"}
 _DETAILS = {
     400: "There was an error parsing the body",
-    401: "an access token is needed, as header Authorization: Bearer rw_…",
+    401: "an access token is needed; programs send it as header Authorization: Bearer rw_…",
     403: "this needs the scope operate; screen has read",
     409: "k_by is acknowledged (version 18), not as it was seen (version 17): look again",
     413: "the request body is too large, expected at most 1000000 bytes",

@@ -19,11 +19,9 @@ def overview(health: Health) -> Health:
     if report is None:
         return health
     names = {alarm.name for alarm in health.alarms if alarm.raised}
-    readings = _readings(report)
-    nearness = {one.name: _parameter_nearness(report, one) for one in readings}
-    nearness |= {f"level:{one.channel}": _level_nearness(one) for one in report.levels}
-    if not names & nearness.keys() and nearness:
-        names = {max(nearness, key=nearness.__getitem__)}
+    near = nearness(report)
+    if not names & near.keys() and near:
+        names = {max(near, key=near.__getitem__)}
     verdict = report.verdict
     if verdict is not None:
         current = _named(verdict.current, names)
@@ -37,6 +35,15 @@ def overview(health: Health) -> Health:
         "level_growth": None,
     }
     return health.model_copy(update={"report": report.model_copy(update=left_out | kept)})
+
+
+def nearness(report: Report) -> dict[str, float]:
+    """How near each reading is to what would be seen, and each channel to its limit, 1 there.
+
+    By the names of their alarms; what a page shows of a machine is chosen by the same rule (``monitor/states.js``).
+    """
+    near = {one.name: _parameter_nearness(report, one) for one in _readings(report)}
+    return near | {f"level:{one.channel}": _level_nearness(one) for one in report.levels}
 
 
 def _named(parameters: Iterable[Parameter], names: set[str]) -> tuple[Parameter, ...]:
@@ -62,8 +69,8 @@ def _parameter_nearness(report: Report, read: Parameter) -> float:
 def _level_nearness(levels: ChannelLevels) -> float:
     """The level of a channel that is nearest to its alert limit, over that; whatever is beyond one comes first."""
 
-    def nearness(limit: LevelLimits) -> float:
+    def of_limit(limit: LevelLimits) -> float:
         value = getattr(levels, limit.measure, None)
         return _BEYOND[limit.state] + (value / limit.alert if limit.alert and value is not None else 0.0)
 
-    return max(map(nearness, levels.limits), default=0.0)
+    return max(map(of_limit, levels.limits), default=0.0)

@@ -92,7 +92,7 @@ class _Listener:
             self.woken = True
             self.loop.call_soon_threadsafe(self.news.set)
 
-    def awake(self) -> None:
+    def reset(self) -> None:
         self.woken = False
         self.news.clear()
 
@@ -183,7 +183,7 @@ class EventFeed:
             asked_s = time.monotonic()
             while True:
                 closes = self._closed
-                listener.awake()
+                listener.reset()
                 behind = [place for place, log in logs.items() if cursor[place] < log.last_sequence()]
                 for place in behind:
                     async for event in self._committed(place, logs[place], cursor):

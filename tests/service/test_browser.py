@@ -134,6 +134,12 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
         expect(page.locator("machine-facts")).to_contain_text("rotor.k_by_N_per_m50000")
         expect(page.locator("parameter-trend canvas")).to_have_count(6)
         expect(page.locator("spectrum-plot canvas")).to_be_visible()
+        name = page.locator("spectrum-plot .u-series:visible th", has_text="measured").first
+        # Without a pointer there is no value, so nothing announces one.
+        assert name.evaluate("one => getComputedStyle(one, '::after').content") == "none"
+        page.locator("spectrum-plot .u-over").hover()
+        expect(page.locator("spectrum-plot .uplot.away")).to_have_count(0)
+        assert name.evaluate("one => getComputedStyle(one, '::after').content") == '":"'
         expect(page.get_by_role("img", name="orbit at the bearing")).to_be_visible()
 
         level = page.locator("level-table tr", has_text="y1").first

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import httpx
 import pytest
@@ -12,7 +13,7 @@ from rotorwatch.records.monitor import MachineReadiness, Readiness, WebhookList
 from service.access.scopes import Scope
 from service.history.records import AuditEntry
 from service.runtime import Runtime
-from tests.service.browsing import PATIENCE_MS, chromium, kept, unreached, violations
+from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations
 from tests.service.monitored import GUARDED, fed, token
 
 OLD = 60
@@ -40,6 +41,15 @@ def sign_in(page: Page, url: str, text: str, view: str) -> None:
     page.goto(f"{url}/#/{view}")
     page.get_by_label("Access token").fill(text)
     page.keyboard.press("Enter")
+
+
+def test_what_there_is_none_of_has_its_heading(browser: Browser, tmp_path: Path) -> None:
+    with fed(tmp_path) as (running, _), looking(browser, running.http_url) as page:
+        page.goto(f"{running.http_url}/#/administration")
+        for heading in ("Access tokens", "Webhooks", "Audit log"):
+            expect(page.get_by_role("heading", name=heading, exact=True)).to_be_visible()
+        expect(page.locator("token-list")).to_contain_text("There is no token.")
+        assert not violations(page)
 
 
 def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtime: Runtime) -> None:

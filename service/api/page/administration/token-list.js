@@ -62,7 +62,7 @@ class TokenTable extends LiveElement {
         ],
       };
     });
-    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "Access tokens") : html("p", { class: "note" }, "There is no token."));
+    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "Access tokens") : html("div", {}, html("h2", {}, "Access tokens"), html("p", { class: "note" }, "There is no token.")));
   }
 
   /** @param {string} why */

@@ -1,26 +1,14 @@
 import { percent, stretch } from "../monitor/figures.js";
 import { html, lay } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { machineFile } from "../machine/machine-file.js";
 import { parameterReadings } from "../machine/parameter-readings.js";
 import { plainPicture } from "./plain-picture.js";
 import { rotorPicture } from "./rotor-picture.js";
 
 /** The machine as its file describes it, with what is read of each part at that part; only what is abnormal has a colour. */
 class RotorDrawing extends MachineElement {
-  /** @type {import("../machine/machine-file.js").MachineFile | null} */
-  #file = null;
+  needsFile = true;
   #why = "";
-
-  connectedCallback() {
-    super.connectedCallback();
-    this.load();
-  }
-
-  async ask() {
-    this.#file = await machineFile(this.place, this.health?.machine_hash);
-    this.show();
-  }
 
   /** @param {string} why */
   refused(why) {
@@ -29,7 +17,7 @@ class RotorDrawing extends MachineElement {
   }
 
   show() {
-    const [file, health] = [this.#file, this.health];
+    const { file, health } = this;
     if (!file || !health) return lay(this, html("p", { class: "note" }, this.#why));
     const readings = parameterReadings(health);
     const report = health.report;

@@ -1,4 +1,5 @@
 import { stretch } from "../monitor/figures.js";
+import { machineFile } from "../machine/machine-file.js";
 import { monitor, pathOf } from "../monitor/monitor.js";
 import { LiveElement } from "./live-element.js";
 
@@ -12,11 +13,27 @@ export class MachineElement extends LiveElement {
   #instead;
   /** Whether `show` needs all that is known of the latest window. */
   needsWhole = true;
+  /** Whether `show` needs the machine file, which is then asked for. */
+  needsFile = false;
+  /** The machine file; null before it is there. @type {import("../machine/machine-file.js").MachineFile | null} */
+  file = null;
 
   connectedCallback() {
     super.connectedCallback();
     this.follow(`health:${this.place}`, () => this.show());
     this.show();
+    if (this.needsFile) this.load();
+  }
+
+  async ask() {
+    if (!this.needsFile) return;
+    this.file = await this.machineFile();
+    this.show();
+  }
+
+  /** The machine file as it is in use. */
+  machineFile() {
+    return machineFile(this.place, this.health?.machine_hash);
   }
 
   attributeChangedCallback() {

@@ -1,6 +1,5 @@
 import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { machineFile } from "./machine-file.js";
 
 /** Values with their places in the file, `window.length_s` for instance; what is not given is left out. @param {unknown} value @param {string} name @returns {[string, string][]} */
 function facts(value, name) {
@@ -15,16 +14,16 @@ function facts(value, name) {
 
 /** The machine file as it is in use, line by line. */
 class MachineFacts extends MachineElement {
-  connectedCallback() {
-    super.connectedCallback();
-    this.load();
-  }
+  needsFile = true;
+  /** @type {unknown} */
+  #shown = null;
 
-  async ask() {
-    const file = await machineFile(this.place, this.health?.machine_hash);
+  show() {
+    if (!this.file || this.file === this.#shown) return;
+    this.#shown = this.file;
     this.replaceChildren(
       html("p", { class: "note" }, `The machine file as it is in use, what it leaves out filled in; units are in the names. Identity ${this.health?.machine_hash}.`),
-      html("dl", { class: "facts" }, ...facts(file, "").flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])),
+      html("dl", { class: "facts" }, ...facts(this.file, "").flatMap(([name, text]) => [html("dt", {}, name), html("dd", {}, text)])),
     );
   }
 

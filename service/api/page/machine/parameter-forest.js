@@ -1,11 +1,8 @@
 import { percent, stretch, Z95 } from "../monitor/figures.js";
 import { html, lay, svg } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
-import { machineFile } from "./machine-file.js";
 import { parameterReadings } from "./parameter-readings.js";
 import { roundUp } from "../plots/plane.js";
-
-/** @typedef {import("./machine-file.js").MachineFile} MachineFile */
 
 const [WIDTH, LEFT, ROW, TOP] = [360, 48, 46, 6];
 /** What is farther away is written at the edge: the others would be too close to be told apart. */
@@ -21,24 +18,13 @@ function mark(who, x, y) {
 
 /** What each diagnostician reads of each parameter, beside the limits and what would not be seen. */
 class ParameterForest extends MachineElement {
-  /** @type {MachineFile | null} */
-  #file = null;
-
-  connectedCallback() {
-    super.connectedCallback();
-    this.load();
-  }
-
-  async ask() {
-    this.#file = await machineFile(this.place, this.health?.machine_hash);
-    this.show();
-  }
+  needsFile = true;
 
   show() {
     const [report, readings] = [this.health?.report, parameterReadings(this.health)];
-    this.hidden = !this.#file || !report || !readings.some((one) => one.read);
-    if (this.hidden || !this.#file || !report) return;
-    const { limits, parameters } = this.#file.alarms;
+    this.hidden = !this.file || !report || !readings.some((one) => one.read);
+    if (this.hidden || !this.file || !report) return;
+    const { limits, parameters } = this.file.alarms;
     const who = [report.parameters[0].by, ...report.opinions.map((one) => one.by)];
     const rows = readings.map((one) => ({
       name: one.stated.name,

@@ -1,4 +1,3 @@
-import { machineFile } from "./machine-file.js";
 import { ReadingTrend } from "./reading-trend.js";
 
 /** @param {"alert" | "danger"} kind @param {number} limit @returns {import("./reading-trend.js").Limit[]} */
@@ -11,7 +10,7 @@ export class ParameterTrend extends ReadingTrend {
 
   /** Limits of the machine file. @returns {Promise<{limits: any, parameters: Record<string, any>}>} */
   async limits() {
-    return (await machineFile(this.place, this.health?.machine_hash)).alarms;
+    return (await this.machineFile()).alarms;
   }
 
   async trended() {

@@ -2,7 +2,6 @@ import { html } from "../elements/markup.js";
 import { MachineElement } from "../elements/machine-element.js";
 import { stretch } from "../monitor/figures.js";
 import { monitor } from "../monitor/monitor.js";
-import { machineFile } from "../machine/machine-file.js";
 
 const RECORDINGS = 40;
 
@@ -77,7 +76,7 @@ export class SamplePlot extends MachineElement {
   /** @returns {Promise<void>} */
   async ask() {
     if (!this.sensors.length) {
-      this.sensors = (await machineFile(this.place, this.health?.machine_hash)).sensors.filter((one) => one.quantity !== "shaft_angle");
+      this.sensors = (await this.machineFile()).sensors.filter((one) => one.quantity !== "shaft_angle");
       this.offer();
     }
     const asked = this.#wanted();

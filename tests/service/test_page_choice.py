@@ -1,0 +1,128 @@
+"""What the page shows of a machine first: the same that an overview leaves of its health, by the same numbers."""
+
+import itertools
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from deno import find_deno_bin
+
+import service.api
+from rotorwatch.records.alarms import Alarm
+from rotorwatch.records.example import example
+from rotorwatch.records.health import Health, Report
+from rotorwatch.records.levels import ChannelLevels, LevelLimits
+from rotorwatch.records.windows import Parameter
+from service.analysis.overview import nearness, overview
+
+STATES = Path(service.api.__file__).parent / "page" / "monitor" / "states.js"
+RAISED = [(), ("k_by",), ("level:y1",), ("stream-lost",), ("k_by", "level:z1"), ("c_by", "stream-lost", "level:y1")]
+CHANGES = [None, -0.2, 0.0, 0.03]
+LEVELS = [[], [(1.4, "normal")], [(3.0, "alert"), (0.1, "normal")], [(None, "normal"), (2.9, "danger")]]
+_ASKED = """
+import { worst } from "STATES";
+const told = await new Response(Deno.stdin.readable).json();
+console.log(JSON.stringify(told.map((one) => worst(one))));
+"""
+
+
+def limits(found: list[tuple[float | None, str]]) -> tuple[dict[str, float | None], tuple[LevelLimits, ...]]:
+    """Values of measures of a channel, and what they are judged by."""
+    measures = ["velocity", "overall"][: len(found)]
+    judged = [
+        LevelLimits.model_validate({"measure": measure, "alert": 2.8, "source": "", "state": state})
+        for measure, (_, state) in zip(measures, found, strict=True)
+    ]
+    return {measure: value for measure, (value, _) in zip(measures, found, strict=True)}, tuple(judged)
+
+
+def parameter(read: Parameter, name: str, change: float | None) -> Parameter:
+    return read.model_copy(update={"name": name, "text": name, "relative_change": change})
+
+
+def channel(level: ChannelLevels, name: str, found: list[tuple[float | None, str]]) -> ChannelLevels:
+    values, judged = limits(found)
+    return level.model_copy(update={"channel": name, "limits": judged, **values})
+
+
+def healths() -> Iterator[Health]:
+    """Every combination of alarms, readings and levels; of some parameters nothing is known that would be seen."""
+    health = Health.model_validate(example(Health))
+    report, alarm = health.report, health.alarms[0]
+    assert report is not None
+    assert report.verdict is not None
+    one, seen, level = report.parameters[0], report.detectable[0], report.levels[0]
+    least = [seen.model_copy(update={"name": name, "loss": -0.3, "gain": 0.02}) for name in ("k_by", "c_by")]
+    for raised, settled, change, other, y1, z1, known in itertools.product(
+        RAISED, (False, True), CHANGES, CHANGES, LEVELS, LEVELS, (1, 2)
+    ):
+        changes = {"k_by": change, "c_by": other}
+        stated = tuple(parameter(one, name, value) for name, value in changes.items())
+        made = Report.model_construct(
+            **{
+                **dict(report),
+                **dict.fromkeys(("opinions", "equations", "sensors", "shapes"), ()),
+                # Before the verdict is settled, what is true now is not what the whole window says.
+                "parameters": stated if settled else (*stated[:1], parameter(one, "c_by", 5.0)),
+                "detectable": tuple(least[:known]),
+                "levels": (channel(level, "y1", y1), channel(level, "z1", z1)),
+                "verdict": report.verdict.model_copy(
+                    update={"settled": settled, "current": stated, "alternatives": ()}
+                ),
+            }
+        )
+        yield health.model_copy(update={"report": made, "alarms": tuple(named(alarm, name) for name in raised)})
+
+
+def named(alarm: Alarm, name: str) -> Alarm:
+    severity = "danger" if name == "c_by" else "alert"
+    return Alarm.model_validate(
+        {**alarm.model_dump(), "name": name, "text": name, "raised": True, "severity": severity}
+    )
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[Health, dict[str, object], dict[str, object]]]:
+    """What the page finds worst, of everything and of its overview."""
+    folder = tmp_path_factory.mktemp("deno")
+    script = folder / "ask.js"
+    script.write_text(_ASKED.replace("STATES", STATES.as_uri()))
+    all_of_them = list(healths())
+    told = [one for health in all_of_them for one in (health, overview(health))]
+    quiet = {"DENO_DIR": str(folder / "cache"), "DENO_NO_UPDATE_CHECK": "1", "NO_COLOR": "1"}
+    done = subprocess.run(
+        [find_deno_bin(), "run", "--no-remote", "--quiet", str(script)],
+        input="[" + ",".join(one.model_dump_json() for one in told) + "]",
+        env=os.environ | quiet,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    answers = json.loads(done.stdout)
+    return list(zip(all_of_them, answers[::2], answers[1::2], strict=True))
+
+
+def test_an_overview_leaves_what_the_page_shows(
+    found: list[tuple[Health, dict[str, object], dict[str, object]]],
+) -> None:
+    assert len(found) > 6000
+    different = [(whole, brief) for _, whole, brief in found if whole != brief]
+    assert not different, different[:3]
+
+
+def test_what_is_nearest_to_its_limit_is_that_by_the_same_number(
+    found: list[tuple[Health, dict[str, object], dict[str, object]]],
+) -> None:
+    calm = [(health, whole) for health, whole, _ in found if not health.alarms]
+    assert len(calm) > 1000
+    for health, whole in calm:
+        assert health.report is not None
+        near = nearness(health.report)
+        first = max(near, key=near.__getitem__)
+        assert whole["nearness"] == pytest.approx(near[first], rel=1e-12)
+        series = str(whole["series"])
+        assert first == (series if whole["quantity"] == "parameter" else f"level:{series.partition(':')[0]}")
