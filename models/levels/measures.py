@@ -48,12 +48,12 @@ COMPARED = ("overall", "velocity", "s_max", "x1", "x2", "high", "envelope")
 """Those that are compared with a reference."""
 
 _SUMS = ("mean", "mean_square", "peak", "peak_to_peak", "fourth", "velocity_square", "high_square", "envelope_square")
-_REGRESSORS = 2 * len(ORDERS)
-"""Cosine and sine of each order; the mean stands for itself."""
 _HIGH_HZ = 1000.0
 NYQUIST_PART = 0.8
 """Part of half the sampling rate up to which spectra are used: above it anti-aliasing filters fall off."""
 _MANY_REVOLUTIONS = 8.0
+_SAMPLES_A_TURN = 8.0
+"""At least: products of two orders go up to six times running speed."""
 _HANN_BINS = 1.5
 """Bins of a tapered spectrum that say as much as one of an untapered one."""
 _STANDS = 2 * np.pi * 0.5
@@ -204,7 +204,7 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     angle_rad : ndarray, shape (n_samples,), or None
         Shaft angle, or one that turns with it from an unknown zero.
     """
-    rows = np.ascontiguousarray(samples.T)
+    rows = samples.T
     n, n_samples = rows.shape
     mean = rows @ np.full(n_samples, 1 / n_samples)
     low, high = rows.min(axis=1) - mean, rows.max(axis=1) - mean
@@ -212,9 +212,9 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     # Single precision is enough for what is left without the mean, and quicker. In parts of the peak: fourth powers of
     # metres would leave its range.
     unit = np.where(peak > 0, peak, 1.0)
-    every = np.zeros((_REGRESSORS + n, n_samples), np.float32)  # with room for what the orders are fitted with
-    x = every[_REGRESSORS:]
-    np.multiply(rows - mean[:, None], 1 / unit[:, None], out=x, casting="same_kind")
+    deviations = np.subtract(rows, mean[:, None], order="C")
+    deviations *= 1 / unit[:, None]
+    x = deviations.astype(np.float32)
     square = x * x
     sums = np.full((len(_SUMS), n), np.nan)
     sums[0] = mean
@@ -241,7 +241,7 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
         if skew:
             distance -= 2 * skew * first * second * x[y] * x[z]
         radius.append(larger * np.sqrt(float(distance.max()) / (1 - skew**2)))
-    orders = unit * _orders(every, angle_rad)
+    orders = unit * _orders(x, spectrum, angle_rad)
     return HopLevels(n_samples, sums, orders, np.array(radius), np.ascontiguousarray(bands.T))
 
 
@@ -260,7 +260,7 @@ def _band_squares(
     first = max(first, 1)
     found = np.full((3, casing.size), np.nan)
     band = parts[:, 2 * first : 2 * last + 2]
-    accelerations = np.isin(casing, plan.columns(Quantity.ACCELERATION))
+    accelerations = np.array([plan.quantities[column] is Quantity.ACCELERATION for column in casing])
     found[0] = band.sum(axis=1)[casing]
     if accelerations.any():
         omega = 2 * np.pi * step_hz * np.arange(first, first + band.shape[1] // 2)
@@ -278,42 +278,52 @@ def _band_squares(
     return found
 
 
-def _orders(every: _SingleArray, angle_rad: FloatArray | None) -> _ComplexArray:
+def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: FloatArray | None) -> _ComplexArray:
     """Amplitudes at the orders, by weighted least squares: exact for orders, whatever the number of revolutions.
+
+    Over many revolutions the samples are tapered, so that other lines stay out, and thinned out: tapered, they begin
+    and end with nothing, so the low end of their spectrum is the same signal in fewer samples, in which nothing that
+    the orders see is missing.
 
     Parameters
     ----------
-    every : ndarray, shape (n_regressors + n, n_samples)
-        Room for the regressors, and the samples.
+    x : ndarray, shape (n, n_samples)
+    spectrum : ndarray, shape (n, n_samples // 2 + 1)
+        Of the tapered samples.
     """
-    x = every[_REGRESSORS:]
-    nothing = np.full((len(ORDERS), x.shape[0]), np.nan, dtype=np.complex128)
+    n, n_samples = x.shape
+    nothing = np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     if angle_rad is None:
         return nothing
-    # Half the angle, without the steps of whole turns.
     steps = np.diff(angle_rad)
-    at = np.flatnonzero(np.abs(steps) > np.pi)
-    turns = np.concatenate([[0.0], np.cumsum(np.round(steps[at] / (2 * np.pi)))])
-    half = angle_rad / 2 - np.repeat(np.pi * turns, np.diff(at + 1, prepend=0, append=angle_rad.size))
-    many = abs(half[-1] - half[0]) >= np.pi * _MANY_REVOLUTIONS
-    half -= 2 * np.pi * np.round(half / (2 * np.pi))
-    if many:
-        half = half.astype(np.float32)
-    else:  # orders are nearly alike then: what tells them apart needs the digits
-        every = every.astype(np.float64)
-    regressors, cos, sin = every[:_REGRESSORS], every[:_REGRESSORS:2], every[1:_REGRESSORS:2]
+    size = np.abs(steps)
+    whole = np.flatnonzero(size > np.pi)  # where it begins anew from zero
+    turns = np.round(steps[whole] / (2 * np.pi)).sum()
+    if abs(angle_rad[-1] - angle_rad[0] - 2 * np.pi * turns) < 2 * np.pi * _MANY_REVOLUTIONS:
+        # Orders are nearly alike then: what tells them apart needs all digits.
+        angle, tapered, weights, every = angle_rad, x.astype(np.float64), np.ones(n_samples), 1
+    else:
+        size[whole] = 0  # a whole turn beside a step like all others
+        most = int(2 * np.pi / (_SAMPLES_A_TURN * size.max()))
+        every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
+        angle, kept = angle_rad[::every], n_samples // every
+        tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
+        weights = _taper(kept)
+    half = angle / 2
+    half[1:] -= np.pi * np.cumsum(np.round(np.diff(angle) / (2 * np.pi)))
+    half = (half - 2 * np.pi * np.round(half / (2 * np.pi))).astype(tapered.dtype)
+    regressors = np.empty((1 + 2 * len(ORDERS), half.size), half.dtype)
+    regressors[0], cos, sin = 1, regressors[1::2], regressors[2::2]
     np.cos(half, out=cos[0])
     np.sin(half, out=sin[0])
     for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):  # cos and sin of a sum of angles
         cos[row] = cos[first] * cos[second] - sin[first] * sin[second]
         sin[row] = sin[first] * cos[second] + cos[first] * sin[second]
-    # Many are tapered, so that other lines stay out. With a row for the mean the product would take twice as long.
-    weights = _taper(half.size) if many else np.ones_like(half)
-    products = np.empty((1 + _REGRESSORS, 1 + every.shape[0]))
-    products[0] = weights.sum(), *(every @ weights)
-    products[1:, 0], products[1:, 1:] = products[0, 1 : 1 + _REGRESSORS], (every @ (regressors * weights).T).T
     try:
-        solved = np.linalg.solve(products[:, : 1 + _REGRESSORS], products[:, 1 + _REGRESSORS :])
+        solved = np.linalg.solve(
+            every * ((regressors * weights) @ regressors.T).astype(np.float64),
+            (regressors @ tapered.T).astype(np.float64),
+        )
     except np.linalg.LinAlgError:  # a shaft that stands still
         return nothing
     return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)

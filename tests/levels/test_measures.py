@@ -107,6 +107,22 @@ def test_orders_with_a_phase_reference_are_amplitude_and_phase_lag() -> None:
     assert found.values["not_x1"][0] == pytest.approx(np.sqrt((100 + 16 + 36) / 2) * 1e-6, rel=5e-3)
 
 
+@pytest.mark.parametrize("n_samples", [10_000, 10_240, 9_973])
+@pytest.mark.parametrize("turns_hz", [(2.0, 2.0), (23.7, 23.7), (-23.7, -23.7), (124.0, 124.0), (310.0, 310.0), (5, 60)])
+def test_orders_are_those_of_a_fit_to_every_sample(n_samples: int, turns_hz: tuple[float, float]) -> None:
+    rng, rate_hz = np.random.default_rng(97), 2000.0
+    theta = 2 * np.pi * np.cumsum(np.linspace(*turns_hz, n_samples)) / rate_hz + 0.4
+    regressors = np.stack([np.ones(n_samples), *(f(k * theta) for k in (0.5, 1, 2, 3) for f in (np.cos, np.sin))])
+    clean = np.array([5.0, 0.3, 0.2, 1.0, -0.5, 0.1, 0.4, -0.2, 0.3]) @ regressors
+    x = np.column_stack([clean, clean + rng.standard_normal(n_samples)])
+    taper = np.hanning(n_samples + 1)[:-1]
+    exact = np.linalg.solve((regressors * taper) @ regressors.T, (regressors * taper) @ x)
+    sizes = plan("displacement", "displacement", rate_hz=rate_hz)
+    found = hop_levels(sizes, x, np.mod(theta, 2 * np.pi)).orders
+    error = np.sqrt(1.5 * 2 / n_samples)  # of a vector's parts, Hann's taper and noise of one
+    assert np.abs(found - (exact[1::2] - 1j * exact[2::2]))[1:] == pytest.approx(0, abs=0.02 * error)
+
+
 @pytest.mark.parametrize("revolutions", [1.3, 2.5, 6.2])
 def test_a_snapshot_of_few_revolutions_keeps_the_orders_apart(revolutions: float) -> None:
     t = np.arange(0.1, 0.1 + revolutions / 25, 1 / RATE_HZ)
