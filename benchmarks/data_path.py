@@ -21,6 +21,8 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import load_bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.window import SlidingWindow, WindowStatistics
+from models.levels.measures import hop_levels
+from service.monitor.levels import LevelWatch
 from service.monitor.monitor import MachineMonitor
 from simulator.scenario import load_scenario
 from simulator.stream import blocks
@@ -44,7 +46,7 @@ def main() -> None:
     scenario, machine = load_scenario("healthy")
     scenario = scenario.overridden(seed=1, duration_s=DATA_S)
     stream = [block for block, _ in blocks(scenario, machine)]
-    bundle, plan = load_bundle("lab", machine), plan_for(machine)
+    bundle, plan = load_bundle("lab", machine), plan_for(machine, levels=True)
     window = SlidingWindow(plan)
     windows: list[WindowStatistics] = []
     samples = np.concatenate([plan.to_si(block.samples) for block in stream])
@@ -54,6 +56,10 @@ def main() -> None:
             windows.append(full)
     piece = samples[: plan.preamble + plan.hop]
     level = piece[:, : len(plan.states)].mean(axis=0)
+    rows = np.ascontiguousarray(piece.T)  # as the moments have them
+    own, angle, measured = rows[:-1, -plan.hop :].T, rows[-1, -plan.hop :], plan.levels
+    levels = LevelWatch(plan, machine, Installed(machine, bundle))
+    assert measured is not None  # noqa: S101  # planned above
     fit, relation = LikelihoodFit(machine), RelationDiagnostician(machine, bundle.networks)
     if bundle.amortised is None:
         raise SystemExit("the shipped bundle has no amortised networks: train it again")
@@ -67,6 +73,9 @@ def main() -> None:
         for number in range(plan.hop // half):
             np.fft.rfft(piece[number * half : number * half + plan.segment], axis=0)
 
+    def often(work: Callable[[], object]) -> float:
+        return median_s(lambda: [work() for _ in range(100)], 100)
+
     def whole() -> None:
         monitor = MachineMonitor(Installed(machine, bundle))
         for block in stream:
@@ -76,6 +85,8 @@ def main() -> None:
     costs = {
         "Fourier transforms alone (yardstick)": median_s(yardstick, 1),
         "moments of a hop": median_s(lambda: hop_moments(plan, piece, level, 0), 1),
+        "  of which levels of the hop": often(lambda: hop_levels(measured, own, angle)),
+        "levels of a window, judged": often(lambda: levels.take(window)),
         "statistics of a window": median_s(window.statistics, 1),
         "likelihood, warm": median_s(lambda: [fit.diagnose(one) for one in windows], len(windows)),
         "likelihood, followed": median_s(lambda: [following.diagnose(one) for one in windows], len(windows)),

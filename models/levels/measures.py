@@ -97,7 +97,14 @@ class LevelPlan:
 
     def columns(self, *quantities: Quantity) -> npt.NDArray[np.intp]:
         """Columns of some quantities."""
-        return np.array([at for at, one in enumerate(self.quantities) if one in quantities], dtype=np.intp)
+        return _columns(self.quantities, quantities)
+
+
+@lru_cache(maxsize=64)
+def _columns(every: tuple[Quantity, ...], wanted: tuple[Quantity, ...]) -> npt.NDArray[np.intp]:
+    columns = np.array([at for at, one in enumerate(every) if one in wanted], dtype=np.intp)
+    columns.flags.writeable = False
+    return columns
 
 
 def level_plan(
@@ -206,7 +213,7 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     """
     rows = samples.T
     n, n_samples = rows.shape
-    mean = rows @ np.full(n_samples, 1 / n_samples)
+    mean = rows @ _shares(n_samples)
     low, high = rows.min(axis=1) - mean, rows.max(axis=1) - mean
     peak = np.maximum(high, -low)
     # Single precision is enough for what is left without the mean, and quicker. In parts of the peak: fourth powers of
@@ -223,11 +230,10 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     sums[3] = high - low
     sums[4] = unit**4 * np.vecdot(square, square) / n_samples
     # Strong lines must not leak into the low end of a band, where integration would magnify them.
-    taper = _taper(n_samples)
+    taper, scale = _taper(n_samples)
     spectrum = scipy.fft.rfft(x * taper, axis=1)
     parts = spectrum.view(np.float32)  # real, imaginary, real ...
     parts = parts * parts
-    scale = 2 / (n_samples * float(taper @ taper))
     casing = plan.columns(Quantity.VELOCITY, Quantity.ACCELERATION)
     if casing.size:
         sums[5:, casing] = unit[casing] ** 2 * _band_squares(plan, spectrum, parts, n_samples, casing)
@@ -253,9 +259,8 @@ def _band_squares(
     casing: npt.NDArray[np.intp],
 ) -> FloatArray:
     """Mean squares of velocity in the band, of the high-frequency band and of its envelope; shape (3, n)."""
-    taper = _taper(n_samples)
+    taper, scale = _taper(n_samples)
     step_hz = plan.rate_hz / n_samples
-    scale = 2 / (n_samples * float(taper @ taper))
     first, last = (round(edge / step_hz) for edge in plan.band_hz)
     first = max(first, 1)
     found = np.full((3, casing.size), np.nan)
@@ -295,6 +300,8 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
     nothing = np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     if angle_rad is None:
         return nothing
+    tapered: FloatArray | _SingleArray
+    weights: FloatArray | _SingleArray
     steps = np.diff(angle_rad)
     size = np.abs(steps)
     whole = np.flatnonzero(size > np.pi)  # where it begins anew from zero
@@ -308,7 +315,7 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
         every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
         angle, kept = angle_rad[::every], n_samples // every
         tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
-        weights = _taper(kept)
+        weights, _ = _taper(kept)
     half = angle / 2
     half[1:] -= np.pi * np.cumsum(np.round(np.diff(angle) / (2 * np.pi)))
     half = (half - 2 * np.pi * np.round(half / (2 * np.pi))).astype(tapered.dtype)
@@ -330,11 +337,19 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
 
 
 @lru_cache(maxsize=8)
-def _taper(size: int) -> _SingleArray:
-    """Hann's, of so many samples."""
+def _taper(size: int) -> tuple[_SingleArray, float]:
+    """Hann's, of so many samples, and what makes mean squares of the squares of its bins."""
     taper = np.hanning(size + 1)[:-1].astype(np.float32)
     taper.flags.writeable = False
-    return taper
+    return taper, 2 / (size * float(taper @ taper))
+
+
+@lru_cache(maxsize=8)
+def _shares(size: int) -> FloatArray:
+    """What makes the mean of so many samples."""
+    shares = np.full(size, 1 / size)
+    shares.flags.writeable = False
+    return shares
 
 
 @dataclass(frozen=True, slots=True)
@@ -419,9 +434,11 @@ def window_levels(
         "high": True,
         "envelope": True,
     }
+    every = np.stack(list(by_hop.values()))
+    means, squares = every.mean(axis=1), (every**2).mean(axis=1)
     taken = {
-        name: np.where(rms_of[name], np.sqrt((each**2).mean(axis=0)), each.mean(axis=0))
-        for name, each in by_hop.items()
+        name: np.where(rms_of[name], np.sqrt(power), level)
+        for name, level, power in zip(by_hop, means, squares, strict=True)
     }
     with np.errstate(divide="ignore", invalid="ignore"):
         values = taken | {
@@ -432,7 +449,7 @@ def window_levels(
             "crest": peak / rms,
             "kurtosis": sums[:, 4].mean(axis=0) / sums[:, 1].mean(axis=0) ** 2,
         }
-    errors = {name: each.std(axis=0) / np.sqrt(max(1, count - 1)) for name, each in by_hop.items()}
+    errors = dict(zip(by_hop, every.std(axis=1) / np.sqrt(max(1, count - 1)), strict=True))
     errors |= {name: shown * scatter[number] for number, name in enumerate(ORDERS) if name in COMPARED}
     in_bands = np.sqrt(np.stack([hop.bands for hop in hops]))
     edges = band_edges(hops[0].n_samples, NYQUIST_PART) - 0.5  # halfway between bins
