@@ -108,7 +108,7 @@ def test_orders_with_a_phase_reference_are_amplitude_and_phase_lag() -> None:
 
 
 @pytest.mark.parametrize("n_samples", [10_000, 10_240, 9_973])
-@pytest.mark.parametrize("turns_hz", [(2.0, 2.0), (23.7, 23.7), (-23.7, -23.7), (124.0, 124.0), (310.0, 310.0), (5, 60)])
+@pytest.mark.parametrize("turns_hz", [(2, 2), (23.7, 23.7), (-23.7, -23.7), (124, 124), (310, 310), (5, 60)])
 def test_orders_are_those_of_a_fit_to_every_sample(n_samples: int, turns_hz: tuple[float, float]) -> None:
     rng, rate_hz = np.random.default_rng(97), 2000.0
     theta = 2 * np.pi * np.cumsum(np.linspace(*turns_hz, n_samples)) / rate_hz + 0.4
