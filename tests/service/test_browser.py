@@ -189,15 +189,15 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
     broken: list[str] = []
     for kind, phone, dark in (("light", False, False), ("dark", False, True), ("phone", True, False)):
         with looking(browser, url, phone=phone, dark=dark) as page:
-            for name, path in VIEWS.items():
+            for view, path in VIEWS.items():
                 page.goto(f"{url}/#/{path}")
-                expect(page.locator(f"{name}-view" if name != "alarms" else "alarms-view alarm-list")).to_contain_text(
+                expect(page.locator(f"{view}-view" if view != "alarms" else "alarms-view alarm-list")).to_contain_text(
                     "lab"
                 )
-                if name == "machine":
+                if view == "machine":
                     expect(page.locator("spectrum-plot canvas")).to_be_visible()
-                kept(page, f"{name}-{kind}")
-                broken += [f"{name}, {kind}: {one}" for one in violations(page)]
+                kept(page, f"{view}-{kind}")
+                broken += [f"{view}, {kind}: {one}" for one in violations(page)]
                 broken += [f"{name}: {one}" for one in unreached(page)] if kind == "light" else []
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
                 ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")

@@ -21,7 +21,12 @@ from service.analysis.overview import nearness, overview
 STATES = Path(service.api.__file__).parent / "page" / "monitor" / "states.js"
 RAISED = [(), ("k_by",), ("level:y1",), ("stream-lost",), ("k_by", "level:z1"), ("c_by", "stream-lost", "level:y1")]
 CHANGES = [None, -0.2, 0.0, 0.03]
-LEVELS = [[], [(1.4, "normal")], [(3.0, "alert"), (0.1, "normal")], [(None, "normal"), (2.9, "danger")]]
+LEVELS: list[list[tuple[float | None, str]]] = [
+    [],
+    [(1.4, "normal")],
+    [(3.0, "alert"), (0.1, "normal")],
+    [(None, "normal"), (2.9, "danger")],
+]
 _ASKED = """
 import { worst } from "STATES";
 const told = await new Response(Deno.stdin.readable).json();
