@@ -198,7 +198,7 @@ def test_a_fault_is_seen_understood_and_acknowledged(browser: Browser, plant: Pl
                     expect(page.locator("spectrum-plot canvas")).to_be_visible()
                 kept(page, f"{view}-{kind}")
                 broken += [f"{view}, {kind}: {one}" for one in violations(page)]
-                broken += [f"{name}: {one}" for one in unreached(page)] if kind == "light" else []
+                broken += [f"{view}: {one}" for one in unreached(page)] if kind == "light" else []
                 assert page.evaluate("document.documentElement.scrollWidth") == (390 if phone else 1360)
                 ground = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
                 assert (int(re.findall(r"\d+", ground)[0]) < 80) is dark
