@@ -23,7 +23,7 @@ class TokenTable extends LiveElement {
   connectedCallback() {
     super.connectedCallback();
     this.#scopes = SCOPES.map(([scope]) => /** @type {HTMLInputElement} */ (html("input", { type: "checkbox", value: scope, checked: scope === "read" && monitor.may(scope), disabled: !monitor.may(scope) })));
-    const boxes = SCOPES.map(([scope, text], at) => html("label", { class: "check" }, this.#scopes[at], html("span", {}, html("b", {}, scope), html("small", {}, ` ${text}${monitor.may(scope) ? "" : "; yours has not this scope"}`))));
+    const boxes = SCOPES.map(([scope, text], at) => html("label", { class: "check" }, this.#scopes[at], html("span", {}, html("b", {}, scope), html("small", {}, ` ${text}${monitor.may(scope) ? "" : "; yours does not have it"}`))));
     this.replaceChildren(
       this.#open,
       this.#message,
