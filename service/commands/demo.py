@@ -13,6 +13,7 @@ simulator beforehand::
     healthy    first fault    repaired       next fault     repaired    ...
 """
 
+import json
 import os
 import queue
 import shutil
@@ -62,9 +63,17 @@ _ENVIRONMENT = {
     "ROTORWATCH_HISTORY__URL": "sqlite:///:memory:",
     "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
 }
+_RECORDING = {
+    "rotate_s": 10.0,  # so that what is replayed need not be waited for
+    "rotate_mb": 50.0,
+    "keep_gb": 0.15,
+    "alarm_keep_gb": 0.15,
+    "alarm_before_s": 60.0,
+    "alarm_after_s": 60.0,
+}
 # A program that ends when the other end of its standard input is gone: however the demo ends, killed or not.
 _TIED = """
-import os, runpy, signal, sys, threading, time
+import atexit, os, runpy, shutil, signal, sys, threading, time
 def tied():
     while os.read(0, 1):
         pass
@@ -72,7 +81,9 @@ def tied():
     time.sleep(20)
     os._exit(1)
 threading.Thread(target=tied, daemon=True).start()
-sys.argv = sys.argv[1:]
+if sys.argv[1]:
+    atexit.register(shutil.rmtree, sys.argv[1], True)
+sys.argv = sys.argv[2:]
 runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 """
 
@@ -195,9 +206,10 @@ class _Show:
 
     def run(self, stack: ExitStack) -> bool:
         """Start both programs and show what comes, to the end; whether exactly what was injected was named."""
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rotorwatch-demo-", ignore_cleanup_errors=True))
         monitor = stack.enter_context(
             _program("monitor", "service.rotorwatch", "run", "--listen", self._endpoint,
-                     "--http-port", self._url.rpartition(":")[2])
+                     "--http-port", self._url.rpartition(":")[2], recordings=folder)
         )  # fmt: skip
         _wait_until_ready(self._url, monitor)
         link = LinkSettings(mode="client", connect=(self._endpoint,))
@@ -341,17 +353,18 @@ class _Program:
 
 
 @contextmanager
-def _program(name: str, module: str, *arguments: str) -> Iterator[_Program]:
-    """Run a program beside this one; it is gone when the block is left, however it is left."""
+def _program(name: str, module: str, *arguments: str, recordings: str = "") -> Iterator[_Program]:
+    """Run a program beside this one; it is gone when the block is left, however it is left, and so is its folder."""
+    recording = {"ROTORWATCH_RECORDING": json.dumps({**_RECORDING, "directory": recordings})} if recordings else {}
     with tempfile.TemporaryFile() as output:  # has no name, so that it cannot be left behind
         process = subprocess.Popen(  # noqa: S603  # our own modules, no shell
-            [sys.executable, "-c", _TIED, module, *arguments],
+            [sys.executable, "-c", _TIED, recordings, module, *arguments],
             stdout=output,
             stderr=subprocess.STDOUT,
             stdin=subprocess.PIPE,
             # A session of its own: Ctrl-C reaches this program alone, which then stops the others in order.
             start_new_session=True,
-            env=os.environ | _ENVIRONMENT,
+            env=os.environ | _ENVIRONMENT | recording,
         )
         try:
             yield _Program(name, process, output)

@@ -87,7 +87,7 @@ class PlantView extends HTMLElement {
   #count(healths) {
     const chosen = this.#filter.value;
     const count = (/** @type {string} */ state) => healths.filter((one) => one.state === state || (state === "no-data" && one.stream.silent)).length;
-    const options = [["", `all ${healths.length} machines`], ...Object.entries(STATES).flatMap(([state, text]) => (count(state) || state === chosen ? [[state, `${text} (${count(state)})`]] : []))];
+    const options = [["", `all machines (${healths.length})`], ...Object.entries(STATES).flatMap(([state, text]) => (count(state) || state === chosen ? [[state, `${text} (${count(state)})`]] : []))];
     const said = options.map(([, text]) => text).join();
     if (this.#filter.dataset.said === said) return;
     this.#filter.dataset.said = said;

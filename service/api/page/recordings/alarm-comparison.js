@@ -1,13 +1,38 @@
-import { clock } from "../monitor/figures.js";
+import { clock, lasting } from "../monitor/figures.js";
 import { html, lay, table } from "../elements/markup.js";
 import { API, monitor, pathOf } from "../monitor/monitor.js";
 import { differences } from "./replay-list.js";
 import "../elements/state-mark.js";
 
 const EVENTS = 1000;
+/** Events of one kind that are no farther apart than this are the same one, earlier or later: windows of a replay need not end when those that were live did. */
+const SAME_NS = 120e9;
 
 /** @typedef {import("../monitor/records.js").AlarmEvent} AlarmEvent */
 /** @typedef {import("../monitor/records.js").ReplayJob} ReplayJob */
+
+/**
+ * Events of both lists, in the order of time, those that are the same together.
+ * @param {AlarmEvent[]} here @param {AlarmEvent[]} there
+ * @returns {{here?: AlarmEvent, there?: AlarmEvent}[]}
+ */
+function paired(here, there) {
+  const left = new Set(there);
+  const found = here.map((one) => {
+    const [nearest] = [...left].filter((other) => other.name === one.name && other.kind === one.kind && Math.abs(other.time_ns - one.time_ns) <= SAME_NS).sort((a, b) => Math.abs(a.time_ns - one.time_ns) - Math.abs(b.time_ns - one.time_ns));
+    left.delete(nearest);
+    return { here: one, there: nearest };
+  });
+  const time = (/** @type {{here?: AlarmEvent, there?: AlarmEvent}} */ { here: one, there: other }) => Number((one ?? other)?.time_ns);
+  return [...found, ...[...left].map((one) => ({ there: one }))].sort((one, other) => time(one) - time(other));
+}
+
+/** Where an event is. @param {AlarmEvent | undefined} here @param {AlarmEvent | undefined} there @param {string} other */
+function where(here, there, other) {
+  if (!here || !there) return html("strong", {}, here ? "this replay only" : `${other} only`);
+  const later_s = (here.time_ns - there.time_ns) / 1e9;
+  return Math.abs(later_s) < 0.5 ? "both" : `both, ${lasting(Math.abs(later_s))} ${later_s > 0 ? "later" : "earlier"} in this replay`;
+}
 
 /** Alarms as a replay would have raised them, beside those that were raised, or that another replay would have raised. */
 class AlarmComparison extends HTMLElement {
@@ -54,21 +79,20 @@ class AlarmComparison extends HTMLElement {
   /** @param {string} beside @param {AlarmEvent[]} others */
   #lay(beside, others) {
     const own = ["raised", "escalated", "cleared"]; // what operators do is no affair of a replay
-    const key = (/** @type {AlarmEvent} */ one) => `${one.name} ${one.kind} ${Math.round(one.time_ns / 1e6)}`;
-    const [here, there] = [this.#events, others].map((list) => new Map(list.filter((one) => own.includes(one.kind)).map((one) => [key(one), one])));
+    const [ours, theirs] = [this.#events, others].map((list) => list.filter((one) => own.includes(one.kind)));
     const other = beside === "live" ? "live" : "the other replay";
-    const all = [...new Map([...there, ...here])].sort(([, one], [, two]) => one.time_ns - two.time_ns);
-    const rows = all.map(([name, one]) => ({
-      attributes: { class: one.kind === "cleared" ? null : one.severity },
-      cells: [
+    const rows = paired(ours, theirs).map(({ here, there }) => {
+      const one = /** @type {AlarmEvent} */ (here ?? there);
+      const cells = [
         html("time", { class: "number" }, clock(one.time_ns)),
         html("span", {}, one.kind),
         one.kind === "cleared" ? "" : html("state-mark", { state: one.severity }),
         html("span", {}, one.text),
-        html("span", {}, !beside ? "this replay" : here.has(name) && there.has(name) ? "both" : html("strong", {}, here.has(name) ? "this replay only" : `${other} only`)),
+        html("span", {}, beside ? where(here, there, other) : "this replay"),
         html("div", { class: "actions" }, html("button", { type: "button", "aria-label": `Show the window at ${clock(one.time_ns)}`, click: () => this.#go(one.time_ns) }, "Show window")),
-      ],
-    }));
+      ];
+      return { attributes: { class: one.kind === "cleared" ? null : one.severity }, cells };
+    });
     lay(this.#rows, rows.length ? table(["time", "what", "severity", "event", "where", "window"], rows, "") : html("p", {}, beside ? `No alarm was raised, neither in this replay nor ${beside === "live" ? "live" : "in the other one"}.` : "No alarm would have been raised."));
   }
 }

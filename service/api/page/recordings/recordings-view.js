@@ -19,6 +19,7 @@ class RecordingsView extends LiveElement {
   #line = /** @type {any} */ (html("recording-line"));
   #table = /** @type {any} */ (html("recording-table"));
   #order = /** @type {any} */ (html("replay-order"));
+  #parts = [this.#line, this.#order, this.#table];
   #said = "";
   /** @type {RecordingEntry[]} */
   #recordings = [];
@@ -29,12 +30,12 @@ class RecordingsView extends LiveElement {
 
   connectedCallback() {
     super.connectedCallback();
-    for (const part of [this.#line, this.#table, this.#order])
+    for (const part of this.#parts)
       part.addEventListener("choose", (/** @type {CustomEvent<Chosen>} */ { detail }) => {
         this.#chosen = detail;
         this.#show();
       });
-    lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.#message, this.#line, this.#order, this.#table, html("replay-list"));
+    lay(this, html("div", { class: "tools" }, html("h1", {}, "Recordings"), this.#machine), this.#message, ...this.#parts, html("replay-list"));
     let heard = monitor.machines.size;
     this.follow("health", () => {
       if (heard === monitor.machines.size) return;
@@ -52,6 +53,7 @@ class RecordingsView extends LiveElement {
 
   async ask() {
     const newest = /** @type {RecordingEntry[]} */ ((await monitor.ask(`${API}/recordings?latest=1`)).recordings);
+    this.#offer(newest.length > 0);
     const places = [...new Set(newest.map((one) => `${one.site}/${one.machine}`))];
     const chosen = this.#machine.value || decodeURIComponent(this.getAttribute("place") ?? "") || places[0];
     if (this.#machine.options.length !== places.length) this.#machine.replaceChildren(...places.map((place) => html("option", { value: place, selected: place === chosen }, place)));
@@ -77,12 +79,18 @@ class RecordingsView extends LiveElement {
     this.#show();
   }
 
+  /** Where nothing is recorded, there is nothing to choose. @param {boolean} any */
+  #offer(any) {
+    for (const part of this.#parts) part.hidden = !any;
+  }
+
   #show() {
-    for (const part of [this.#line, this.#table, this.#order]) part.show(this.#machine.value, this.#recordings, this.#alarms, this.#chosen);
+    for (const part of this.#parts) part.show(this.#machine.value, this.#recordings, this.#alarms, this.#chosen);
   }
 
   /** @param {string} why */
   refused(why) {
+    this.#offer(this.#recordings.length > 0);
     this.#message.textContent = why;
   }
 }

@@ -21,6 +21,8 @@ class ReplayView extends LiveElement {
   #body = html("div");
   /** @type {EventSource | null} */
   #stream = null;
+  /** The scrubber stays below the banner, whose lines are more on a phone. */
+  #sized = new ResizeObserver(() => this.style.setProperty("--banner", `${this.#banner.offsetHeight}px`));
 
   get #path() {
     return `${API}/replays/${this.getAttribute("place")}`;
@@ -29,11 +31,13 @@ class ReplayView extends LiveElement {
   connectedCallback() {
     super.connectedCallback();
     lay(this, this.#banner, html("div", { class: "replay-frame" }, this.#head, html("div", { class: "tools" }, this.#state, this.#bar, this.#stop), this.#message, this.#body));
+    this.#sized.observe(this.#banner);
     this.load();
   }
 
   disconnectedCallback() {
     super.disconnectedCallback();
+    this.#sized.disconnect();
     this.#stream?.close();
   }
 
