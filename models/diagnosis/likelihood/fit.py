@@ -17,7 +17,7 @@ from models.checkpoint import checked, prefixed, texts, unprefixed
 from models.diagnosis.likelihood.following import Linearised
 from models.diagnosis.likelihood.goodness import MOST_MISFIT, goodness_of_fit, unexplained_at, unseen
 from models.diagnosis.likelihood.motions import BinGroups, Motions, group_bins, integrated
-from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened, Workspace
+from models.diagnosis.likelihood.scoring import FisherScoring, Maximum, Weights, Whitened
 from models.diagnosis.likelihood.spectral_model import (
     COLUMNS,
     ROWS,
@@ -73,7 +73,6 @@ class LikelihoodFit:
         self._line_band: tuple[FloatArray, npt.NDArray[np.bool_]] | None = None
         self._latest: tuple[WindowStatistics, SpectralModel, ModelPoint, FloatArray, float] | None = None
         self._groups: dict[bytes, BinGroups] = {}
-        self._workspace = Workspace()
 
     def reset(self) -> None:
         """Start the next window cold."""
@@ -346,9 +345,7 @@ class LikelihoodFit:
         self, model: SpectralModel, window: WindowStatistics, speed: float, strength: float | None = None
     ) -> FisherScoring:
         observed = _observed(model, window)
-        return FisherScoring(
-            model, observed, window.n_segments, speed, self._usual_cutoff_hz, strength, self._workspace
-        )
+        return FisherScoring(model, observed, window.n_segments, speed, self._usual_cutoff_hz, strength)
 
     def _grouped(self, frequencies_hz: FloatArray, excluded: npt.NDArray[np.bool_], coarser: float) -> BinGroups:
         """Groups for frequencies and excluded bins, remembered while the speed stays in the same bin."""

@@ -61,21 +61,6 @@ class Maximum:
     remaining: FloatArray
 
 
-class Workspace:
-    """Large arrays that one search after the other uses: allocating them takes longer than filling them."""
-
-    def __init__(self) -> None:
-        self._arrays: dict[tuple[int, ...], tuple[FloatArray, FloatArray]] = {}
-
-    def arrays(self, shape: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
-        """Return two arrays of this shape with arbitrary contents."""
-        if shape not in self._arrays:
-            if len(self._arrays) >= 4:
-                self._arrays.clear()
-            self._arrays[shape] = np.empty(shape), np.empty(shape)
-        return self._arrays[shape]
-
-
 class Weights:
     """How much a window's data count, and how strongly usual values pull at what they leave undetermined.
 
@@ -133,8 +118,6 @@ class FisherScoring:
     strength : float, optional
         How strongly the forces' own colours are pulled towards none until the window itself has said so; the weakest
         pull without it.
-    workspace : Workspace, optional
-        Shared by searches that follow each other; the slopes of a `Maximum` are valid until the next one.
     """
 
     def __init__(
@@ -145,12 +128,11 @@ class FisherScoring:
         speed_rad_s: float,
         usual_cutoff_hz: float,
         strength: float | None = None,
-        workspace: Workspace | None = None,
     ) -> None:
-        workspace = Workspace() if workspace is None else workspace
         self._model, self._observed, self._speed_rad_s = model, observed, speed_rad_s
         self.weights = Weights(model, n_segments, usual_cutoff_hz, strength)
-        self._slopes, self._weighted = workspace.arrays((model.size, model.groups.bins.size, model.n * model.n))
+        shape = (model.size, model.groups.bins.size, model.n * model.n)
+        self._slopes, self._weighted = np.empty(shape), np.empty(shape)  # filled by every step
 
     @property
     def centre(self) -> FloatArray:
