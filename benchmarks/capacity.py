@@ -15,7 +15,6 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import json
 import signal
-import socket
 import tempfile
 import threading
 import time
@@ -27,7 +26,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import zenoh
-from running_monitor import started, url_of
+from running_monitor import on_loopback, started, url_of
 
 from models.diagnosis.moments import plan_for
 from models.machine import MachineFile, load_machine
@@ -125,23 +124,14 @@ class Plant:
 @contextmanager
 def monitored(folder: Path, machines: Sequence[MachineFile]) -> Iterator[tuple[Process, str, str]]:
     """A monitor of these machines: its process, its endpoint and its address."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    environment, endpoint = on_loopback(folder)
     text = Path("models/machines/lab.toml").read_text(encoding="utf-8")
     entries = []
     for machine in machines:
         file = folder / f"{machine.name}.toml"
         file.write_text(text.replace('name = "lab"', f'name = "{machine.name}"'), encoding="utf-8")
         entries.append({"file": str(file), "bundle": "lab"})
-    environment = {
-        **os.environ,
-        "ROTORWATCH_LINK": json.dumps({"listen": [endpoint]}),
-        "ROTORWATCH_HTTP__PORT": "0",
-        "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
-        "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
-        "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
-        "ROTORWATCH_MACHINES": json.dumps(entries),
-    }
+    environment["ROTORWATCH_MACHINES"] = json.dumps(entries)
     process = started(["service.rotorwatch", "run"], folder / "out", folder / "log", environment)
     try:
         yield Process(process.pid), endpoint, url_of(process, folder / "out", folder / "log")

@@ -66,20 +66,10 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
     *publish : str
         Options of the publisher.
     """
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
-    environment = {
-        **os.environ,
-        "ROTORWATCH_LINK": json.dumps({"listen": [endpoint]}),
-        "ROTORWATCH_HTTP__PORT": "0",
-        "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
-        "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
-        "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
-        **settings,
-    }
+    environment, endpoint = on_loopback(folder)
     send = ["simulator.rotorsim", "publish", "--connect", endpoint, "--wait-for-subscriber", "120", *publish]
     out, log, published = folder / "out", folder / "log", folder / "published"
-    process = started(["service.rotorwatch", "run"], out, log, environment)
+    process = started(["service.rotorwatch", "run"], out, log, environment | settings)
     resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (files, files))
     publisher = started(send, published, Path(os.devnull), dict(os.environ))
     try:
@@ -92,6 +82,20 @@ def monitor(folder: Path, files: int, settings: dict[str, str], *publish: str) -
             one.terminate()
         for one in (publisher, process):
             one.wait(60)
+
+
+def on_loopback(folder: Path) -> tuple[dict[str, str], str]:
+    """Environment of a monitor that whoever is on this computer may ask, with its history in a file; its endpoint."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    return {
+        **os.environ,
+        "ROTORWATCH_LINK": json.dumps({"listen": [endpoint]}),
+        "ROTORWATCH_HTTP__PORT": "0",
+        "ROTORWATCH_ACCESS__OPEN_ON_LOOPBACK": "true",
+        "ROTORWATCH_ACCESS__LIMITS__REQUESTS_PER_MINUTE": "1000000",
+        "ROTORWATCH_HISTORY__URL": f"sqlite:///{folder}/history.sqlite",
+    }, endpoint
 
 
 def started(arguments: list[str], out: Path, err: Path, environment: dict[str, str]) -> subprocess.Popen[bytes]:
