@@ -6,7 +6,8 @@
 # make wheels  build both wheels into dist/, and run the demo out of the wheel under every Python there is here
 # make floors  run the demo and the tests below with the lowest versions that pyproject.toml admits
 
-PYTHONS := $(foreach minor,11 12 13,$(shell command -v python3.$(minor) 2>/dev/null))
+# Asked, since a shim may stand where no version is installed.
+PYTHONS := $(foreach minor,11 12 13,$(shell python3.$(minor) -c 'print("python3.$(minor)")' 2>/dev/null))
 PYTHON ?= $(or $(firstword $(PYTHONS)),python3.11)
 VENV := .venv
 BIN := $(VENV)/bin
