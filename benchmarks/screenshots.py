@@ -30,13 +30,16 @@ VIEWS = {
 FAULT = "k_by=-0.25@140"
 WIDTH, MOST_BYTES, PACE = 1280, 150_000, "6"
 WAIT_MS = 240_000
+SCRUBBER = 130
+"""Height of what stays above the window of a replay, px."""
 
 
-def picture(page: Page, at: Path, height: int) -> None:
-    """What is seen, in as many colours as fit into the size."""
+def picture(page: Page, at: Path, height: int, top: str = "body") -> None:
+    """What is seen from an element on, in as many colours as fit into the size."""
     page.set_viewport_size({"width": WIDTH, "height": height})
     page.wait_for_timeout(1500)
-    page.evaluate("scrollTo(0, 0)")
+    above = 0 if top == "body" else SCRUBBER
+    page.locator(top).first.evaluate(f"one => scrollTo(0, one.getBoundingClientRect().top + scrollY - {above})")
     shot = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     for colours in (256, 128, 64, 32):
         shot.quantize(colours, dither=Image.Dither.NONE).save(at, optimize=True)
@@ -66,6 +69,11 @@ def look(one: Monitor, folder: Path) -> None:
                 page.get_by_role("slider", name="Window").focus()
                 page.keyboard.press("End")
             picture(page, folder / f"page-{name}.png", height)
+            if name == "replay":
+                for plot in ("orbit-plot", "spectrum-plot"):
+                    page.locator(f"window-plots plot-fold[shows='plots/{plot}'] summary").click()
+                page.locator("window-plots canvas").first.wait_for()
+                picture(page, folder / "page-replay-window.png", 900, "window-plots")
 
 
 def sign_in(temporary: Path, folder: Path) -> None:

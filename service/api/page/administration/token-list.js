@@ -25,6 +25,7 @@ class TokenTable extends LiveElement {
     this.#scopes = SCOPES.map(([scope]) => /** @type {HTMLInputElement} */ (html("input", { type: "checkbox", value: scope, checked: scope === "read" && monitor.may(scope), disabled: !monitor.may(scope) })));
     const boxes = SCOPES.map(([scope, text], at) => html("label", { class: "check" }, this.#scopes[at], html("span", {}, html("b", {}, scope), html("small", {}, ` ${text}${monitor.may(scope) ? "" : "; yours does not have it"}`))));
     this.replaceChildren(
+      html("h2", {}, "Access tokens"),
       this.#open,
       this.#message,
       this.#made,
@@ -62,7 +63,7 @@ class TokenTable extends LiveElement {
         ],
       };
     });
-    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "Access tokens") : html("div", {}, html("h2", {}, "Access tokens"), html("p", { class: "note" }, "There is no token.")));
+    renew(this.#rows, rows.length ? table(["token", "scopes", "state", "created", "expires", "last used", "actions"], rows, "") : html("p", { class: "note" }, "There is no token."));
   }
 
   /** @param {string} why */
