@@ -7,7 +7,7 @@ import httpx
 import numpy as np
 import pytest
 
-from models.commissioning.commissioned import install
+from models.commissioning.commissioned import Installed, install
 from models.diagnosis.window import WindowStatistics
 from models.errors import RotorwatchError
 from models.machine import load_machine
@@ -25,6 +25,7 @@ from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario
 from tests.service.monitored import PLACE, answered, client, problem
 from tests.service.replaying import S, recording
 from tests.service.snapshotting import numbers
+from tests.service.test_schedule import KIT, stream
 
 SECONDS, FAULT_S = 60.0, 25.0
 GAP = range(303, 306)
@@ -47,14 +48,31 @@ def folder(tmp_path_factory: pytest.TempPathFactory, file: str) -> Path:
     return made
 
 
-def test_a_window_of_a_recording_is_that_of_the_monitor(folder: Path, file: str) -> None:
-    installed = install(load_machine(file), None)
+def held_by_monitor(source: RecordingSource, installed: Installed) -> list[tuple[Report, WindowStatistics | None]]:
+    """Every report, and the window that it is of."""
     monitor = MachineMonitor(installed)
     held: list[tuple[Report, WindowStatistics | None]] = []
-    source = RecordingSource([folder / "demo" / "lab" / NAME])
     for message in source.messages({source.machine("demo/lab").stream}):
         for step in monitor.step_payload(message.payload, message.attachment, message.encoding):
             held += [(one, monitor.window) for one in step.windows]
+    return held
+
+
+def test_a_window_of_snapshots_is_that_of_the_monitor(tmp_path: Path) -> None:
+    source = RecordingSource([recording(tmp_path / NAME, stream()[: 9 * 40], KIT)])
+    installed = install(KIT, None)
+    report, window = held_by_monitor(source, installed)[-1]
+    found = recorded_window(source, KIT, "demo/lab", report.end_ns, report, lagged=False)
+    assert window is not None
+    assert found.window is not None
+    assert (found.filled, abs(found.window.start_ns - window.start_ns) < 1000) == (1.0, True)
+    assert found.window.spectrum == pytest.approx(window.spectrum, rel=1e-9, abs=1e-30)
+
+
+def test_a_window_of_a_recording_is_that_of_the_monitor(folder: Path, file: str) -> None:
+    installed = install(load_machine(file), None)
+    source = RecordingSource([folder / "demo" / "lab" / NAME])
+    held = held_by_monitor(source, installed)
     whole = [number for number, (_, window) in enumerate(held) if window is not None]
     assert len(whole) > 3
     for number in (0, whole[0], whole[-1]):
