@@ -50,6 +50,11 @@ def test_what_there_is_none_of_has_its_heading(browser: Browser, tmp_path: Path)
             expect(page.get_by_role("heading", name=heading, exact=True)).to_be_visible()
         expect(page.locator("token-list")).to_contain_text("There is no token.")
         assert not violations(page)
+        with browser.new_page() as other:  # whose console says that something was refused
+            other.goto(f"{running.http_url}/#/recordings")
+            expect(other.locator("recordings-view")).to_contain_text("the settings name no directory for them")
+            for element in ("replay-order", "recording-line", "recording-table", "recordings-view .tools select"):
+                expect(other.locator(element).first).to_be_hidden()
 
 
 def test_a_token_is_created_used_to_sign_in_and_revoked(browser: Browser, runtime: Runtime) -> None:

@@ -57,7 +57,6 @@ class RecordingsView extends LiveElement {
     const places = [...new Set(newest.map((one) => `${one.site}/${one.machine}`))];
     const chosen = this.#machine.value || decodeURIComponent(this.getAttribute("place") ?? "") || places[0];
     if (this.#machine.options.length !== places.length) this.#machine.replaceChildren(...places.map((place) => html("option", { value: place, selected: place === chosen }, place)));
-    this.#machine.hidden = !places.length;
     if (!places.length) {
       this.#message.textContent = "Nothing has been recorded yet.";
       return;
@@ -81,7 +80,7 @@ class RecordingsView extends LiveElement {
 
   /** Where nothing is recorded, there is nothing to choose. @param {boolean} any */
   #offer(any) {
-    for (const part of this.#parts) part.hidden = !any;
+    for (const part of [this.#machine, ...this.#parts]) part.hidden = !any;
   }
 
   #show() {
