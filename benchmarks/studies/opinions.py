@@ -45,8 +45,8 @@ def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ..
     """Columns of a record: a refused window is a result, and counted.
 
     Of every parameter that is read its relative change and, with ``error`` behind its name, the standard error;
-    ``named`` the parameters said to have changed, with spaces between them, and ``outside``, at the first of `rates`,
-    with ``strict`` before them at the second one.
+    ``named`` the parameters said to have changed, with spaces between them, ``largest`` the largest change among them,
+    and ``outside``, at the first of `rates`, with ``strict`` before them at the second one.
     """
     started = process_time()
     try:
@@ -66,6 +66,7 @@ def opinion(one: Diagnostician, window: WindowStatistics, rates: tuple[float, ..
     for prefix, rate in zip(("", "strict "), rates, strict=False):
         verdict = isolate_window(diagnosis, rate)
         said |= {f"{prefix}named": " ".join(verdict.changed), f"{prefix}outside": verdict.outside}
+        said[f"{prefix}largest"] = max((abs(one.relative_change or 0.0) for one in verdict.readings), default=0.0)
     misfit = None if diagnosis.misfit_z is None else round(diagnosis.misfit_z, 3)
     return said | {"misfit": misfit, "suspect": diagnosis.suspect}
 

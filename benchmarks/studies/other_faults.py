@@ -5,6 +5,7 @@ conditions. After a healthy stretch one fault begins.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 
 from benchmarks.studies import results as r
@@ -15,9 +16,12 @@ from benchmarks.studies.subjects import SHIPPED, SUBJECTS
 from benchmarks.studies.watched import commissioned, raised
 from benchmarks.studies.watched_machine import CONDITIONS, Subject
 from models.alarm_names import CHANGED, DATA, LEVEL, MODEL, SHAPE
-from models.commissioning.commissioned import KnowledgeLevel
+from models.commissioning.commissioned import Installed, KnowledgeLevel
 from models.physics.rotor import PARAMETERS
 from service.monitor.monitor import MachineMonitor
+
+_FIRST_WINDOWS = 6
+"""What is not commissioned is compared with its first five; one more fills before they are told apart."""
 
 
 def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[str, Value]]:
@@ -26,9 +30,11 @@ def _measure(options: Options, _: None, cell: Cell, number: int) -> list[dict[st
     installed = commissioned(subject.file, *map(subject.healthy, range(CONDITIONS)))
     # The rotor of finite elements touches nothing and does not crack.
     faults = [fault for fault in FAULTS if name in SHIPPED or fault not in {*RUBS, CRACK}]
-    if isinstance(installed, str):
-        return [{"fault": fault, "refused": installed} for fault in faults]
-    return [{"fault": fault, **_watched(subject, MachineMonitor(installed), fault)} for fault in faults]
+    said: dict[str, Value] = {}
+    if isinstance(installed, str):  # what is left is to watch its levels, against its first windows
+        said = {"refused": installed}
+        subject, installed = replace(subject, windows=_FIRST_WINDOWS), Installed(subject.file)
+    return [{"fault": fault, **said, **_watched(subject, MachineMonitor(installed), fault)} for fault in faults]
 
 
 def _watched(subject: Subject, monitor: MachineMonitor, fault: str) -> dict[str, Value]:
@@ -57,8 +63,8 @@ def _watched(subject: Subject, monitor: MachineMonitor, fault: str) -> dict[str,
 # What is added up
 
 
-def _heard(rows: Sequence[Record]) -> list[Record]:
-    return [row for row in rows if "refused" not in row and row["fault"] != HEALTHY]
+def _heard(rows: Sequence[Record], *, refused: bool = False) -> list[Record]:
+    return [row for row in rows if ("refused" in row) == refused and row["fault"] != HEALTHY]
 
 
 _COLUMNS = {
@@ -85,6 +91,13 @@ _TABLES = (
         },
         partial(r.where, fault=HEALTHY),
         "The same streams without a fault:",
+    ),
+    Table(
+        "other-faults-watched",
+        ("machine",),
+        {name: _COLUMNS[name] for name in ("streams", "heard", "by levels", "delay, median s")},
+        partial(_heard, refused=True),
+        "Where the commissioning was refused, by levels alone, against the first five windows:",
     ),
     Table("other-faults-each", ("machine", "level", "fault"), _COLUMNS, _heard),
 )

@@ -27,6 +27,10 @@ _CHANGES: tuple[dict[str, float], ...] = (
 )
 """True changes; their place is part of the seed."""
 _COMMISSIONINGS = 5
+_RAISE_ABOVE = 0.1
+"""A smaller change raises no alarm, as shipped."""
+_HEALTHY_WEIGHT = 8
+"""Windows of the healthy machine for each one of a change: false alarms are rare."""
 
 
 def _measure(options: Options, _learned: None, cell: Cell, number: int) -> list[dict[str, Value]]:
@@ -51,12 +55,24 @@ def _false_alarms(rows: Sequence[Record]) -> Estimate | None:
     return r.share("any")(r.where(rows, changed="healthy"))
 
 
+def _beyond_limit(rows: Sequence[Record]) -> Estimate | None:
+    healthy = r.where(rows, changed="healthy")
+    return r.rate(float(str(row.get("largest") or 0.0)) > _RAISE_ABOVE for row in healthy)
+
+
+def _refused(rows: Sequence[Record]) -> Estimate | None:
+    commissionings = {row["commissioning"]: str(row["refused"]).startswith("not commissioned") for row in rows}
+    return r.rate(commissionings.values())
+
+
 _TABLES = (
     Table(
         "unknown",
         ("level", "machine"),
         {
+            "commissioning refused": _refused,
             "healthy: any named": _false_alarms,
+            "healthy: named beyond 10 %": _beyond_limit,
             **{
                 f"{kind} located": partial(_located, kind[:2])
                 for kind in ("k_by, k_bz −10 %", "c_by, c_bz −30 %", "e +20 %")
@@ -107,11 +123,11 @@ def unknown(options: Options) -> Study:
         if name not in SUBJECTS:
             raise MachineFileError(f"--machine {name}: not among {', '.join(SUBJECTS)}")
     commissionings = 1 if options.small else _COMMISSIONINGS
-    share, rest = divmod(options.windows, commissionings)
+    plan = [options.windows * (1 if changes or options.small else _HEALTHY_WEIGHT) for changes in _CHANGES]
     cells = tuple(
         Cell(
             {"level": level.value, "machine": name, "commissioning": commissioning, "changed": changed_in(changes)},
-            share + (commissioning < rest),
+            plan[at] // commissionings + (commissioning < plan[at] % commissionings),
             (level, name, commissioning, at),
         )
         for level in (KnowledgeLevel.NONE, KnowledgeLevel.PARTIAL, KnowledgeLevel.FULL)

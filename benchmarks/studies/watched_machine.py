@@ -28,7 +28,7 @@ CONDITIONS = 3
 _HEALTHY, AFTER = 4.1, 2.5
 """Windows of a healthy recording, and of a stream after its fault has begun."""
 _BEFORE_S = 10.0
-"""Healthy, once the window is full."""
+"""Healthy, once the window is full, or the first windows that a machine is compared with that is not commissioned."""
 _BLOCK_S = 0.5
 _ALIKE = (1.35, 1.65)
 """Level of the excitation; as commissioned within a tenth, or levels would rightly alarm before the fault begins."""
@@ -52,6 +52,8 @@ class Subject:
     ----------
     always : callable
         What is so from the beginning, in healthy recordings too.
+    windows : int
+        That are full before a fault begins.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Subject:
     seed: int
     number: int
     always: Change = as_simulated
+    windows: int = 1
 
     @property
     def file(self) -> MachineFile:
@@ -105,7 +108,7 @@ class Subject:
     @property
     def begins_s(self) -> float:
         """When a fault begins."""
-        return self._window_s + _BEFORE_S
+        return self.windows * self._window_s + _BEFORE_S
 
     def _rng(self, *purpose: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, SUBJECTS.index(self.name), self.number, *purpose])

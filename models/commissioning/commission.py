@@ -154,7 +154,7 @@ def parameter_summaries(
             reason = "; ".join(reasons) or "cannot be told without the rotor's own parameters"
             found.append(ParameterSummary(name=name, text=PARAMETER_TEXT[name], evaluable=False, reason=reason))
             continue
-        own, shared = (float(np.median(part)) for part in zip(*known, strict=True))
+        own, shared, elsewhere = (float(np.median(part)) for part in zip(*known, strict=True))
         own *= math.sqrt(window_s / machine.window_data_s)
         readings = _readings(name, compared)
         found.append(
@@ -168,29 +168,35 @@ def parameter_summaries(
                 else None,
                 window_error=own,
                 commissioning_error=shared,
-                detectable_loss=max(-1.0, from_scale(name, -threshold * math.hypot(own, shared))),
-                detectable_gain=from_scale(name, threshold * math.hypot(own, shared)),
+                detectable_loss=max(-1.0, from_scale(name, -threshold * math.hypot(own, shared, elsewhere))),
+                detectable_gain=from_scale(name, threshold * math.hypot(own, shared, elsewhere)),
                 wished=wished,
                 readings=readings,
-                **_needed(name, wished, threshold, own, shared, healthy_s, machine.window_data_s),
+                **_needed(name, wished, threshold, (own, shared, elsewhere), healthy_s, machine.window_data_s),
             )
         )
     return tuple(found)
 
 
 def _needed(
-    name: str, wished: float, threshold: float, own: float, shared: float, healthy_s: float, window_s: float
+    name: str, wished: float, threshold: float, errors: tuple[float, float, float], healthy_s: float, window_s: float
 ) -> dict[str, float]:
-    """Healthy data and window length for a wished change: both errors fall as one over the root of the length."""
-    allowed = abs(to_scale(name, wished)) / threshold
+    """Healthy data and window length for a wished change: two errors fall as one over the root of the length.
+
+    Nothing where no length is enough, because of what the relation is off in other conditions.
+    """
+    own, shared, elsewhere = errors
+    allowed = math.sqrt(max(0.0, (to_scale(name, wished) / threshold) ** 2 - elsewhere**2))
+    if not allowed:
+        return {}
     # At most half of what is allowed to the window: a commissioning that leaves nothing to chance takes for ever.
     window = window_s * max(1.0, 2 * (own / allowed) ** 2)
     left = allowed**2 - own**2 * window_s / window
     return {"healthy_s_for_wished": healthy_s * shared**2 / left, "window_s_for_wished": window}
 
 
-def _errors(name: str, diagnosis: Diagnosis) -> tuple[float, float] | None:
-    """A window's own and its shared standard error of a parameter, in the scale of the errors."""
+def _errors(name: str, diagnosis: Diagnosis) -> tuple[float, float, float] | None:
+    """A window's own, its shared standard error, and that of other conditions, in the scale of the errors."""
     names = [reading.name for reading in diagnosis.evaluable]
     if name not in names:
         return None
@@ -198,7 +204,9 @@ def _errors(name: str, diagnosis: Diagnosis) -> tuple[float, float] | None:
     factor = slope(name, to_scale(name, diagnosis.evaluable[at].relative_change or 0.0))
     total = float(diagnosis.full_covariance[at, at])
     shared = 0.0 if diagnosis.common is None else float(diagnosis.common[at, at])
-    return math.sqrt(max(0.0, total - shared)) / factor, math.sqrt(shared) / factor
+    elsewhere = min(shared, diagnosis.elsewhere.get(name, 0.0))
+    own = math.sqrt(max(0.0, total - shared))
+    return own / factor, math.sqrt(shared - elsewhere) / factor, math.sqrt(elsewhere) / factor
 
 
 def _spread(readings: Sequence[HealthyReading]) -> float | None:

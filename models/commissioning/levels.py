@@ -28,10 +28,11 @@ from models.diagnosis.baseline.learned import (
     disagreements,
     learn_baseline,
     learned_rows,
+    planes_coupled,
     undetermined,
     unsuitable,
 )
-from models.diagnosis.baseline.rows import ROWS, evaluable_rows, formation_of
+from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, evaluable_rows, formation_of, not_measured
 from models.diagnosis.baseline.stored import BaselineRecord
 from models.diagnosis.likelihood.fit import LikelihoodFit
 from models.diagnosis.readings import Diagnosis
@@ -168,6 +169,12 @@ def _learn_none(machine: MachineFile, pieces: Sequence[Piece], progress: Progres
         return Learned(checks, shape=shape)
 
 
+_LINEAR = (
+    "The relations are linear. A bearing that stiffens with its displacement reads up to 5 % too stiff or too soft "
+    "under a force of another direction or level: smaller changes of its stiffness are not claimed."
+)
+
+
 def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Progress) -> Learned:
     """Learn the relations, in one baseline or in one for each speed.
 
@@ -190,7 +197,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Pro
             stated = determined(diagnostician.diagnose(piece.window), piece.window, machine.window_data_s)
             read.append((piece.recording, piece.window.end_ns, stated))
             progress("learning the relations", len(read), len(pieces))
-        compared += _halves(group)
+        compared += _halves(group, baseline.rows)
     halves = check_halves([each for _, _, each in compared])
     determined_ = check_determined([reason for baseline in baselines for reason in baseline.reasons if reason])
     sources = check_sources(
@@ -202,7 +209,7 @@ def _with_relations(machine: MachineFile, pieces: Sequence[Piece], progress: Pro
         checks,
         tuple(read),
         tuple(compared),
-        notes=(band,),
+        notes=(band, _LINEAR),
         baselines=tuple(
             ConditionBaseline(
                 conditions=OperatingRange.of([piece.window for piece in group]), baseline=BaselineRecord.of(baseline)
@@ -225,14 +232,19 @@ def learned_baseline(windows: Sequence[WindowStatistics], conditions: Sequence[s
     Raises
     ------
     EstimationError
-        If they determine none.
+        If they determine none; in one condition, if they do not determine all whose motions are measured.
     """
-    baseline = learn_baseline(windows, conditions)
+    rows = COUPLED_ROWS if planes_coupled(windows) else ROWS
+    baseline = learn_baseline(windows, conditions, rows)
     weak = undetermined(baseline)
     relations = tuple(None if why else one for one, why in zip(baseline.relations, weak, strict=True))
     reasons = tuple(why or reason for why, reason in zip(weak, baseline.reasons, strict=True))
-    if all(relation is None for relation in relations):
-        raise EstimationError("; ".join(dict.fromkeys(reasons)))
+    states = windows[0].states
+    measured = [not not_measured(row.motions, states) for row in learned_rows(baseline.rows)]
+    lost = [relation is None for relation, there in zip(relations, measured, strict=True) if there]
+    # A single recording that does not determine one of two planes is no ground to believe the other one.
+    if all(lost) or (any(lost) and len(set(conditions)) < 2):
+        raise EstimationError("; ".join(dict.fromkeys(reason for reason in reasons if reason)))
     return replace(baseline, relations=relations, reasons=reasons)
 
 
@@ -240,7 +252,7 @@ def _differentiated(baseline: Baseline, band_to_hz: float) -> str:
     """Up to which frequency the derivatives of what is measured hold, in a sentence."""
     deepest = max(
         formation_of([term.motions for term in row.terms], relation.states).deepest
-        for row, relation in zip(learned_rows(ROWS), baseline.relations, strict=True)
+        for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True)
         if relation is not None
     )
     edge = passband_hz(deepest, band_to_hz)
@@ -302,7 +314,7 @@ def _without_equations(machine: MachineFile, shape: HealthyShape | None, no_shap
     return Learned((equations, check_shapes(machine, powers, shape.windows)), shape=shape)
 
 
-def _halves(pieces: Sequence[Piece]) -> tuple[Read, ...]:
+def _halves(pieces: Sequence[Piece], rows: Sequence[Row]) -> tuple[Read, ...]:
     """Every window read against what the other halves of the recordings teach."""
     found: list[Read] = []
     for late in (False, True):
@@ -311,7 +323,7 @@ def _halves(pieces: Sequence[Piece]) -> tuple[Read, ...]:
         if not teaching or not asked:
             continue
         try:
-            half = learn_baseline([piece.window for piece in teaching], [piece.recording for piece in teaching])
+            half = learn_baseline([p.window for p in teaching], [p.recording for p in teaching], rows)
         except EstimationError:
             continue  # half of the data is too little for this machine; the whole may be enough
         diagnostician = BaselineDiagnostician(half)

@@ -1,7 +1,8 @@
 """What a diagnostician says about a window: readings of parameters and of equations, or why there are none."""
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -205,6 +206,9 @@ class Diagnosis:
     # (m, m): part of `covariance` that every window shares, as the error of a commissioning does: further windows do
     # not remove it. None where there is no such part.
     common: FloatArray | None = None
+    # Part of the variances in `common`, by parameter, that longer healthy recordings do not remove either: what a
+    # relation is off in conditions that it was not learned in.
+    elsewhere: Mapping[str, float] = field(default_factory=dict)
     # Over-identification: how far the window is from anything the model can explain, standard normal where the model
     # holds; None where the diagnostician has no such test.
     misfit_z: float | None = None

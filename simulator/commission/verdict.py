@@ -230,6 +230,12 @@ def budget_sentences(report: CommissioningReport) -> tuple[str, ...]:
     if found:
         sizes = {one.name: one.wished for one in found}
         told.append(f"{_wished(sizes)} of {listed(sizes)} is found as things are.")
+    never = [one.name for one in read if one.wished is not None and one.window_s_for_wished is None]
+    if never:
+        told.append(
+            f"For {listed(never)} the wished change is never found with 95 % probability, however long the windows and "
+            "the recordings: commission in more conditions, or wish for a larger change."
+        )
     too_long = [one.name for one in read if (one.window_s_for_wished or 0.0) > _LONGEST_WINDOW_S]
     if too_long:
         told.append(

@@ -16,7 +16,7 @@ from scipy.special import chdtrc, ndtr, ndtri
 from models.diagnosis.baseline.lag_moments import row_window, shared_covariance
 from models.diagnosis.baseline.learned import Baseline, coefficient_slices, learned_rows, positive, unsuitable
 from models.diagnosis.baseline.relation import Relation, RowChange, one_source, read_row
-from models.diagnosis.baseline.rows import ROWS, Row, parameters_of
+from models.diagnosis.baseline.rows import Row, parameters_of
 from models.diagnosis.baseline.unbalance import (
     SPEED_TOLERANCE,
     ForceRow,
@@ -117,6 +117,7 @@ class _Unbalance:
     variance: float
     common_covariance: FloatArray
     common_variance: float
+    slope: FloatArray  # (n_own,), to the bearing's changes
 
 
 class BaselineDiagnostician:
@@ -128,7 +129,8 @@ class BaselineDiagnostician:
 
     by = "baseline"
 
-    def __init__(self, baseline: Baseline, rows: Sequence[Row] = ROWS) -> None:
+    def __init__(self, baseline: Baseline, rows: Sequence[Row] | None = None) -> None:
+        rows = baseline.rows if rows is None else rows
         self._baseline = baseline
         self._rows = learned_rows(rows)
         self._slices = coefficient_slices(self._rows)
@@ -141,7 +143,8 @@ class BaselineDiagnostician:
         }
         self._names = tuple(own.parameter for row in self._rows for own in row.own)
         self._parameters = parameters_of(rows)
-        self._one_source = {own.parameter: own.one_source for row in rows for own in row.own}
+        self._own_of = {own.parameter: own for row in rows for own in row.own}
+        self._conditions = max(1, len({one.condition for one in baseline.consistency}))
         self._coefficients = np.zeros(self._slices[-1].stop)
         for at, relation in zip(self._slices, baseline.relations, strict=True):
             if relation is not None:
@@ -161,6 +164,7 @@ class BaselineDiagnostician:
         bearing = self._bearing(changes)
         names = list(self._names)
         values, total, common = bearing.values, bearing.noise + bearing.common, bearing.common
+        through = np.eye(values.size)  # from the bearing's changes to all
         if "e" in self._parameters:
             names.append("e")
             reasons["e"] = ""
@@ -172,9 +176,12 @@ class BaselineDiagnostician:
                 values = np.append(values, e.value)
                 total = _bordered(total, e.covariance, e.variance)
                 common = _bordered(common, e.common_covariance, e.common_variance)
+                through = np.vstack([through, e.slope])
         if one_source(window):
-            wider = np.array([self._one_source[name] for name in names[: values.size]])
+            wider = np.array([self._own_of[name].one_source for name in names[: values.size]])
             total, common = total * np.outer(wider, wider), common * np.outer(wider, wider)
+        elsewhere = through @ np.diag(self._elsewhere(bearing.values)) @ through.T
+        total, common = total + elsewhere, common + elsewhere
         known = [names.index(name) for name in self._parameters if not reasons[name]]
         covariance = positive(total[np.ix_(known, known)])
         errors = dict(zip(known, np.sqrt(np.diag(covariance)).tolist(), strict=True))
@@ -189,6 +196,7 @@ class BaselineDiagnostician:
             parameters=parameters,
             covariance=covariance if known else None,
             common=positive(common[np.ix_(known, known)]) if known else None,
+            elsewhere=dict(zip(names, np.diag(elsewhere).tolist(), strict=False)),  # none of an e that was not read
             misfit_z=_misfit(changes),
         )
         impossible = _impossible(diagnosis)
@@ -199,6 +207,11 @@ class BaselineDiagnostician:
             return diagnosis
         misfit = suspicion.z if diagnosis.misfit_z is None else max(diagnosis.misfit_z, suspicion.z)
         return replace(diagnosis, misfit_z=misfit, suspect=suspicion.sentence)
+
+    def _elsewhere(self, changes: FloatArray) -> FloatArray:
+        """Variances of what a relation is off in other conditions; each that it holds in is a witness against it."""
+        errors = np.array([self._own_of[name].elsewhere for name in self._names])
+        return (errors * np.maximum(1 + changes, 1 + _MOST_LOSS)) ** 2 / self._conditions
 
     def _bearing(self, changes: list[RowChange | None]) -> _Bearing:
         n = len(self._names)
@@ -276,7 +289,8 @@ class BaselineDiagnostician:
             raise EstimationError(
                 f"unbalance not seen well enough: standard error {text} %, at most {limit} % is a reading"
             )
-        return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, float(along @ shared @ along))
+        common_variance = float(along @ shared @ along)
+        return _Unbalance(size - 1, with_bearing @ along, variance, shared_with @ along, common_variance, along @ to_d)
 
     def _rotations(
         self, coordinates: tuple[str, ...], window: WindowStatistics

@@ -15,7 +15,7 @@ from models.diagnosis.baseline.lag_moments import (
     shared_covariance,
 )
 from models.diagnosis.baseline.relation import Contribution, Relation, RowChange, beyond_memory, change_of, learn_row
-from models.diagnosis.baseline.rows import ROWS, Row, not_measured, state_of
+from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS, Row, not_measured, state_of
 from models.diagnosis.baseline.unbalance import SynchronousVectors, rotation_of, rotations_by_speed
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
@@ -129,6 +129,8 @@ def allowance_of(found: Sequence[LeftOut]) -> float:
 
 
 _SHORTEST_LAG_RANGE_S = 0.1
+# Planes are coupled where the stiffness across is more of that along, and more standard errors, in one of them.
+_COUPLED, _SHOWN = 0.03, 4.0
 _FEWEST_HOPS = 2
 
 
@@ -150,6 +152,12 @@ class Baseline:
     def states(self) -> tuple[str, ...]:
         """Measured states that it was learned with and that later windows must have."""
         return tuple(sorted({name for one in self.relations if one is not None for name in one.states}))
+
+    @property
+    def rows(self) -> tuple[Row, ...]:
+        """The shipped table that it was learned with."""
+        n_coupled = coefficient_slices(learned_rows(COUPLED_ROWS))[-1].stop
+        return COUPLED_ROWS if len(self.covariance) == n_coupled else ROWS
 
 
 def learned_rows(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -219,7 +227,7 @@ def learn_baseline(
 
 
 def _learn(
-    row: Row, windows: Sequence[WindowStatistics], states: tuple[str, ...]
+    row: Row, windows: Sequence[WindowStatistics], states: tuple[str, ...], *, widened: bool = True
 ) -> tuple[Relation | None, list[Contribution], str]:
     reason = not_measured(row.motions, states)
     if not reason and row.needs_speed and not all(np.isfinite(window.speed_rad_s) for window in windows):
@@ -229,12 +237,31 @@ def _learn(
     try:
         references = references_of(states)
         prepared: list[RowWindow] = [row_window(row, window, states, references) for window in windows]
-        relation, contributions = learn_row(row, *beyond_memory(row, prepared))
+        relation, contributions = learn_row(row, *beyond_memory(row, prepared), widened=widened)
     except EstimationError as error:
         return None, [], str(error)
     except np.linalg.LinAlgError:
         return None, [], f"{row.title}: the healthy recording does not determine it; a channel may hardly move"
     return relation, contributions, ""
+
+
+def planes_coupled(windows: Sequence[WindowStatistics]) -> bool:
+    """Whether the bearing answers a motion in one plane with a force in the other, as far as healthy windows tell.
+
+    A relation of one plane alone is then none: what the other plane adds depends on how the force is directed. Where
+    one plane shows it, both are coupled; one source hides it in one plane at times, not in both.
+    """
+    if not windows or any(unsuitable(window) for window in windows):
+        return False
+    states = tuple(name for name in windows[0].states if all(name in window.states for window in windows))
+    for row in learned_rows(COUPLED_ROWS):
+        relation, _, _ = _learn(row, windows, states, widened=False)
+        if relation is None:
+            continue
+        across, error = relation.coefficients[-2], np.sqrt(relation.covariance[-2, -2])
+        if abs(across) > max(_COUPLED, _SHOWN * error):
+            return True
+    return False
 
 
 def references_of(states: tuple[str, ...]) -> tuple[str, ...]:
@@ -302,11 +329,12 @@ def positive(covariance: FloatArray) -> FloatArray:
 
 _FAR = 3.0  # spreads from what is expected
 _VAGUE = 0.33  # relative standard error beyond which a coefficient is not known
+_LEFT_OVER = 5.0  # times what chance leaves; where there are several conditions, they are compared with each other
 _DISAGREE = 4.0  # standard errors between conditions
 _RECORD = "record a second condition: another speed, another load, or more broadband excitation at the bearing"
 
 
-def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, ...]:
+def undetermined(baseline: Baseline) -> tuple[str, ...]:
     """Say of every learned row why the healthy windows do not determine it; empty where they do.
 
     One source of excitation leaves combinations of coefficients weakly determined. The estimate then wanders to where
@@ -318,14 +346,16 @@ def undetermined(baseline: Baseline, rows: Sequence[Row] = ROWS) -> tuple[str, .
         A sentence with what to record instead for each row, in the order of the learned rows; empty if there is no
         doubt, or if there is no relation (``baseline.reasons`` says why).
     """
-    found = []
-    for row, relation in zip(learned_rows(rows), baseline.relations, strict=True):
-        reason = "" if relation is None else _reason(row, relation)
+    found, alone = [], len({one.condition for one in baseline.consistency}) < 2
+    for row, relation in zip(learned_rows(baseline.rows), baseline.relations, strict=True):
+        reason = "" if relation is None else _reason(row, relation, alone=alone)
         found.append(f"{row.title}: {reason}; {_RECORD}" if reason else "")
     return tuple(found)
 
 
-def _reason(row: Row, relation: Relation) -> str:
+def _reason(row: Row, relation: Relation, *, alone: bool) -> str:
+    if alone and relation.misfit > _LEFT_OVER:
+        return f"what is left over is {relation.misfit:.1f} times what chance leaves, so no such relation holds"
     b, spread = relation.coefficients, np.sqrt(np.diag(relation.covariance))
     for own in row.own:
         for at in own.terms:

@@ -1,0 +1,97 @@
+"""Bearings that answer a motion in one plane with a force in the other, and what a relation is off elsewhere."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.studies.subjects import subject_named
+from models.commissioning.levels import learned_baseline
+from models.diagnosis.baseline.diagnostician import BaselineDiagnostician
+from models.diagnosis.baseline.learned import Baseline, planes_coupled, undetermined
+from models.diagnosis.baseline.rows import COUPLED_ROWS, ROWS
+from models.diagnosis.baseline.stored import BaselineRecord
+from models.diagnosis.verdict.isolation import isolate_window
+from models.diagnosis.window import WindowStatistics
+from models.errors import EstimationError
+
+SEED = 6301
+
+
+@cache
+def healthy(name: str) -> tuple[WindowStatistics, ...]:
+    return subject_named(name).healthy(SEED, 0, 4)
+
+
+@cache
+def baseline(name: str) -> Baseline:
+    return learned_baseline(healthy(name), ["one"] * 4)
+
+
+def later(name: str, changes: dict[str, float], number: int) -> WindowStatistics:
+    return subject_named(name).later(SEED, 0, 0, number, changes)[0]
+
+
+@pytest.mark.slow
+def test_a_film_that_couples_the_planes_is_learned_and_its_changes_are_named() -> None:
+    learned = baseline("fluid-film")
+    assert learned.rows == COUPLED_ROWS
+    for relation, across in zip(learned.relations, (0.09, -0.07), strict=True):
+        assert relation is not None
+        assert relation.misfit < 1.5
+        # -k_yz/k_y of the bearing and of what else holds the shaft
+        assert relation.coefficients[4] == pytest.approx(-across, abs=0.03)
+    monitor = BaselineDiagnostician(learned)
+    assert [isolate_window(monitor.diagnose(later("fluid-film", {}, n)), 0.01).changed for n in range(6)] == [()] * 6
+    softer = [isolate_window(monitor.diagnose(later("fluid-film", {"k_by": -0.1}, n)), 0.01) for n in range(4)]
+    assert sum(one.changed == ("k_by",) for one in softer) >= 3
+
+
+@pytest.mark.slow
+def test_a_machine_whose_planes_are_apart_keeps_its_relations() -> None:
+    assert not planes_coupled(healthy("overhung"))
+    assert baseline("overhung").rows == ROWS
+
+
+def test_a_restored_baseline_of_coupled_planes_reads_the_same() -> None:
+    again = BaselineRecord.model_validate_json(BaselineRecord.of(baseline("fluid-film")).model_dump_json())
+    window = later("fluid-film", {}, 0)
+    one, other = (
+        each.diagnose(window) for each in (BaselineDiagnostician(baseline("fluid-film")), again.diagnostician())
+    )
+    assert one.parameters == other.parameters
+
+
+def test_each_condition_that_a_relation_holds_in_makes_it_surer_elsewhere() -> None:
+    learned, window = baseline("overhung"), later("overhung", {}, 0)
+    half = tuple(replace(one, condition=str(one.window % 2)) for one in learned.consistency)
+    found = [BaselineDiagnostician(each).diagnose(window) for each in (learned, replace(learned, consistency=half))]
+    for name, floor in (("k_by", 0.005), ("c_by", 0.03)):
+        alone, two = (next(each.standard_error for each in one.evaluable if each.name == name) for one in found)
+        assert alone is not None
+        assert two is not None
+        assert floor < two * np.sqrt(2)
+        assert two < alone
+    common = found[0].common
+    assert common is not None
+    assert np.all(np.sqrt(np.diag(common))[:4] > (0.0045, 0.025, 0.0045, 0.025))  # no number of windows makes it less
+
+
+def test_a_relation_that_leaves_over_too_much_in_its_own_recording_is_none() -> None:
+    first, second = baseline("overhung").relations
+    assert first is not None
+    foreign = replace(baseline("overhung"), relations=(replace(first, misfit=5.5), second))
+    reason, none = undetermined(foreign)
+    assert "what is left over is 5.5 times what chance leaves" in reason
+    assert none == ""
+
+
+@pytest.mark.slow
+def test_one_recording_that_leaves_a_plane_undetermined_is_not_believed_in_the_other() -> None:
+    windows = subject_named("geared").healthy(5301, 4, 6)
+    with pytest.raises(EstimationError, match="horizontal: what moves with the bearing comes out at"):
+        learned_baseline(windows, ["one"] * 6)
+    first, second = learned_baseline(windows, ["one"] * 3 + ["another"] * 3).relations
+    assert first is None
+    assert second is not None
