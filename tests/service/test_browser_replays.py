@@ -86,6 +86,7 @@ def test_a_recording_is_replayed_with_another_limit_and_scrubbed(browser: Browse
 
         # After twice the delay of the live machine; and windows are full from the twentieth second on.
         events = page.locator("alarm-comparison tbody tr")
+        expect(events.first).to_contain_text(re.compile(r"changed by −\d"))  # no hyphen, as in the text itself
         expect(events.filter(has_text="raised")).to_have_count(1)
         expect(events.filter(has_text="raised")).to_contain_text(re.compile("k_by.*both, 5 s later in this replay"))
         expect(page.locator("state-strip tbody tr")).not_to_have_count(0)

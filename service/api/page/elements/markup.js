@@ -30,10 +30,10 @@ function filled(made, attributes, children) {
   return made;
 }
 
-/** What there is, as nodes and text. @param {Child[]} children */
+/** What there is, as nodes and text, numbers with the minus sign that people write. @param {Child[]} children */
 function nodes(children) {
   const there = children.filter((child) => child !== null && child !== undefined && child !== false && child !== "");
-  return there.map((child) => (child instanceof Node ? child : new Text(String(child))));
+  return there.map((child) => (child instanceof Node ? child : new Text(String(child).replace(/(^|[^\w-])-(?=\d)/g, "$1−"))));
 }
 
 /**
