@@ -27,7 +27,8 @@ def write_page(study: Study, options: Options, records: Sequence[Record], docs: 
     for folder in (figures, results):
         folder.mkdir(parents=True, exist_ok=True)
     charts, goals = list(study.charts(records)), list(study.goals(records))
-    tables = [table.write(records, results) for table in study.tables]
+    filled = [table for table in study.tables if table.of(records)]
+    tables = [table.write(records, results) for table in filled]
     verdicts = [goal.verdict for goal in goals]
     keys = [*study.cells[0].keys, "number"]
     numbers = {
@@ -48,7 +49,7 @@ def write_page(study: Study, options: Options, records: Sequence[Record], docs: 
         title=words["title"],
         text=words["text"].format(**numbers),
         fails=words["fails"].format(**numbers),
-        tables=[(table.page, table.of(records)) for table in study.tables if table.page],
+        tables=[(table.page, table.of(records)) for table in filled if table.page],
         goals=goals,
         verdicts=tuple(verdicts.count(one) for one in ("met", "missed", "within chance")),
         charts=charts,
