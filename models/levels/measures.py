@@ -311,7 +311,8 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
         angle, tapered, weights, every = angle_rad, x.astype(np.float64), np.ones(n_samples), 1
     else:
         size[whole] = 0  # a whole turn beside a step like all others
-        most = int(2 * np.pi / (_SAMPLES_A_TURN * size.max()))
+        slowest = 2 * np.pi * _MANY_REVOLUTIONS / n_samples  # slower, and it has jumped
+        most = int(2 * np.pi / (_SAMPLES_A_TURN * max(slowest, size.max())))
         every = next((step for step in range(most, 1, -1) if n_samples % step == 0), 1)
         angle, kept = angle_rad[::every], n_samples // every
         tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)

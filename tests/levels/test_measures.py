@@ -141,6 +141,15 @@ def test_a_neighbours_line_is_not_read_as_running_speed() -> None:
     assert found.values["x1"][0] < 0.01 * 40e-6
 
 
+@pytest.mark.parametrize("slope", [0.0, 1e-12, 1e-300])
+def test_an_angle_that_jumps_and_stands_between_ends_like_any_other(slope: float) -> None:
+    n_samples = 10_000
+    angle = slope * np.arange(n_samples) + 4.0 * (np.arange(n_samples) // 100)
+    x = np.random.default_rng(98).standard_normal((n_samples, 1))
+    found = hop_levels(plan("displacement", rate_hz=2000.0), x, angle)
+    assert np.isfinite(found.sums[0]).all()
+
+
 def test_a_shaft_that_stands_still_has_no_orders() -> None:
     sizes = plan("velocity", rate_hz=2000.0)
     x = np.random.default_rng(84).standard_normal((10_000, 1))
