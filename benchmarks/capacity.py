@@ -1,6 +1,6 @@
 """How many machines one monitor carries: end to end, from the last sample of a hop to its report on the topic.
 
-Run: ``python benchmarks/capacity.py --machines 10 20 40`` (four minutes for each). A monitor with its history in a file
+Run: ``python benchmarks/capacity.py --machines 10 20 40`` (some minutes for each). A monitor with its history in a file
 and networks on watches so many rotor kits (9 channels, 2 kHz, windows of 60 s, hops of 5 s); this process, which shares
 the computer with it, sends streams simulated beforehand at pace 1, the machines' hops spread evenly over time. Cores
 and memory are the monitor's own; *yardstick* is the processor time of the Fourier transforms that a hop's cross-spectra

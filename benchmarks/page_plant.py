@@ -47,9 +47,10 @@ class Plant:
         return f"event: overview\ndata: {overview(Health.model_validate(told)).model_dump_json()}\n\n"
 
     async def events(self) -> AsyncIterator[str]:
-        """All of them at once, and then a batch again and again."""
+        """All of them one after the other, as the service does, and then a batch again and again."""
         yield "event: start\ndata: {}\n\n"
-        yield "".join(self.health(number) for number in range(self.machines))
+        for number in range(self.machines):
+            yield self.health(number)
         turn = itertools.cycle(range(self.machines))
         while True:
             await asyncio.sleep(self.every_s)
