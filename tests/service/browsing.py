@@ -126,12 +126,20 @@ def route_events(page: Page, instead: Callable[[Route], None]) -> None:
 
 
 def violations(page: Page) -> list[str]:
-    """What breaks a rule of WCAG 2.2 AA on the page as it is now, as axe-core tells it; nothing of it stays there."""
+    """What breaks a rule of WCAG 2.2 AA on the page, as axe-core tells it; nothing of it stays there.
+
+    If anything does, it is looked at again from its top and a second later: where plots come in, and under bars that
+    stay while the page is scrolled, one control lies upon another for a moment.
+    """
     if not page.evaluate("'axe' in window"):
         page.evaluate(files("axe_playwright_python").joinpath("axe.min.js").read_text(encoding="utf-8"))
     # What it says of rules that hold takes as long as looking: one place each of those is told.
     options = {"runOnly": RULES, "resultTypes": ["violations"]}
     found: dict[str, Any] = page.evaluate("options => axe.run(document, options)", options)
+    if found["violations"]:
+        page.evaluate("scrollTo(0, 0)")
+        page.wait_for_timeout(1000)
+        found = page.evaluate("options => axe.run(document, options)", options)
     assert len(found["passes"]) > 10
     return [
         f"{rule['id']}: {node['html'][:200]}: {node['failureSummary']}"
