@@ -6,6 +6,8 @@ export class LiveElement extends HTMLElement {
   #loading = false;
   #again = false;
   #unseen = false;
+  /** Whether what was asked for last has been answered. */
+  answered = false;
 
   connectedCallback() {
     this.#gone = new AbortController();
@@ -43,7 +45,9 @@ export class LiveElement extends HTMLElement {
     this.#loading = true;
     try {
       await this.ask();
+      this.answered = true;
     } catch (error) {
+      this.answered = false;
       this.refused(error instanceof Error ? error.message : String(error));
     } finally {
       this.#loading = false;

@@ -40,9 +40,9 @@ export class MachineElement extends LiveElement {
     if (this.isConnected) this.load();
   }
 
-  /** What is recorded does not change, and is asked for once. @param {number} every_s */
+  /** What is recorded does not change, and is asked for until it is there. @param {number} every_s */
   keepLoading(every_s) {
-    this.repeat(every_s, () => this.recorded || this.load());
+    this.repeat(every_s, () => (this.recorded && this.answered) || this.load());
     this.load();
   }
 
