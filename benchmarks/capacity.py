@@ -57,23 +57,34 @@ def yardstick_s(machine: MachineFile) -> float:
 
 @dataclass(slots=True)
 class Process:
-    """What the system says of a process: processor, s, memory, MB, and what it had written to the disk, MB."""
+    """What the system says of a process and those that it has started: processor, memory, what went to the disk."""
 
     pid: int
 
+    def all(self) -> list[Path]:
+        """Where the system tells of each."""
+        stats = ((one.parent, one.read_text(encoding="utf-8")) for one in Path("/proc").glob("[0-9]*/stat"))
+        started = [place for place, text in stats if int(text.rsplit(")", 1)[1].split()[1]) == self.pid]
+        return [Path(f"/proc/{self.pid}"), *started]
+
     def cpu_s(self) -> float:
-        """Processor time so far."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text(encoding="ascii").rsplit(")", 1)[1].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        """Processor time so far, s."""
+        stats = [(one / "stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split() for one in self.all()]
+        return sum(int(one[11]) + int(one[12]) for one in stats) / os.sysconf("SC_CLK_TCK")
 
     def memory_mb(self) -> float:
-        """Resident memory."""
-        return int(Path(f"/proc/{self.pid}/statm").read_text(encoding="ascii").split()[1]) * 4096 / 1e6
+        """Resident memory, what processes share counted in each, MB."""
+        return sum(int((one / "statm").read_text(encoding="ascii").split()[1]) for one in self.all()) * 4096 / 1e6
 
     def written_mb(self) -> float:
-        """What has gone to the disk."""
-        lines = dict(one.split(": ") for one in Path(f"/proc/{self.pid}/io").read_text(encoding="ascii").splitlines())
-        return int(lines["write_bytes"]) / 1e6
+        """What has gone to the disk, MB."""
+        texts = [(one / "io").read_text(encoding="ascii").splitlines() for one in self.all()]
+        return sum(int(dict(line.split(": ") for line in lines)["write_bytes"]) for lines in texts) / 1e6
+
+    def signal(self, number: int) -> None:
+        """Send a signal to all of them."""
+        for one in self.all():
+            os.kill(int(one.name), number)
 
 
 @dataclass(slots=True)
@@ -136,7 +147,7 @@ def monitored(folder: Path, machines: Sequence[MachineFile]) -> Iterator[tuple[P
     try:
         yield Process(process.pid), endpoint, url_of(process, folder / "out", folder / "log")
     finally:
-        process.send_signal(signal.SIGCONT)
+        Process(process.pid).signal(signal.SIGCONT)
         process.terminate()
         process.wait(120)
 
@@ -211,9 +222,9 @@ def measure(count: int, seed: int, length_s: float, stall_s: float) -> None:
 
 def _stalled(process: Process, plant: Plant, stall_s: float, most_s: float) -> float:
     """Stop the monitor for a while; seconds from then on until the last report that came late."""
-    os.kill(process.pid, signal.SIGSTOP)
+    process.signal(signal.SIGSTOP)
     time.sleep(stall_s)
-    os.kill(process.pid, signal.SIGCONT)
+    process.signal(signal.SIGCONT)
     again_s = time.monotonic()
     time.sleep(max(0.0, most_s - stall_s))
     return max((at_s - again_s for at_s, late_s in plant.heard if at_s > again_s and late_s > IN_TIME_S), default=0.0)

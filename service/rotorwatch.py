@@ -94,7 +94,7 @@ def run(
     check_address_space()
     prepare_numerics()
     raise_file_limit()
-    from service.runtime import running  # noqa: PLC0415  # must see the variables set above
+    from service.runtime.runtime import running  # noqa: PLC0415  # must see the variables set above
     from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
     from service.terminal.logs import configure_logging  # noqa: PLC0415
     from service.terminal.stopping import stop_request  # noqa: PLC0415

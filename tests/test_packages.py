@@ -151,7 +151,7 @@ def test_a_checkout_that_is_not_installed_can_be_imported_and_commissioning_need
 ) -> None:
     code = (
         "import importlib.metadata as m, simulator.commission.command; print('torch' in sys.modules); "
-        "import service.runtime; "
+        "import service.runtime.runtime; "
         "print([d.name for d in m.distributions() if d.name.startswith('rotorwatch')])"
     )
     assert in_new_process(code, checkout, others, cwd=tmp_path) == "False\n[]"

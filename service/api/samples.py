@@ -23,7 +23,7 @@ from service.api.views import ServiceView
 from service.monitor.evaluation import evaluator_for
 from service.monitor.reports import identity_of
 from service.recordings.replay.source import RecordingSource
-from service.stream.worker import MachineWorker
+from service.stream.monitored import Monitored
 
 _MOST_BYTES = 600_000_000
 _PATIENCE_S = 10.0
@@ -112,7 +112,7 @@ class SampleReader:
         self._windows: OrderedDict[object, tuple[MachineSnapshots, LatestData]] = OrderedDict()
 
     @contextmanager
-    def samples(self, view: MachineWorker, chosen: Chosen, reach_s: float | None = None) -> Iterator[Sampled]:
+    def samples(self, view: Monitored, chosen: Chosen, reach_s: float | None = None) -> Iterator[Sampled]:
         """Samples as they were chosen.
 
         Parameters
@@ -142,7 +142,7 @@ class SampleReader:
             keys = source.machine(_place(view))
             yield Recorded(source, keys, *source.between(_moment(since_ns), _moment(until_ns), keys))
 
-    def window(self, view: MachineWorker, chosen: Chosen) -> tuple[MachineSnapshots, LatestData]:
+    def window(self, view: Monitored, chosen: Chosen) -> tuple[MachineSnapshots, LatestData]:
         """A window as it was chosen, and what shows it; of those that were recorded the newest few are kept.
 
         Raises
@@ -163,7 +163,7 @@ class SampleReader:
             return kept
 
     def _read(
-        self, view: MachineWorker, chosen: Chosen, job: ReplayJob | None, found: _Files
+        self, view: Monitored, chosen: Chosen, job: ReplayJob | None, found: _Files
     ) -> tuple[MachineSnapshots, LatestData]:
         installed, report, until_ns = view.snapshots.installed, None, chosen.until_ns
         if job is not None and job.mode == "offline":
@@ -179,14 +179,14 @@ class SampleReader:
             data = LatestData(lacking=str(error))
         return MachineSnapshots(installed, identity_of(installed)), data
 
-    def _files(self, view: MachineWorker, chosen: Chosen) -> _Files:
+    def _files(self, view: Monitored, chosen: Chosen) -> _Files:
         ids = [f"{_place(view)}/{name}" for name in chosen.recordings]
         if chosen.replay is not None:
             ids = list(self._job(view, chosen.replay).recordings)
         found = [found_recording(self._service.catalogue, one) for one in dict.fromkeys(ids)]
         return tuple((one.path, one.size_bytes) for one in found)
 
-    def _job(self, view: MachineWorker, replay_id: str) -> ReplayJob:
+    def _job(self, view: Monitored, replay_id: str) -> ReplayJob:
         job = self._service.replays.job(replay_id)
         machine = job.recordings[0].rpartition("/")[0]
         if machine != _place(view):
@@ -217,7 +217,7 @@ def _check_size(source: RecordingSource, since_ns: int | None, until_ns: int | N
         raise HTTPException(422, f"recording: {size / 1e6:.0f} MB, {most}")
 
 
-def _place(view: MachineWorker) -> str:
+def _place(view: Monitored) -> str:
     return f"{view.machine.site}/{view.machine.name}"
 
 

@@ -16,7 +16,7 @@ from service.delivery.webhooks.webhooks import Webhooks
 from service.history.holdings import Holdings
 from service.history.shared import AuditLog
 from service.recordings.catalogue import Catalogue
-from service.stream.worker import MachineWorker
+from service.stream.monitored import Monitored
 
 PLACE = "/api/v1/machines/{site}/{machine}"
 _LATEST_NS = 2**63 - 1
@@ -43,12 +43,12 @@ AlarmName = Annotated[
 
 
 class ServiceView(Protocol):
-    """What the API needs to know about the service; `service.runtime.Runtime` is one."""
+    """What the API needs to know about the service; `service.runtime.runtime.Runtime` is one."""
 
-    def machines(self) -> Sequence[MachineWorker]:
+    def machines(self) -> Sequence[Monitored]:
         """Every monitored machine."""
 
-    def machine(self, site: str, name: str) -> MachineWorker | None:
+    def machine(self, site: str, name: str) -> Monitored | None:
         """One machine, or None if it is not monitored."""
 
     def readiness(self) -> Readiness:
@@ -83,7 +83,7 @@ class ServiceView(Protocol):
         """Where replays are started."""
 
 
-def found_machine(service: ServiceView, site: str, name: str) -> MachineWorker:
+def found_machine(service: ServiceView, site: str, name: str) -> Monitored:
     """Find a machine.
 
     Raises

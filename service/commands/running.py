@@ -95,6 +95,9 @@ def prepare_numerics() -> None:
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
+    # The same for the programs that this one starts.
+    os.environ["MALLOC_ARENA_MAX"] = "2"
+    os.environ["MALLOC_TRIM_THRESHOLD_"], os.environ["MALLOC_MMAP_THRESHOLD_"] = str(_KEPT_BYTES), str(_LARGE_BYTES)
     library = ctypes.CDLL(None)
     if hasattr(library, "mallopt"):  # not everywhere
         library.mallopt(_M_ARENA_MAX, 2)

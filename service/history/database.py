@@ -104,7 +104,7 @@ class Database:
         set_aside : bool
             Whether a file that is damaged is renamed and a new one begun; otherwise it is an error.
         read_only : bool
-            Neither make the file nor touch the tables, to look into a history that another program writes.
+            Neither make the file nor touch the tables: another program looks after the history.
 
         Raises
         ------
@@ -115,6 +115,8 @@ class Database:
             raise StoreError(f"{self.shown}: the history is open already")
         with self.plainly():
             self._engine = self._new_engine() if read_only else self._connect(set_aside)
+            if read_only and self.file is not None:
+                self.file.opened()
         threading.Thread(target=self._watch, name="history-watch", daemon=True).start()
 
     def stop(self) -> None:

@@ -15,14 +15,16 @@ whoever waits is told.
 import time
 from collections.abc import Callable
 
-from sqlalchemy import text
+from sqlalchemy import select, text
 
+from service.history.claim import Claim
 from service.history.database import Database
 from service.history.holdings import Holdings
 from service.history.machine import MachineStore
 from service.history.records import Dropped, Retention, StoreError
 from service.history.reduction import Reduction
 from service.history.shared import AlarmLog, AuditLog, TokenStore, WebhookCursors
+from service.history.tables import machines
 from service.history.writer import Writer
 
 _PROBE_S = 3.0
@@ -44,6 +46,9 @@ class Store:
         Reports of one machine that wait in memory meanwhile, and steps whose readings do.
     now_ns : callable
         The computer's time, nanoseconds since 1970 UTC.
+    shared : bool
+        Other processes of this monitor write the same database, and one of them looks after it: nothing is made,
+        reduced or begun anew here.
 
     Raises
     ------
@@ -69,10 +74,12 @@ class Store:
         retry_s: float = 1.0,
         waiting_reports: int = 2000,
         now_ns: Callable[[], int] = time.time_ns,
+        shared: bool = False,
     ) -> None:
         self._database = Database(url, timeout_s)
         self._bucket_ns = retention.bucket_s * 10**9
-        self._writer = Writer(self._database, retry_s, waiting_reports, self._bucket_ns)
+        self._writer = Writer(self._database, retry_s, waiting_reports, self._bucket_ns, shared=shared)
+        self._shared = shared
         self._reduction = Reduction(self._database, retention, now_ns)
         self._now_ns = now_ns
         self.holdings = Holdings(self._database, retention)
@@ -120,9 +127,10 @@ class Store:
         StoreError
             If the database cannot be reached or used.
         """
-        self._database.start(set_aside)
+        self._database.start(set_aside, read_only=self._shared)
         self._writer.start()
-        self._reduction.start()
+        if not self._shared:
+            self._reduction.start()
 
     def close(self) -> None:
         """Write what waits, if the database takes it, let go of all machines and disconnect.
@@ -135,7 +143,8 @@ class Store:
         if not self._database.is_open:
             return
         try:
-            self._reduction.stop()
+            if not self._shared:
+                self._reduction.stop()
             self._writer.stop()
         finally:
             self._database.stop()
@@ -149,6 +158,22 @@ class Store:
             If another monitor writes it, or the database fails.
         """
         return MachineStore(self._database, self._writer, self._writer.claim(site, name), self._now_ns, self._bucket_ns)
+
+    def reader(self, site: str, name: str) -> MachineStore:
+        """The history of a machine that another process of this monitor writes, to be read.
+
+        Raises
+        ------
+        StoreError
+            If there is none, or the database fails.
+        """
+        found = self._database.rows(
+            select(machines.c.machine_id).where(machines.c.site == site, machines.c.name == name)
+        )
+        if not found:
+            raise StoreError(f"{self.shown}: there is no history of {site}/{name}")
+        claim = Claim(site, name, most_reports=0, machine_id=found[0][0])
+        return MachineStore(self._database, self._writer, claim, self._now_ns, self._bucket_ns)
 
     def retain(self, now_ns: int) -> Dropped:
         """Drop and reduce what is too old at a time of the computer; happens by itself every few minutes.

@@ -23,6 +23,8 @@ from service.history.tables import machines
 _LOCK = 0x726F746F  # first number of PostgreSQL's advisory locks; the second is the machine's
 _LOOK_S = 2.0  # between looks whether the database is still where it should be
 _LETS_GO_S = 2.0  # PostgreSQL notices within it that a monitor that was killed has gone
+_ENDS_S = 6.0  # until a process that shares the machines has ended that lost its monitor
+_AGAIN_S = 0.05
 _PATIENCE = 4.0  # times the database's timeout: others may be before this step
 _log = structlog.get_logger("rotorwatch", part="history")
 
@@ -41,13 +43,18 @@ class Writer:
         Reports of one machine that wait meanwhile, and steps whose readings do.
     bucket_ns : int
         Length of the buckets that readings are added to.
+    shared : bool
+        Another process looks after the database: one that was deleted, replaced or damaged is not begun anew here.
     """
 
-    def __init__(self, database: Database, retry_s: float, most_reports: int, bucket_ns: int) -> None:
+    def __init__(
+        self, database: Database, retry_s: float, most_reports: int, bucket_ns: int, *, shared: bool = False
+    ) -> None:
         self._database = database
         self._retry_s = retry_s
         self._most_reports = most_reports
         self._bucket_ns = bucket_ns
+        self._shared = shared
         self._claims: list[Claim] = []
         self._files = ExitStack()
         self._series: SeriesNumbers = {}
@@ -186,6 +193,9 @@ class Writer:
         why, generation = self._database.astray(), self._database.generation
         if not self._claims or not (why or any(claim.generation != generation for claim in self._claims)):
             return True
+        if self._shared:
+            self._fail(self._claims, f"{why}; start the monitor again")
+            return False
         self._fail(self._claims, why or self.trouble)
         try:
             if why:
@@ -227,22 +237,25 @@ class Writer:
         number = select(machines.c.machine_id).where(machines.c.site == claim.site, machines.c.name == claim.name)
         new = {"site": claim.site, "name": claim.name, "owner": "", "steps": 0, "reports": 0, "windows": 0}
         owner, file = secrets.token_hex(16), self._database.file
+        patience = time.monotonic() + min(_LETS_GO_S, self._database.timeout_s)
         with ExitStack() as undo:
+            if file is not None:
+                path = file.path.with_name(f"{file.path.name}.{claim.site}.{claim.name}.lock")
+                # A process that shares the machines may be ending, on its own, after its monitor was killed.
+                while (descriptor := lock_file(path)) is None:
+                    if not self._shared or time.monotonic() > patience + _ENDS_S:
+                        raise _taken(claim)
+                    time.sleep(_AGAIN_S)
+                undo.callback(os.close, descriptor)
             with connection.begin():
                 if (found := connection.scalar(number)) is None:
                     connection.execute(self._database.insert(machines).values(new).on_conflict_do_nothing())
                     found = connection.execute(number).scalar_one()
-                if file is not None:
-                    descriptor = lock_file(file.path.with_name(f"{file.path.name}.{claim.site}.{claim.name}.lock"))
-                    if descriptor is None:
-                        raise _taken(claim)
-                    undo.callback(os.close, descriptor)
-                elif not self._database.is_sqlite:
-                    patience = time.monotonic() + min(_LETS_GO_S, self._database.timeout_s)
+                if not self._database.is_sqlite:
                     while not _lock_row(connection, found):
                         if time.monotonic() > patience:
                             raise _taken(claim)
-                        time.sleep(0.05)
+                        time.sleep(_AGAIN_S)
                 chosen = machines.c.machine_id == found
                 connection.execute(update(machines).where(chosen).values(owner=owner))
                 steps = connection.execute(select(machines.c.steps).where(chosen)).scalar_one()

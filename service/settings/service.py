@@ -150,6 +150,17 @@ class RecordingSettings(BaseModel, extra="forbid", frozen=True):
         return self
 
 
+class ShardSettings(BaseModel, extra="forbid", frozen=True):
+    """Processes that share the machines: one computes on one core at a time."""
+
+    count: int | None = Field(
+        default=None,
+        ge=1,
+        le=1024,
+        description="how many there are; left out, one for every ten machines, and no more than there are cores",
+    )
+
+
 class ReplaySettings(BaseModel, extra="forbid", frozen=True):
     """Replays of recordings that are started over HTTP; results are kept below the directory of the recordings."""
 
@@ -188,6 +199,7 @@ class ServiceSettings(BaseSettings):
     )
     queue: QueueSettings = Field(default=QueueSettings(), description="blocks that wait for evaluation")
     history: HistorySettings = Field(default=HistorySettings(), description="reports, alarms, restarts")
+    shards: ShardSettings = Field(default=ShardSettings(), description="processes that share the machines")
     recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
     replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
     webhooks: tuple[WebhookSettings, ...] = Field(default=(), description="who is told of alarm events")

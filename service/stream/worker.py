@@ -27,9 +27,12 @@ from service.monitor.alarms.operation import NotInTime, OperatorAction
 from service.monitor.descriptor import descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MachineHealth, MonitorReport, Tally, identity_of
+from service.recordings.recorder import MachineRecorder
 from service.settings.service import QueueSettings
 from service.stream.checkpoints import StepWriter, recorded_after, recorded_since_ns, restored
 from service.stream.inbox import Inbox, RawBlock
+from service.stream.liveness import Pulse
+from service.stream.monitored import MachineStatus
 from service.stream.outlet import Outlet
 from service.terminal.logs import Limiter, logger
 
@@ -91,6 +94,7 @@ class MachineWorker:
         self.latest = LatestData()
         self.errors = 0
         self.last_error = ""
+        self.recorder: MachineRecorder | None = None
         self.tally = Tally()
         self._clocks = clocks
         self._on_events = on_events
@@ -116,6 +120,7 @@ class MachineWorker:
         self._published_alarms: tuple[tuple[str, int, bool, bool], ...] = ()
         self._dropped_logged = 0
         self._ticking = False
+        self._pulse = Pulse(self.inbox.call)
         self._thread = threading.Thread(target=self._run, name=f"monitor {machine.site}/{machine.name}", daemon=True)
 
     def _restored(self, installed: Installed) -> tuple[MachineMonitor, str]:
@@ -218,6 +223,21 @@ class MachineWorker:
             restart="; ".join(each for each in (self.restart, self._monitor.recalled) if each),
         )
 
+    def status(self) -> MachineStatus:
+        """How the monitoring is at work."""
+        return MachineStatus(
+            alive=self.alive,
+            errors=self.errors,
+            last_error=self.last_error,
+            trouble=self.trouble,
+            busy_s=round(self._pulse.busy_s, 1),
+            queue_blocks=len(self.inbox),
+            history_waiting=self.history.waiting,
+            restart=self.restart,
+            tally=self.tally,
+            recorder=None if self.recorder is None else self.recorder.status(),
+        )
+
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
         snapshot = self._snapshot
@@ -284,6 +304,7 @@ class MachineWorker:
 
     def tick(self) -> None:
         """Let the machine's thread notice that time passes, with data or without; called every now and then."""
+        self._pulse.beat()
         if not self._ticking:
             self._ticking = True
             self.inbox.call(self._tick)

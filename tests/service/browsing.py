@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, Route, sync_playwright
 
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import MachineEntry
 from simulator.scenario import parse_fault
 from tests.service.live import LAB, SHORT, Feed, endpoint, machine_file, open_session, scenario_blocks, settings

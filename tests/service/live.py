@@ -21,7 +21,7 @@ from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from models.signals.wire import encode_block
 from rotorwatch.records.health import Health
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import HistorySettings, HttpSettings, MachineEntry, QueueSettings, ServiceSettings
 from service.stream.worker import MachineWorker
@@ -113,13 +113,20 @@ def settings(
     )
 
 
+def worker_of(runtime: Runtime) -> MachineWorker:
+    """The first machine, which this process monitors itself."""
+    worker = runtime.machines()[0]
+    assert isinstance(worker, MachineWorker)
+    return worker
+
+
 @contextmanager
 def service(
     listen: str, machine: str = "lab", bundle: str | None = None, when_full: str = "drop", bound: int = 600
 ) -> Iterator[tuple[Runtime, MachineWorker]]:
     """A running service with one machine."""
     with running(settings(listen, machine, bundle, when_full, bound)) as runtime:
-        yield runtime, runtime.machines()[0]
+        yield runtime, worker_of(runtime)
 
 
 def machine_file(folder: Path, *replacements: tuple[str, str]) -> str:

@@ -13,11 +13,21 @@ from models.machine import load_machine
 from rotorwatch.records.monitor import Problem
 from service.access.scopes import Scope
 from service.access.tokens import new_token
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
-from tests.service.live import Feed, endpoint, machine_file, open_session, scenario_blocks, send, settings, until
+from tests.service.live import (
+    Feed,
+    endpoint,
+    machine_file,
+    open_session,
+    scenario_blocks,
+    send,
+    settings,
+    until,
+    worker_of,
+)
 
 PLACE = "/api/v1/machines/demo/lab"
 OPEN = AccessSettings(open_on_loopback=True, limits=LimitSettings(requests_per_minute=1_000_000))
@@ -41,7 +51,7 @@ def faulty(folder: Path, access: AccessSettings = OPEN) -> Iterator[tuple[Runtim
     plan = settings(address, file, bundle="lab", when_full="wait")
     recording = plan.recording.model_copy(update={"directory": folder / "recordings"})
     with running(plan.model_copy(update={"access": access, "recording": recording})) as runtime:
-        worker = runtime.machines()[0]
+        worker = worker_of(runtime)
         send(address, scenario_blocks(78.0, parse_fault("k_by=-0.33@0")), load_machine(file))
         until(lambda: worker.health().quality.accepted_blocks == 780, "all blocks")
         yield runtime, worker

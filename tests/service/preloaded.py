@@ -16,7 +16,7 @@ from pathlib import Path
 _ROOT = Path(__file__).parents[2]
 
 PROGRAMS = [
-    *("service.runtime", "service.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
+    *("service.runtime.runtime", "service.rotorwatch", "simulator.rotorsim", "simulator.publisher"),
     *("models.signals.recording", "service.recordings.replay.offline", "service.terminal.stopping"),
     *("service.history.migrations", "pydantic.v1", "uvicorn.loops.asyncio", "uvicorn.lifespan.off", __name__),
 ]

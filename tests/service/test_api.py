@@ -21,7 +21,7 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from service.access.scopes import Scope
 from service.api.description import DescribedApp
 from service.api.routes.page import page_files
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
 from tests.service.live import ROOT, START_NS
 from tests.service.monitored import GUARDED, PLACE, answered, client, faulty, fed, problem, token

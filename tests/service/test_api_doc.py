@@ -18,7 +18,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.monitor import Problem
 from service.access.guard import Guard
 from service.api.app import create_app
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from service.settings.service import ServiceSettings
 from tests.service.live import ROOT, settings, until
 from tests.service.monitored import GUARDED, PLACE, client, fed, token

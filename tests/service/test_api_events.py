@@ -25,10 +25,10 @@ from service.delivery import event_feed
 from service.delivery.event_feed import CursorError, EventFeed, cursor_text, parsed_cursor
 from service.history.records import StoreError
 from service.monitor.alarms.operation import OperatorAction
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import MachineEntry
-from service.stream.worker import MachineWorker
+from service.stream.monitored import Monitored
 from tests.service.live import endpoint, settings, until
 from tests.service.monitored import OPEN, client, fed, problem, token
 
@@ -52,7 +52,7 @@ def shared() -> Iterator[Runtime]:
         yield runtime
 
 
-def happen(worker: MachineWorker, count: int = 1) -> None:
+def happen(worker: Monitored, count: int = 1) -> None:
     """Bring about alarm events."""
     for _ in range(count):
         kind: Any = "unshelve" if worker.history.last_sequence() % 2 == 0 else "shelve"
@@ -85,7 +85,7 @@ def is_shelved(health: Health) -> bool:
     return any(one.name == "k_by" and one.state == "shelved" for one in health.alarms)
 
 
-def log(worker: MachineWorker) -> list[str]:
+def log(worker: Monitored) -> list[str]:
     return [one.text for one in worker.history.events(after=-1, limit=10_000)]
 
 

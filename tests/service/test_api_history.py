@@ -21,7 +21,7 @@ from service.monitor import conversion
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.alarms.alarm import Alarm, AlarmEvent
 from service.monitor.reports import MachineHealth, identity_of, machine_hash
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from tests.service.live import LAB, START_NS, Feed, until
 from tests.service.monitored import PLACE, answered, client, fed
 

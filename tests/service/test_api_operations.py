@@ -13,8 +13,8 @@ from rotorwatch.records.alarms import Alarm, AlarmStates
 from rotorwatch.records.history import AlarmEventList, AuditList
 from rotorwatch.records.operations import OperationDone
 from service.access.scopes import Scope
-from service.runtime import Runtime
-from tests.service.live import Feed, until
+from service.runtime.runtime import Runtime
+from tests.service.live import Feed, until, worker_of
 from tests.service.monitored import GUARDED, PLACE, answered, client, fed, problem, token
 
 READ, OPERATE, CONFIGURE = Scope
@@ -241,7 +241,7 @@ def test_what_was_done_and_what_was_refused_is_in_the_audit_log(plant: tuple[Run
 
 def test_a_monitor_that_is_being_stopped_says_so(plant: tuple[Runtime, Feed, httpx.Client]) -> None:
     runtime, _, http = plant
-    runtime.machines()[0].stop()
+    worker_of(runtime).stop()
     found = problem(http.post(f"{GAP}/acknowledge", json={}, headers={"If-Match": "*"}), 503)
     assert found.detail == "demo/lab: the monitor is being stopped"
     found = problem(http.get("/readyz"), 503)

@@ -15,13 +15,13 @@ import pytest
 from models.machine import load_machine
 from models.signals.keys import MachineKeys
 from models.signals.link import LinkSettings
-from service.runtime import running
+from service.runtime.runtime import running
 from service.stream.transport import route
 from simulator.publisher import PublishSettings, publish
 from simulator.scenario import load_scenario, parse_fault
 from simulator.stream import TruthRecord, blocks
 from tests.service.asyncapi import asyncapi
-from tests.service.live import LAB, ROOT, START_NS, endpoint, machine_file, open_session, settings, until
+from tests.service.live import LAB, ROOT, START_NS, endpoint, machine_file, open_session, settings, until, worker_of
 
 PAGE = ROOT / "docs" / "asyncapi.json"
 DOCUMENT = asyncapi(TruthRecord)
@@ -117,7 +117,7 @@ def heard(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     link = LinkSettings(mode="client", connect=(address,))
     plant = settings(address, file, bundle="lab", when_full="wait").model_copy(update={"link": link})
     with route(LinkSettings(listen=(address,))), running(plant) as runtime, open_session(address, "client") as session:
-        worker = runtime.machines()[0]
+        worker = worker_of(runtime)
         subscriber = session.declare_subscriber(
             f"{LAB.keys.root}/**", lambda sample: take(str(sample.key_expr), sample.payload.to_bytes())
         )

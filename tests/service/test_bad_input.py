@@ -27,7 +27,7 @@ from service.analysis.trend import read_trend
 from service.interchange.exported import Selection, Table, alarm_table, report_table, stream_table
 from service.monitor.descriptor import descriptor_mismatch
 from service.recordings.replay.source import RecordingSource
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from service.stream.worker import MachineWorker
 from tests.service.live import LAB, Feed, endpoint, machine_file, open_session, service, until
 

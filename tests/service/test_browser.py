@@ -17,7 +17,7 @@ from rotorwatch.records.history import ReadingBucket
 from rotorwatch.records.levels import LevelGrowth
 from rotorwatch.records.windows import SensorFault, Shape
 from service.access.scopes import Scope
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from tests.service.browsing import (
     PATIENCE_MS,
     SEEN_AT,

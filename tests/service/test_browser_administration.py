@@ -12,7 +12,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.monitor import MachineReadiness, Readiness, WebhookList
 from service.access.scopes import Scope
 from service.history.records import AuditEntry
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations
 from tests.service.monitored import GUARDED, fed, token
 

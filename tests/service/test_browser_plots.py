@@ -13,7 +13,7 @@ from models.machine import load_machine
 from rotorwatch.records.example import example
 from rotorwatch.records.health import Health
 from rotorwatch.records.windows import SensorFault, UnbalanceVector
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, route_events, violations
 from tests.service.live import ROOT
 from tests.service.monitored import faulty

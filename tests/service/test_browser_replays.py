@@ -10,7 +10,7 @@ from playwright.sync_api import Browser, Page, expect
 from models.machine import load_machine
 from rotorwatch.records.replays import ReplayJob, ReplayReportList
 from rotorwatch.records.snapshots import OrbitSnapshot, SpectrumSnapshot
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
 from tests.service.browsing import PATIENCE_MS, chromium, kept, looking, unreached, violations

@@ -34,7 +34,7 @@ from rotorwatch import (
 )
 from rotorwatch.client import errors
 from service.access.scopes import Scope
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, TlsSettings
 from service.settings.service import HistorySettings, HttpSettings, ServiceSettings
 from service.stream.worker import MachineWorker

@@ -9,7 +9,7 @@ from rotorwatch.records.health import HealthState
 from rotorwatch.records.history import AlarmEvidence
 from service.history.records import Retention
 from service.history.store import Store
-from service.runtime import running
+from service.runtime.runtime import running
 from service.settings.service import HistorySettings, MachineEntry
 from simulator.scenario import parse_fault
 from tests.service.live import LAB, SHORT, Feed, endpoint, machine_file, open_session, scenario_blocks, settings, until

@@ -12,7 +12,7 @@ from models.alarm_names import FAULT
 from service.history.records import Retention, StoredEvent, TokenRecord
 from service.history.store import Store
 from service.rotorwatch import app
-from service.runtime import running as running_here
+from service.runtime.runtime import running as running_here
 from service.settings.service import HistorySettings
 from tests.service.live import PATIENT, endpoint, machine_file, settings, until
 from tests.service.monitored import client

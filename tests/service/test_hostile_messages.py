@@ -25,7 +25,7 @@ from rotorwatch.records.example import example
 from rotorwatch.records.health import HealthState, Report
 from service.monitor.descriptor import MOST_BYTES, MOST_DIFFERENCES, descriptor_mismatch
 from service.monitor.monitor import MachineMonitor
-from service.runtime import running
+from service.runtime.runtime import running
 from service.stream.inbox import Inbox, RawBlock
 from service.stream.transport import Link, route
 from tests.service.foreign import FOREIGN, Foreign, as_blocks, foreign

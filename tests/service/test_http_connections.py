@@ -16,7 +16,7 @@ from fastapi import FastAPI
 from structlog.testing import capture_logs
 
 from service.api.server import HttpServer, http_connections
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.access import AccessSettings, LimitSettings
 from service.settings.service import HttpSettings
 from tests.service.live import OPEN, endpoint, program, settings, until

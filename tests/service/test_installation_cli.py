@@ -14,7 +14,7 @@ from models.machine import load_machine_file
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from service.access.scopes import Scope
-from service.runtime import running
+from service.runtime.runtime import running
 from service.settings.service import load_settings
 from simulator.publisher import PublishSettings, publish
 from tests.loopback import endpoint

@@ -13,7 +13,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from service.access.scopes import Scope
 from service.delivery.metrics.requests import RequestCounts
 from service.history.records import StoreError
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import HistorySettings
 from tests.service.hooked import hook, settings_for
 from tests.service.live import ROOT, Feed, endpoint, machine_file, open_session, settings, until
@@ -126,9 +126,9 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
     assert read.of_lab("gaps_total") == quality.gaps == 1
     assert read.of_lab("missing_seconds_total") == pytest.approx(3.0)
     assert read.of_lab("step_seconds_count") == 16
-    assert 0.0 < read.of_lab("step_seconds_sum") == pytest.approx(worker.tally.step_s)
-    assert read.of_lab("commit_seconds_total") == pytest.approx(worker.tally.commit_s) != 0.0
-    assert read.of_lab("windows_total") == worker.tally.windows
+    assert 0.0 < read.of_lab("step_seconds_sum") == pytest.approx(worker.status().tally.step_s)
+    assert read.of_lab("commit_seconds_total") == pytest.approx(worker.status().tally.commit_s) != 0.0
+    assert read.of_lab("windows_total") == worker.status().tally.windows
     assert read.of_lab("window_filled_ratio") == worker.health().filled
     assert read.of_lab("data_age_seconds") >= 0.0
     for name in ("queue_blocks", "queue_dropped_blocks_total", "link_missed_blocks_total", "publisher_alive",
@@ -149,7 +149,7 @@ def test_data_and_alarms_are_counted_as_they_came(read: Read, served: tuple[Runt
 
 
 def test_the_service_itself(read: Read, served: tuple[Runtime, str, Read]) -> None:
-    recorder = served[0].recorder_status(served[0].machines()[0])
+    recorder = served[0].machines()[0].status().recorder
     assert recorder is not None
     assert read.of_lab("recorder_state", state="recording") == 1.0
     assert read.of_lab("recorder_state", state="off") == 0.0

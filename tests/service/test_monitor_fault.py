@@ -19,7 +19,7 @@ from service.monitor.alarms.alarm import AlarmEvent
 from service.monitor.evaluation import KnownMachineEvaluator
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import identity_of
-from service.runtime import running
+from service.runtime.runtime import running
 from service.stream.checkpoints import checkpoint_step, restored
 from service.stream.inbox import Inbox, RawBlock
 from tests.service.live import (
@@ -33,6 +33,7 @@ from tests.service.live import (
     send,
     service,
     until,
+    worker_of,
 )
 from tests.service.live import settings as plan_for
 from tests.service.monitored import client
@@ -197,7 +198,7 @@ def test_a_full_queue_says_so_to_operators(tmp_path: Path) -> None:
     quiet = ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
     plan = plan_for(address, machine_file(tmp_path, quiet), bound=30)
     with running(plan) as runtime, open_session(address) as session:
-        worker = runtime.machines()[0]
+        worker = worker_of(runtime)
         feed = Feed(session, worker.machine)
         feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks == 1, "first block")

@@ -28,7 +28,7 @@ from rotorwatch import __version__
 from service.access.guard import Guard
 from service.access.scopes import Scope
 from service.api.app import create_app
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from tests.service.monitored import GUARDED, client, faulty, problem, token
 
 READ, OPERATE, CONFIGURE = Scope

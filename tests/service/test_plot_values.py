@@ -22,7 +22,7 @@ from service.analysis.recorded import Sampled
 from service.analysis.snapshots.run_up import centreline_series, vector_series
 from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
 from service.api import samples
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from tests.service.live import LAB, START_NS
 from tests.service.monitored import PLACE, answered, client, faulty, problem
 from tests.service.replaying import S, recorded, recording

@@ -2,6 +2,7 @@
 
 import sqlite3
 import threading
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -10,9 +11,8 @@ import pytest
 from rotorwatch.records.health import HealthState
 from rotorwatch.records.monitor import MachineReadiness, Readiness
 from service.api.readiness import readiness_of
-from service.history.records import Retention
 from service.history.store import Store
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import HistorySettings, ServiceSettings
 from service.stream.liveness import Pulse
 from tests.service.hooked import hook, settings_for
@@ -28,15 +28,17 @@ def asked(runtime: Runtime) -> tuple[int, Readiness]:
     return answer.status_code, Readiness.model_validate(fields)
 
 
-def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(tmp_path: Path) -> None:
+def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     address, file = endpoint(), tmp_path / "history.sqlite"
     machine = machine_file(
         tmp_path, ("[operation]", "[ingest]\nno_data_after_s = 3600.0\nreorder_blocks = 0\n\n[operation]")
     )
     plan = settings(address, machine, when_full="wait")
-    runtime = Runtime(plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")}))
     # As the runtime makes it, but not as patient with its database.
-    runtime.store = Store(f"sqlite:///{file}", Retention(), timeout_s=2.0, retry_s=0.05)
+    monkeypatch.setattr("service.runtime.runtime.Store", partial(Store, timeout_s=2.0, retry_s=0.05))
+    runtime = Runtime(plan.model_copy(update={"history": HistorySettings(url=f"sqlite:///{file}")}))
     runtime.start()
     try:
         with open_session(address) as session:

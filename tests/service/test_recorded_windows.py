@@ -18,7 +18,7 @@ from rotorwatch.records.snapshots import CorrelationSnapshot, OrbitSnapshot, Spe
 from service.analysis.recorded_window import recorded_window
 from service.monitor.monitor import MachineMonitor
 from service.recordings.replay.source import RecordingSource
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from simulator.scenario import parse_fault
 from tests.service.live import SHORT, START_NS, endpoint, machine_file, scenario_blocks, settings, until

@@ -23,9 +23,9 @@ from service.recordings.backlog import Backlog
 from service.recordings.catalogue import Catalogue
 from service.recordings.leftovers import is_locked
 from service.recordings.recorder import MachineRecorder
-from service.runtime import running
+from service.runtime.runtime import running
 from service.settings.service import RecordingSettings, ServiceSettings
-from tests.service.live import LAB, ROOT, Feed, Program, endpoint, open_session, program, settings, until
+from tests.service.live import LAB, ROOT, Feed, Program, endpoint, open_session, program, settings, until, worker_of
 
 KEYS = LAB.keys
 NOW_NS = 1_795_271_130_000_000_000  # 2026-11-21 14:25:30 UTC
@@ -89,7 +89,8 @@ def test_everything_under_the_keys_is_recorded_as_it_was(tmp_path: Path) -> None
             )
             session.put("rotorwatch/demo/other/stream", b"another machine")
             until(lambda: service.machines()[0].health().quality.accepted_blocks == 120, "120 accepted blocks")
-            (recorder,) = service._recorders.values()
+            recorder = worker_of(service).recorder
+            assert recorder is not None
             # Descriptor, note, health, alarm states, and the reports of two hops.
             until(lambda: recorder.status().received >= 126, "messages at the recorder")
         assert service.readiness().machines[0].recording == "recording"
@@ -231,7 +232,8 @@ def test_a_missing_folder_is_waited_for_without_losing_anything(tmp_path: Path) 
         until(lambda: "failing" in service.readiness().machines[0].recording, "failing recorder")
         assert "disk/demo/lab: cannot be written" in service.readiness().machines[0].recording
         assert service.readiness().ready
-        (recorder,) = service._recorders.values()
+        recorder = worker_of(service).recorder
+        assert recorder is not None
         until(lambda: recorder.status().received >= 30, "messages at the recorder")
         place.unlink()
         until(lambda: service.readiness().machines[0].recording == "recording", "recorder that works")

@@ -21,7 +21,7 @@ from service.recordings.catalogue import PART, Catalogue, Recording, kept_reason
 from service.recordings.recent import recent_messages, recorded_files
 from service.recordings.recorder import MachineRecorder
 from service.recordings.retention import AlarmMark, alarm_mark, decide
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import RecordingSettings
 from tests.service.live import (
     LAB,
@@ -35,6 +35,7 @@ from tests.service.live import (
     scenario_blocks,
     settings,
     until,
+    worker_of,
 )
 from tests.service.replaying import recording
 from tests.service.test_store import alarm_event
@@ -252,7 +253,9 @@ def recorded(folder: Path) -> Iterator[tuple[Runtime, Feed]]:
 def test_a_monitor_keeps_recordings_for_its_own_alarms_alone(tmp_path: Path) -> None:
     folder = tmp_path / "kept" / "demo" / "lab"
     with recorded(tmp_path) as (runtime, feed):
-        recorder, worker = runtime._recorders["demo", "lab"], runtime.machines()[0]
+        worker = worker_of(runtime)
+        recorder = worker.recorder
+        assert recorder is not None
 
         def closed(count: int) -> bool:
             feed.session.put(LAB.keys.alarm_event, ALARM.payload, encoding=ALARM.encoding)

@@ -17,7 +17,7 @@ import models.machine
 from rotorwatch.records.recordings import RecordingDetail, RecordingList
 from rotorwatch.records.replays import ReplayAlarmList, ReplayJob, ReplayList, ReplayReportList
 from service.api.routes.replays import ReplayDesk
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import HttpSettings, RecordingSettings, ReplaySettings, ServiceSettings
 from simulator.scenario import parse_fault
 from tests.service import monitored

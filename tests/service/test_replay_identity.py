@@ -18,12 +18,12 @@ from service.monitor.monitor import MachineMonitor
 from service.recordings.replay.control import Control
 from service.recordings.replay.offline import OfflineReplay
 from service.recordings.replay.source import RecordingSource
-from service.runtime import running
+from service.runtime.runtime import running
 from service.stream.replay_link import NetworkPlan, replay_to_network
 from service.stream.transport import TopicMessage, follow
 from service.stream.worker import MachineWorker
 from simulator.scenario import parse_fault
-from tests.service.live import LAB, endpoint, scenario_blocks, send, service, settings, until
+from tests.service.live import LAB, endpoint, scenario_blocks, send, service, settings, until, worker_of
 from tests.service.replaying import digest_of, lines_of, recording, split
 
 BLOCKS = 700
@@ -70,7 +70,7 @@ def monitor_in(namespace: str, link: LinkSettings, when_full: str = "drop") -> I
     with running(
         base.model_copy(update={"link": link.model_copy(update={"namespace": namespace})})
     ) as runtime:  # fmt: skip
-        yield runtime.machines()[0]
+        yield worker_of(runtime)
 
 
 def test_offline_says_what_the_monitor_says(faulty: Path, expected: OfflineSummary) -> None:

@@ -24,7 +24,7 @@ from service.api.server import HttpError
 from service.monitor.alarm_conversion import alarm_cloud_event
 from service.monitor.monitor import MachineMonitor
 from service.monitor.reports import MonitorReport
-from service.runtime import Runtime, running
+from service.runtime.runtime import Runtime, running
 from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
 from service.stream.checkpoints import stored_event, stored_report
 from service.stream.transport import LinkError, TopicMessage, follow
@@ -213,7 +213,7 @@ def test_nothing_is_left_behind_when_a_part_cannot_start() -> None:
             failed.start()
         assert address in str(link.value)
         assert not failed.readiness().ready
-        assert not any(worker.alive for worker in failed.machines())
+        assert not any(one.status().alive for one in failed.machines())
     # Both addresses are free again.
     with running(second.model_copy(update={"http": HttpSettings(port=port)})) as runtime:
         assert runtime.readiness().ready

@@ -17,7 +17,7 @@ from service.commands.running import Commands
 from service.delivery.webhooks.answer import Answer, Meaning, answer_of, no_answer, pause_s
 from service.delivery.webhooks.receiver import Receiver
 from service.delivery.webhooks.signature import new_secret, parse_secret, signing_keys
-from service.runtime import Runtime
+from service.runtime.runtime import Runtime
 from service.settings.service import load_settings
 from service.settings.webhooks import WebhookSettings
 from tests.service.hooked import Got, Hook, hook, settings_for

@@ -14,7 +14,7 @@ import zenoh
 import zenoh.ext
 
 from models.signals.link import LinkSettings, TlsSettings, load_link
-from service.runtime import running
+from service.runtime.runtime import running
 from service.settings.service import HttpSettings, MachineEntry, ServiceSettings
 from service.stream.transport import Link, TopicMessage, follow
 from simulator.publisher import PublishError, PublishSettings, publish

@@ -24,7 +24,7 @@ from service.monitor.alarms.operation import (
     OperatorAction,
     UnknownAlarm,
 )
-from service.stream.worker import MachineWorker
+from service.stream.monitored import Monitored
 
 _IF_MATCH = r'^(\*|(W/)?"-?[0-9]{1,18}")$'
 _ETAG = {
@@ -146,7 +146,7 @@ def _add_operation(app: FastAPI, service: ServiceView, guard: Guard, kind: Opera
         return OperationDone(alarm=_marked(_present(view, name), response), events=events)
 
 
-def _present(view: MachineWorker, name: str) -> Alarm:
+def _present(view: Monitored, name: str) -> Alarm:
     """An alarm as it is now; one that nothing has been seen of yet is normal.
 
     Raises

@@ -23,7 +23,7 @@ from service.analysis.snapshots.run_up import centreline_series, vector_series
 from service.analysis.snapshots.samples import full_spectrum_snapshot, waterfall_snapshot, waveform_snapshot
 from service.api.samples import Chosen, ChosenSamples, ChosenWindow, Recordings, SampleReader
 from service.api.views import PLACE, MachineName, ServiceView, SinceNs, SiteName, UntilNs, found_machine
-from service.stream.worker import MachineWorker
+from service.stream.monitored import Monitored
 
 _MOST_REPORTS = 400
 _SOON_S = 120.0
@@ -55,7 +55,7 @@ class _Data:
 
     def of_samples(
         self,
-        view: MachineWorker,
+        view: Monitored,
         chosen: Chosen,
         make: Callable[[Sampled], _Values],
         without: Callable[[str], _Values],
@@ -72,7 +72,7 @@ class _Data:
 
     def of_past(  # what may be asked for
         self,
-        view: MachineWorker,
+        view: Monitored,
         names: list[str],
         between: tuple[int | None, int | None],
         make: Callable[[Sampled | Past], _Values],

@@ -20,8 +20,7 @@ from service.delivery.metrics.machine import Observed, machine_families
 from service.delivery.metrics.requests import RequestCounts
 from service.delivery.webhooks.webhooks import Webhooks
 from service.history.records import StoreError
-from service.recordings.recorder import RecorderStatus
-from service.stream.worker import MachineWorker
+from service.stream.monitored import Monitored
 
 CONTENT_TYPE = CONTENT_TYPE_LATEST
 _PAGE = 1000
@@ -29,13 +28,10 @@ _WEBHOOK_STATES = ("working", "failing", "disabled")
 
 
 class MeasuredService(Protocol):
-    """What metrics are read from; `service.runtime.Runtime` is one."""
+    """What metrics are read from; `service.runtime.runtime.Runtime` is one."""
 
-    def machines(self) -> Sequence[MachineWorker]:
+    def machines(self) -> Sequence[Monitored]:
         """Every monitored machine."""
-
-    def recorder_status(self, worker: MachineWorker) -> RecorderStatus | None:
-        """How a machine's recorder stands; None without one."""
 
     def readiness(self) -> Readiness:
         """Whether the service can do its work."""
@@ -48,9 +44,9 @@ class MeasuredService(Protocol):
 class _EventCounts:
     """Alarm events of one machine by kind, counted in its history from now on."""
 
-    def __init__(self, worker: MachineWorker) -> None:
-        self._history = worker.history
-        self._after = worker.history.last_sequence()
+    def __init__(self, machine: Monitored) -> None:
+        self._history = machine.history
+        self._after = machine.history.last_sequence()
         self._kinds: Counter[str] = Counter()
 
     def read(self) -> Counter[str]:
@@ -77,9 +73,9 @@ class Metrics:
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
 
-    def watch(self, worker: MachineWorker) -> None:
+    def watch(self, machine: Monitored) -> None:
         """Count the alarm events of a machine from now on."""
-        self._events[f"{worker.machine.site}/{worker.machine.name}"] = _EventCounts(worker)
+        self._events[f"{machine.machine.site}/{machine.machine.name}"] = _EventCounts(machine)
 
     def text(self) -> bytes:
         """Everything in the text format of Prometheus; for any thread."""
@@ -89,20 +85,11 @@ class Metrics:
     def collect(self) -> Iterator[Metric]:
         """Every metric, as the library wants them."""
         readiness = self._service.readiness()
-        busy = {(one.site, one.machine): one.worker_busy_s for one in readiness.machines}
         observed = []
-        for worker in self._service.machines():
-            place = worker.machine.site, worker.machine.name
-            events = self._events.get("/".join(place))
-            observed.append(
-                Observed(
-                    worker,
-                    worker.health(),
-                    busy.get(place, 0.0),
-                    self._service.recorder_status(worker),
-                    Counter() if events is None else events.read(),
-                )
-            )
+        for one in self._service.machines():
+            events = self._events.get(f"{one.machine.site}/{one.machine.name}")
+            counts = Counter() if events is None else events.read()
+            observed.append(Observed(one, one.health(), one.status(), counts))
         yield from machine_families(observed)
         yield from _service_families(readiness)
         yield from _webhook_families(self._service.webhooks.statuses())

@@ -9,7 +9,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 from rotorwatch.records.alarms import AlarmState, EventKind, Severity
 from rotorwatch.records.health import Health, HealthState
 from service.recordings.recorder import RecorderStatus
-from service.stream.worker import MachineWorker
+from service.stream.monitored import MachineStatus, Monitored
 
 _PLACE = ("site", "machine")
 _RECORDER_STATES = ("off", "idle", "recording", "failing")
@@ -19,16 +19,15 @@ _RECORDER_STATES = ("off", "idle", "recording", "failing")
 class Observed:
     """A machine at the moment of asking."""
 
-    worker: MachineWorker
+    monitored: Monitored
     health: Health
-    busy_s: float  # how long its thread has been at work on the same block
-    recorder: RecorderStatus | None  # None if it is not recorded
+    status: MachineStatus
     events: Mapping[str, int]  # alarm events since the start, by kind
 
     @property
     def place(self) -> tuple[str, str]:
         """Values of the labels ``site`` and ``machine``."""
-        return self.worker.machine.site, self.worker.machine.name
+        return self.monitored.machine.site, self.monitored.machine.name
 
 
 _Values = Iterable[tuple[tuple[str, ...], float]]
@@ -65,7 +64,7 @@ def _one(number: Callable[[Observed], float | None]) -> Callable[[Observed], _Va
 
 
 def _recorded(number: Callable[[RecorderStatus], float]) -> Callable[[Observed], _Values]:
-    return _one(lambda machine: None if machine.recorder is None else number(machine.recorder))
+    return _one(lambda machine: None if machine.status.recorder is None else number(machine.status.recorder))
 
 
 def _state(machine: Observed) -> _Values:
@@ -73,7 +72,7 @@ def _state(machine: Observed) -> _Values:
 
 
 def _recorder_state(machine: Observed) -> _Values:
-    now = "off" if machine.recorder is None else machine.recorder.state
+    now = "off" if machine.status.recorder is None else machine.status.recorder.state
     return (((state,), float(state == now)) for state in _RECORDER_STATES)
 
 
@@ -109,38 +108,38 @@ _FAMILIES = (
     _Family("counter", "blocks_refused_total", "Blocks refused, by reason",
             lambda machine: (((why,), n) for why, n in machine.health.quality.refused_blocks.items()), ("reason",)),
     _Family("counter", "data_seconds_total", "Length of the data accepted",
-            _one(lambda machine: machine.worker.tally.data_s)),
+            _one(lambda machine: machine.status.tally.data_s)),
     _Family("counter", "gaps_total", "Interruptions of the stream", _one(lambda machine: machine.health.quality.gaps)),
     _Family("counter", "missing_seconds_total", "Length of the data that the gaps cost",
             _one(lambda machine: machine.health.quality.missing_s)),
     _Family("gauge", "queue_blocks", "Blocks that have arrived and wait for evaluation",
-            _one(lambda machine: len(machine.worker.inbox))),
+            _one(lambda machine: machine.status.queue_blocks)),
     _Family("counter", "queue_dropped_blocks_total", "Blocks dropped because the monitor could not keep up",
             _one(lambda machine: machine.health.quality.queue_dropped_blocks)),
     _Family("counter", "link_missed_blocks_total", "Blocks lost on the way, as far as the link knows",
             _one(lambda machine: machine.health.quality.link_missed_blocks)),
     _Family("gauge", "window_filled_ratio", "Fraction of a full window that is there",
             _one(lambda machine: machine.health.filled)),
-    _Family("counter", "windows_total", "Windows evaluated", _one(lambda machine: machine.worker.tally.windows)),
+    _Family("counter", "windows_total", "Windows evaluated", _one(lambda machine: machine.status.tally.windows)),
     _Family("counter", "commit_seconds_total", "Time spent waiting for the history",
-            _one(lambda machine: machine.worker.tally.commit_s)),
+            _one(lambda machine: machine.status.tally.commit_s)),
     _Family("gauge", "history_waiting_steps", "Steps that are not in the history yet",
-            _one(lambda machine: machine.worker.history.waiting)),
+            _one(lambda machine: machine.status.history_waiting)),
     _Family("gauge", "worker_alive", "1 if the thread that evaluates the blocks runs",
-            _one(lambda machine: machine.worker.alive)),
+            _one(lambda machine: machine.status.alive)),
     _Family("gauge", "worker_busy_seconds", "How long that thread has been at work on the same block",
-            _one(lambda machine: machine.busy_s)),
+            _one(lambda machine: machine.status.busy_s)),
     _Family("counter", "worker_errors_total", "Blocks lost to an error inside the monitor",
-            _one(lambda machine: machine.worker.errors)),
+            _one(lambda machine: machine.status.errors)),
     _Family("gauge", "restored_at_start", "1 if the monitor went on from where it stood before its latest start",
-            _one(lambda machine: machine.worker.restart.startswith("went on"))),
+            _one(lambda machine: machine.status.restart.startswith("went on"))),
     _Family("gauge", "level", "Vibration levels of the latest window, in the unit of the channel", _levels,
             ("channel", "measure", "unit")),
     _Family("gauge", "alarms", "Alarms that are not normal", _alarms, ("state", "severity")),
     _Family("counter", "alarm_events_total", "Alarm events in the history since the start, by kind",
             lambda machine: (((kind.value,), machine.events.get(kind.value, 0)) for kind in EventKind), ("kind",)),
     _Family("gauge", "alarm_sequence", "Number of the latest alarm event, -1 before the first; goes on across restarts",
-            _one(lambda machine: machine.worker.history.last_sequence())),
+            _one(lambda machine: machine.monitored.history.last_sequence())),
     _Family("gauge", "recorder_state", "1 for the state the recorder is in, 0 for others", _recorder_state,
             ("state",)),
     _Family("counter", "recorder_received_messages_total", "Messages that arrived at the recorder",
@@ -161,7 +160,7 @@ def machine_families(machines: Sequence[Observed]) -> Iterator[Metric]:
         "rotorwatch_step_seconds", "Time spent evaluating blocks: how many, and how long altogether", labels=_PLACE
     )
     for machine in machines:
-        identity, tally = machine.worker.identity, machine.worker.tally
+        identity, tally = machine.monitored.identity, machine.status.tally
         info.add_metric(machine.place, {"bundle": identity["bundle"] or "", "machine_hash": identity["machine_hash"]})
         steps.add_metric(machine.place, tally.blocks, tally.step_s)
     yield info

@@ -1,0 +1,1 @@
+"""The running service: its processes and threads."""

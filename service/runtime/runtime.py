@@ -1,0 +1,211 @@
+"""The running service: the machines, whoever hears of them, and the HTTP server; start and stop.
+
+::
+
+    machines (threads, or processes that share them) --> Listener --> event stream, webhooks
+        '--> Store <-- HTTP threads: reports, alarm events
+
+The main thread waits for a signal. `service.runtime.machines` says which thread does what for a machine,
+`service.runtime.shards` how processes share them.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from rotorwatch.records.health import Health
+from rotorwatch.records.monitor import MachineReadiness, Readiness
+from service.access.guard import Guard
+from service.api.app import create_app
+from service.api.readiness import readiness_of
+from service.api.routes.replays import ReplayDesk
+from service.api.server import HttpError, HttpServer
+from service.delivery.event_feed import EventFeed
+from service.delivery.metrics.collector import Metrics
+from service.delivery.metrics.requests import RequestCounts, RequestMeter
+from service.delivery.webhooks.webhooks import Webhooks
+from service.history.holdings import Holdings
+from service.history.records import StoreError
+from service.history.shared import AuditLog
+from service.history.store import Store
+from service.recordings.catalogue import Catalogue
+from service.runtime.machines import LocalMachines
+from service.runtime.shards import Shards, shard_count
+from service.settings.service import ServiceSettings
+from service.stream.monitored import Monitored
+from service.terminal.logs import logger
+
+_log = logger(part="runtime")
+
+
+class Runtime:
+    """Monitors of all machines with their links and the HTTP server.
+
+    Building it reads every file; nothing runs or listens before `start`.
+
+    Raises
+    ------
+    MachineFileError, BundleError
+        If a machine file or bundle cannot be used.
+    """
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self.settings = settings
+        self._monitored: Sequence[Monitored] = ()
+        self._history_open = False
+        # What is heard in a namespace is a replay, of which nobody must be told.
+        self.webhooks = Webhooks(() if settings.link.namespace else settings.webhooks)
+        self._requests = RequestCounts()
+        self.metrics = Metrics(self, self._requests)
+        self.store = Store(settings.history.database, settings.history.retention)
+        self.feed = EventFeed()
+        directory = settings.recording.directory
+        self.catalogue = None if directory is None else Catalogue(Path(directory))
+        self.replays = ReplayDesk(settings, self.catalogue)
+        count = shard_count(settings)
+        self._machines: LocalMachines | Shards
+        self._machines = (
+            LocalMachines(settings, self.store, self) if count == 1 else Shards(settings, count, self.store, self)
+        )
+        self._server: HttpServer | None = None
+        self._undo = ExitStack()
+
+    @property
+    def http_url(self) -> str:
+        """Where the HTTP API is, once started."""
+        if self._server is None:
+            raise HttpError("the HTTP API is not started")
+        return self._server.url
+
+    @property
+    def audit(self) -> AuditLog:
+        """Who asked for what."""
+        return self.store.audit
+
+    @property
+    def holdings(self) -> Holdings:
+        """How far back the history goes."""
+        return self.store.holdings
+
+    def machines(self) -> Sequence[Monitored]:
+        """Every monitored machine."""
+        return self._monitored
+
+    def machine(self, site: str, name: str) -> Monitored | None:
+        """One machine, or None if it is not monitored."""
+        for one in self._monitored:
+            if (one.machine.site, one.machine.name) == (site, name):
+                return one
+        return None
+
+    def health(self, health: Health) -> None:
+        """Hear that a machine's health has changed."""
+        self.feed.health(health)
+
+    def wake(self) -> None:
+        """Hear that alarm events were committed."""
+        self.feed.wake()
+        self.webhooks.wake()
+
+    def readiness(self) -> Readiness:
+        """Whether everything that monitoring needs works, and what does not."""
+        statuses = [(one, one.status()) for one in self._monitored]
+        machines = tuple(
+            MachineReadiness(
+                site=one.machine.site,
+                machine=one.machine.name,
+                state=one.health().state,
+                worker_alive=status.alive,
+                worker_errors=status.errors,
+                last_worker_error=status.last_error,
+                worker_busy_s=status.busy_s,
+                trouble=status.trouble,
+                queue_blocks=status.queue_blocks,
+                history_waiting=status.history_waiting,
+                recording="off" if status.recorder is None else status.recorder.text,
+            )
+            for one, status in statuses
+        )
+        elsewhere = next((status.history_trouble for _, status in statuses if status.history_trouble), "")
+        return readiness_of(
+            session_open=self._machines.session_open,
+            machines=machines,
+            history_open=self._history_open,
+            history_trouble=self.store.trouble or elsewhere or self.store.unreachable(),
+            history_lost=self.store.lost,
+            failing_webhooks=self.webhooks.failing(),
+        )
+
+    def start(self) -> None:
+        """Open the session, start the threads, serve HTTP.
+
+        Raises
+        ------
+        LinkError
+            If the Zenoh endpoints cannot be used.
+        HttpError
+            If the HTTP address cannot be listened on.
+        StoreError
+            If the history cannot be opened, or another monitor writes that of one of the machines.
+        """
+        with ExitStack() as undo:
+            # Takes the port first: the commonest mistake, the quickest check.
+            server = HttpServer(self.settings.http, self.settings.access)
+            undo.callback(server.stop)
+            guard = Guard(self.store.tokens, self.store.audit, self.settings.access, self.settings.http.host)
+            self._machines.connect(undo)
+            self.store.open(set_aside=True)
+            if self.store.lost:
+                _log.error("the history begins anew", why=self.store.lost)
+            undo.callback(self.store.close)
+            self._history_open = True
+            # After the machines, whose last events they tell, and before the history that these are read from.
+            undo.callback(self.feed.close)
+            undo.callback(self.webhooks.close)
+            self._monitored = self._machines.open(undo)
+            for one in self._monitored:
+                self.metrics.watch(one)
+            logs = {f"{one.machine.site}/{one.machine.name}": one.history for one in self._monitored}
+            self.webhooks.start(logs, self.store.webhooks)
+            self._machines.start(undo)
+            undo.callback(self.replays.close)
+            self._server = server
+            app = create_app(self, guard)
+            app.add_middleware(RequestMeter, counts=self._requests)  # around all others, so that refusals count
+            server.start(app)
+            self._undo = undo.pop_all()
+        _log.info("running", http=server.url, machines=len(self._monitored))
+
+    def stop(self) -> None:
+        """Stop in the reverse order of starting.
+
+        Raises
+        ------
+        StoreError
+            Saying what is lost, if the history does not take the last of it; everything has stopped all the same.
+        """
+        try:
+            self._undo.close()
+            if refused := self._machines.refused():
+                raise StoreError(f"the history refused the latest step, which is lost: {refused}")
+        except StoreError as error:
+            _log.error("stopped; not everything is in the history", why=str(error))
+            raise
+        _log.info("stopped")
+
+
+@contextmanager
+def running(settings: ServiceSettings) -> Iterator[Runtime]:
+    """Run the service inside a ``with`` block.
+
+    Raises
+    ------
+    RotorwatchError
+        As `Runtime` and `Runtime.start`.
+    """
+    runtime = Runtime(settings)
+    runtime.start()
+    try:
+        yield runtime
+    finally:
+        runtime.stop()

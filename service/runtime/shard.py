@@ -1,0 +1,119 @@
+"""A process that monitors some of the machines for another one, which serves them.
+
+It goes on until the other one says so or ends, and is told apart from a monitor by nobody on the network.
+"""
+
+import signal
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from multiprocessing.connection import Connection
+
+from models.errors import RotorwatchError
+from models.signals.link import LinkSettings
+from rotorwatch.records.health import Health
+from service.history.store import Store
+from service.runtime.machines import LocalMachines
+from service.runtime.standing import EVENTS, Question, Standing, latest_to_bytes
+from service.settings.service import ServiceSettings
+from service.stream.shard_link import ShardLink
+from service.stream.transport import Link
+from service.stream.worker import MachineWorker
+from service.terminal.logs import configure_logging
+
+_STATUS_S = 1.0
+
+
+def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> None:
+    """Monitor machines until something comes over the connection, or its other end is closed.
+
+    Says over it, once it is ready, an empty text, or else the kind of an error and, after a line break, what is wrong;
+    and at its end what was lost.
+
+    Parameters
+    ----------
+    settings : ServiceSettings
+        With the machines of this process alone.
+    inner : str
+        Zenoh endpoint of the process that serves them.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):  # meant for that process, which decides when this one ends
+        signal.signal(number, signal.SIG_IGN)
+    configure_logging(settings.log)
+    undo = ExitStack()
+    try:
+        with ExitStack() as starting:
+            shard = _Shard(settings, inner, starting)
+            undo = starting.pop_all()
+    except Exception as error:  # whatever it is, somebody waits to hear it
+        connection.send_bytes(f"{type(error).__name__}\n{error}".encode())
+        return
+    connection.send_bytes(b"")
+    while not connection.poll(_STATUS_S):
+        shard.tell_all()
+    lost = ""
+    try:
+        undo.close()
+    except RotorwatchError as error:
+        lost = str(error)
+    lost = "; ".join(filter(None, (lost, shard.refused())))
+    try:
+        connection.send_bytes(lost.encode())
+    except OSError:  # nobody is there any more
+        return
+
+
+class _Shard:
+    """The machines of this process, and what is told of them."""
+
+    def __init__(self, settings: ServiceSettings, inner: str, undo: ExitStack) -> None:
+        self._store = Store(settings.history.database, settings.history.retention, shared=True)
+        machines = LocalMachines(settings, self._store, self)
+        self.refused = machines.refused
+        self._told: dict[str, int] = {}
+        self._link: ShardLink | None = None
+        machines.connect(undo)
+        self._store.open()
+        undo.callback(self._store.close)
+        self._workers = {one.history.title: one for one in machines.open(undo)}
+        link = Link(LinkSettings(mode="client", connect=(inner,)))
+        undo.callback(link.close)
+        self._link = ShardLink(link, tuple(self._workers), self._answer)
+        undo.callback(self._link.close)
+        machines.start(undo)
+
+    def health(self, health: Health) -> None:
+        """Hear that a machine's health has changed."""
+        self._tell(f"{health.site}/{health.machine}", health)
+
+    def wake(self) -> None:
+        """Hear that alarm events were committed."""
+        for place, worker in self._workers.items():
+            if worker.history.last_sequence() != self._told.get(place):
+                self._tell(place)
+
+    def tell_all(self) -> None:
+        """Tell how the machines are monitored."""
+        for place in self._workers:
+            self._tell(place)
+
+    def _tell(self, place: str, health: Health | None = None) -> None:
+        if self._link is not None:
+            self._link.tell(self._standing(place, health).model_dump_json().encode())
+
+    def _standing(self, place: str, health: Health | None) -> Standing:
+        worker = self._workers[place]
+        sequence = self._told[place] = worker.history.last_sequence()
+        status = replace(worker.status(), history_trouble=self._store.trouble)
+        return Standing(place=place, sequence=sequence, status=status, health=health)
+
+    def _answer(self, place: str, content: bytes) -> bytes:
+        question = Question.model_validate_json(content)
+        answers: dict[str, Callable[[MachineWorker], bytes]] = {
+            "standing": lambda one: self._standing(place, one.health()).model_dump_json().encode(),
+            "alarms": lambda one: one.alarms(include_normal=question.include_normal).model_dump_json().encode(),
+            "detectable": lambda one: one.detectable(question.change).model_dump_json().encode(),
+            "operate": lambda one: EVENTS.dump_json(() if question.action is None else one.operate(question.action)),
+            "latest": lambda one: latest_to_bytes(one.latest),
+        }
+        return answers[question.about](self._workers[place])

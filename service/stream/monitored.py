@@ -1,0 +1,74 @@
+"""A machine that is monitored, as others see it: in this process, or from another one."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from models.machine import MachineFile
+from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
+from rotorwatch.records.health import Health
+from rotorwatch.records.machines import DetectableChanges, MachineDescription
+from service.analysis.snapshots.heading import LatestData
+from service.analysis.snapshots.machine import MachineSnapshots
+from service.history.machine import MachineStore
+from service.monitor.alarms.operation import OperatorAction
+from service.monitor.reports import Identity, Tally
+from service.recordings.recorder import RecorderStatus
+
+
+@dataclass(frozen=True, slots=True)
+class MachineStatus:
+    """How the monitoring of a machine is at work; counts since it was started."""
+
+    alive: bool = False  # the thread that evaluates the blocks runs
+    errors: int = 0  # blocks lost to an error inside the monitor
+    last_error: str = ""
+    trouble: str = ""  # why the machine is not monitored as it should be; empty if it is
+    busy_s: float = 0.0  # how long the thread has been at work on the same block
+    queue_blocks: int = 0  # blocks that wait for evaluation
+    history_waiting: int = 0  # steps that are not in the history yet
+    history_trouble: str = ""  # why the history cannot be written; empty if it can
+    restart: str = ""  # how it went on at its start from where it stood
+    tally: Tally = field(default_factory=Tally)
+    recorder: RecorderStatus | None = None  # None if it is not recorded
+
+
+class Monitored(Protocol):
+    """A monitored machine; for any thread. `service.stream.worker.MachineWorker` is one."""
+
+    @property
+    def machine(self) -> MachineFile:
+        """The machine file as it is in use."""
+
+    @property
+    def identity(self) -> Identity:
+        """The machine, and the exact files its monitor runs on."""
+
+    @property
+    def history(self) -> MachineStore:
+        """What is kept of it."""
+
+    @property
+    def snapshots(self) -> MachineSnapshots:
+        """What shows a window."""
+
+    @property
+    def latest(self) -> LatestData:
+        """What the monitor holds now."""
+
+    def health(self) -> Health:
+        """Where the machine stands now."""
+
+    def status(self) -> MachineStatus:
+        """How its monitoring is at work."""
+
+    def alarms(self, *, include_normal: bool = False) -> AlarmStates:
+        """Return the alarms as they are now."""
+
+    def detectable(self, change: float | None) -> DetectableChanges:
+        """Return what would be found on the machine as it runs now."""
+
+    def description(self) -> MachineDescription:
+        """Identity, stream, keys, and the present state."""
+
+    def operate(self, operation: OperatorAction) -> tuple[AlarmCloudEvent, ...]:
+        """Do what an operator asks for, and say what happened; raises as `AlarmBook.operate`, `NotInTime`."""

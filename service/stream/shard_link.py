@@ -1,0 +1,98 @@
+"""Between processes that share the machines of one monitor: a Zenoh session of their own, which nobody else reaches."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import zenoh
+
+from models.errors import RotorwatchError
+from service.stream.transport import Link
+
+_NEWS = "news"
+_THREADS = 4
+_ANSWER_S = 15.0
+
+
+class NoAnswerError(RotorwatchError):
+    """Nobody answered, or not in time."""
+
+
+class ShardLink:
+    """The side of the process that monitors machines.
+
+    Parameters
+    ----------
+    link : Link
+        Open session; must outlive this object.
+    places : sequence of str
+        ``site/machine`` of what it monitors.
+    answer : callable
+        Takes a place and a question and returns the answer; a `RotorwatchError` is told to whoever asked, with its
+        kind.
+    """
+
+    def __init__(self, link: Link, places: tuple[str, ...], answer: Callable[[str, bytes], bytes]) -> None:
+        self._news = link.session.declare_publisher(_NEWS, congestion_control=zenoh.CongestionControl.BLOCK)
+        self._answer = answer
+        self._pool = ThreadPoolExecutor(_THREADS, "answer")  # one that takes long holds up no other
+        self._declared = [link.session.declare_queryable(place, link.guarded(self._asked)) for place in places]
+
+    def tell(self, content: bytes) -> None:
+        """Tell the process that serves the machines."""
+        self._news.put(content)
+
+    def close(self) -> None:
+        """Answer nothing any more."""
+        for one in self._declared:
+            one.undeclare()  # type: ignore[no-untyped-call]
+        self._pool.shutdown()
+
+    def _asked(self, query: zenoh.Query) -> None:
+        self._pool.submit(self._reply, query)
+
+    def _reply(self, query: zenoh.Query) -> None:
+        with query:
+            try:
+                content = self._answer(str(query.key_expr), b"" if query.payload is None else query.payload.to_bytes())
+            except RotorwatchError as error:
+                query.reply_err(str(error), encoding=type(error).__name__)
+            except Exception as error:  # whoever asked must not wait for an answer that does not come
+                query.reply_err(f"{type(error).__name__}: {error}", encoding=RotorwatchError.__name__)
+            else:
+                query.reply(query.key_expr, content)
+
+
+def hear(link: Link, callback: Callable[[bytes], None]) -> Callable[[], object]:
+    """Hear what every shard tells, on a thread of Zenoh's; returns what ends it."""
+
+    def take(sample: zenoh.Sample) -> None:
+        callback(sample.payload.to_bytes())
+
+    # Indirect: what is heard is a lot to read, and Zenoh's own threads are needed meanwhile.
+    return link.session.declare_subscriber(_NEWS, zenoh.handlers.Callback(link.guarded(take), indirect=True)).undeclare
+
+
+def ask(link: Link, place: str, question: bytes, errors: tuple[type[RotorwatchError], ...] = ()) -> bytes:
+    """Ask the process that monitors a machine.
+
+    Parameters
+    ----------
+    errors : tuple of type
+        Kinds of error that are raised as what they were; others as `RotorwatchError`.
+
+    Raises
+    ------
+    NoAnswerError
+        If there is no answer in 15 s.
+    """
+    for reply in link.session.get(place, payload=question, timeout=_ANSWER_S):
+        if reply.ok is not None:
+            return reply.ok.payload.to_bytes()
+        if reply.err is not None:
+            kinds = {kind.__name__: kind for kind in errors}
+            text = reply.err.payload.to_string()
+            if str(reply.err.encoding) in kinds:
+                raise kinds[str(reply.err.encoding)](text)
+            if text != "Timeout":
+                raise RotorwatchError(text)
+    raise NoAnswerError(f"{place}: the process that monitors it does not answer")
