@@ -1,6 +1,5 @@
 """What the commands share: exit codes, one thread for linear algebra, common options."""
 
-import ctypes
 import os
 import resource
 from collections.abc import Iterator
@@ -12,13 +11,12 @@ import typer
 from typer.core import TyperGroup
 
 from models.errors import BundleError, MachineFileError, RotorwatchError
+from service.terminal.memory import prepare_memory
 
 ENDPOINT = "tcp/127.0.0.1:7447"
 """Where a monitor listens unless it is told otherwise."""
 
 _FILES = 65_536
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # of malloc.h
-_KEPT_BYTES, _LARGE_BYTES = 64 << 20, 32 << 20
 _NO_THREAD = "can't start new thread"
 _MB = 1_000_000
 _ADDRESS_SPACE_MB = 2_000
@@ -85,24 +83,10 @@ def prepare_numerics() -> None:
     """Settings of the process for numerics: threads and memory. Works only before numpy is imported.
 
     One thread for linear algebra: results do not depend on the number of cores, and workers do not compete.
-
-    Two arenas of the C library's memory for all threads: by default glibc gives each thread of up to eight per core one
-    of its own, and each keeps what it once needed. After hundreds of thousands of messages of all sizes the monitor
-    held twice the memory that it used.
-
-    What a hop has freed is kept for the next one: by default glibc hands arrays of more than 128 kB back to the kernel,
-    and getting them again, page by page, took longer than the arithmetic of a hop.
     """
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
-    # The same for the programs that this one starts.
-    os.environ["MALLOC_ARENA_MAX"] = "2"
-    os.environ["MALLOC_TRIM_THRESHOLD_"], os.environ["MALLOC_MMAP_THRESHOLD_"] = str(_KEPT_BYTES), str(_LARGE_BYTES)
-    library = ctypes.CDLL(None)
-    if hasattr(library, "mallopt"):  # not everywhere
-        library.mallopt(_M_ARENA_MAX, 2)
-        library.mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
-        library.mallopt(_M_MMAP_THRESHOLD, _LARGE_BYTES)
+    prepare_memory()
 
 
 def raise_file_limit() -> None:

@@ -20,6 +20,7 @@ from service.stream.shard_link import ShardLink
 from service.stream.transport import Link
 from service.stream.worker import MachineWorker
 from service.terminal.logs import configure_logging
+from service.terminal.memory import prepare_memory
 
 _STATUS_S = 1.0
 
@@ -39,6 +40,7 @@ def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> 
     """
     for number in (signal.SIGINT, signal.SIGTERM):  # meant for that process, which decides when this one ends
         signal.signal(number, signal.SIG_IGN)
+    prepare_memory()
     configure_logging(settings.log)
     undo = ExitStack()
     try:

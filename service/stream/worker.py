@@ -144,11 +144,6 @@ class MachineWorker:
         return monitor, text
 
     @property
-    def alive(self) -> bool:
-        """Whether the thread runs."""
-        return self._thread.is_alive()
-
-    @property
     def trouble(self) -> str:
         """Why the machine is not monitored as it should be although data come in; empty if it is."""
         refused = self.steps.refused
@@ -226,7 +221,7 @@ class MachineWorker:
     def status(self) -> MachineStatus:
         """How the monitoring is at work."""
         return MachineStatus(
-            alive=self.alive,
+            alive=self._thread.is_alive(),
             errors=self.errors,
             last_error=self.last_error,
             trouble=self.trouble,

@@ -254,7 +254,7 @@ def test_the_last_step_at_a_stop_survives_a_defect(tmp_path: Path, monkeypatch: 
         at.put(block(0))
         monkeypatch.setattr(MachineMonitor, "state", defective)
         at.worker.stop()
-        assert not at.worker.alive
+        assert not at.worker.status().alive
         assert DEFECT in at.worker.last_error
 
 

@@ -78,7 +78,7 @@ def test_a_stuck_worker_is_a_reason_until_it_goes_on(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("service.api.readiness.STUCK_S", 0.5)
     release = threading.Event()
     with service(endpoint()) as (runtime, worker):
-        until(lambda: worker.alive, "the thread")
+        until(lambda: worker.status().alive, "the thread")
         assert asked(runtime)[0] == 200
         worker.inbox.call(lambda: void(release.wait(600.0)))
         until(lambda: not runtime.readiness().ready, "the thread that does not answer")

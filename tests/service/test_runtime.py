@@ -226,7 +226,7 @@ def test_stopped_service_has_no_thread_left() -> None:
         for _ in range(50):
             feed.put_good()
         until(lambda: worker.health().quality.accepted_blocks > 0, "blocks")
-    assert not worker.alive
+    assert not worker.status().alive
 
 
 @pytest.mark.parametrize(
