@@ -214,12 +214,12 @@ def hop_levels(plan: LevelPlan, samples: FloatArray, angle_rad: FloatArray | Non
     rows = samples.T
     n, n_samples = rows.shape
     mean = rows @ _shares(n_samples)
-    low, high = rows.min(axis=1) - mean, rows.max(axis=1) - mean
+    deviations = np.subtract(rows, mean[:, None], order="C")
+    low, high = deviations.min(axis=1), deviations.max(axis=1)
     peak = np.maximum(high, -low)
     # Single precision is enough for what is left without the mean, and quicker. In parts of the peak: fourth powers of
     # metres would leave its range.
     unit = np.where(peak > 0, peak, 1.0)
-    deviations = np.subtract(rows, mean[:, None], order="C")
     deviations *= 1 / unit[:, None]
     x = deviations.astype(np.float32)
     square = x * x
@@ -265,21 +265,22 @@ def _band_squares(
     first = max(first, 1)
     found = np.full((3, casing.size), np.nan)
     band = parts[:, 2 * first : 2 * last + 2]
-    accelerations = np.array([plan.quantities[column] is Quantity.ACCELERATION for column in casing])
+    accelerations = plan.columns(Quantity.ACCELERATION)
+    at = casing.searchsorted(accelerations)
     found[0] = band.sum(axis=1)[casing]
-    if accelerations.any():
+    if accelerations.size:
         omega = 2 * np.pi * step_hz * np.arange(first, first + band.shape[1] // 2)
-        found[0, accelerations] = band[casing[accelerations]] @ np.repeat(omega**-2, 2)
+        found[0, at] = band[accelerations] @ np.repeat(omega**-2, 2)
     found[0] *= scale
-    if plan.high_hz is not None and accelerations.any():
+    if plan.high_hz is not None and accelerations.size:
         first, last = (round(edge / step_hz) for edge in plan.high_hz)
-        high = spectrum[casing[accelerations], first : last + 1]
-        found[1, accelerations] = scale * np.sum(np.abs(high) ** 2, axis=1)
+        high = spectrum[accelerations, first : last + 1]
+        found[1, at] = scale * np.sum(np.abs(high) ** 2, axis=1)
         # The band shifted to zero frequency: its magnitude is the envelope, a sample for each of its bins.
         envelope = np.abs(scipy.fft.ifft(high, axis=1)) * (2 * high.shape[1] / n_samples)
         weights = np.interp(np.arange(high.shape[1]) / high.shape[1], np.arange(n_samples) / n_samples, taper)
         level = envelope.sum(axis=1) / weights.sum()  # the taper is on the envelope too: compared with its like
-        found[2, accelerations] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2)
+        found[2, at] = np.sum((envelope - level[:, None] * weights) ** 2, axis=1) / np.sum(weights**2)
     return found
 
 
@@ -297,15 +298,14 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
         Of the tapered samples.
     """
     n, n_samples = x.shape
-    nothing = np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     if angle_rad is None:
-        return nothing
+        return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     tapered: FloatArray | _SingleArray
     weights: FloatArray | _SingleArray
-    steps = np.diff(angle_rad)
+    steps = angle_rad[1:] - angle_rad[:-1]
     size = np.abs(steps)
-    whole = np.flatnonzero(size > np.pi)  # where it begins anew from zero
-    turns = np.round(steps[whole] / (2 * np.pi)).sum()
+    (whole,) = (size > np.pi).nonzero()  # where it begins anew from zero
+    turns = np.rint(steps[whole] / (2 * np.pi)).sum()
     if abs(angle_rad[-1] - angle_rad[0] - 2 * np.pi * turns) < 2 * np.pi * _MANY_REVOLUTIONS:
         # Orders are nearly alike then: what tells them apart needs all digits.
         angle, tapered, weights, every = angle_rad, x.astype(np.float64), np.ones(n_samples), 1
@@ -318,22 +318,24 @@ def _orders(x: _SingleArray, spectrum: npt.NDArray[np.complex64], angle_rad: Flo
         tapered = scipy.fft.irfft(spectrum[:, : kept // 2 + 1], n=kept, axis=1)
         weights, _ = _taper(kept)
     half = angle / 2
-    half[1:] -= np.pi * np.cumsum(np.round(np.diff(angle) / (2 * np.pi)))
-    half = (half - 2 * np.pi * np.round(half / (2 * np.pi))).astype(tapered.dtype)
+    half[1:] -= np.pi * np.rint((angle[1:] - angle[:-1]) / (2 * np.pi)).cumsum()
+    half = (half - 2 * np.pi * np.rint(half / (2 * np.pi))).astype(tapered.dtype)
     regressors = np.empty((1 + 2 * len(ORDERS), half.size), half.dtype)
     regressors[0], cos, sin = 1, regressors[1::2], regressors[2::2]
     np.cos(half, out=cos[0])
     np.sin(half, out=sin[0])
     for row, first, second in ((1, 0, 0), (2, 1, 1), (3, 2, 1)):  # cos and sin of a sum of angles
-        cos[row] = cos[first] * cos[second] - sin[first] * sin[second]
-        sin[row] = sin[first] * cos[second] + cos[first] * sin[second]
+        both = regressors[2 * first + 1 : 2 * first + 3]
+        by_cos, by_sin = both * cos[second], both * sin[second]
+        np.subtract(by_cos[0], by_sin[1], out=cos[row])
+        np.add(by_cos[1], by_sin[0], out=sin[row])
     try:
         solved = np.linalg.solve(
             every * ((regressors * weights) @ regressors.T).astype(np.float64),
             (regressors @ tapered.T).astype(np.float64),
         )
     except np.linalg.LinAlgError:  # a shaft that stands still
-        return nothing
+        return np.full((len(ORDERS), n), np.nan, dtype=np.complex128)
     return np.asarray(solved[1::2] - 1j * solved[2::2], dtype=np.complex128)
 
 
