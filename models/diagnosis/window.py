@@ -283,6 +283,11 @@ class SlidingWindow:
         return len(self._hops) / self.plan.hops
 
     @property
+    def lacking(self) -> int:
+        """How many samples the next hop lacks, if none are left out before."""
+        return self.plan.need - self._pending_samples
+
+    @property
     def hops(self) -> tuple[HopMoments, ...]:
         """The hops that are in the window, oldest first."""
         return tuple(self._hops)

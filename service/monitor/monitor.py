@@ -61,6 +61,7 @@ class MachineMonitor:
 
     def __init__(self, installed: Installed) -> None:
         self.machine = machine = installed.machine
+        self._name = f"{machine.site}/{machine.name}"
         self.identity = identity_of(installed)
         self._evaluator = evaluator_for(installed)
         self._sensors = None if installed.commissioned is None else installed.commissioned.sensors
@@ -118,8 +119,7 @@ class MachineMonitor:
         try:
             block, schema_hash = decode_block(payload, attachment, encoding)
         except WireError as error:
-            name = f"{self.machine.site}/{self.machine.name}"
-            return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{name}: {error}"))),)
+            return (MonitorReport(self._count(Admission(Reason.MALFORMED, f"{self._name}: {error}"))),)
         misshapen = self._gate.form(block, schema_hash)
         if misshapen is not None:  # before anything is made of its run and number
             return (MonitorReport(self._count(misshapen)),)
@@ -131,7 +131,7 @@ class MachineMonitor:
             return self._released()
         if self._disputed(block):
             text = f"block {block.sequence} of run {block.run} came in two versions; neither is used"
-            verdict = Admission(Reason.CONFLICT, f"{self.machine.site}/{self.machine.name}: {text}")
+            verdict = Admission(Reason.CONFLICT, f"{self._name}: {text}")
             return (MonitorReport(self._count(verdict), events=self._alarms.take()),)
         if self._dropped:
             self._drops[block.run, block.sequence], self._dropped = self._dropped, 0
@@ -279,6 +279,11 @@ class MachineMonitor:
         return self._end_ns
 
     @property
+    def blocks_to_hop(self) -> int:
+        """How many more blocks like the latest one complete a hop, at least one: little is news before."""
+        return 1 if self._used is None else max(1, -(-self._window.lacking // self._used.samples.shape[0]))
+
+    @property
     def window(self) -> WindowStatistics | None:
         """The window of the latest report; None if it was not full."""
         return self._statistics
@@ -372,7 +377,7 @@ class MachineMonitor:
         anew = not self._gate.courses
         verdict = self._gate.judge(block, schema_hash)
         if anew and verdict.accepted and self._end_ns is not None:
-            name, ingest = f"{self.machine.site}/{self.machine.name}", self.machine.ingest
+            name, ingest = self._name, self.machine.ingest
             late_s = (block.start_ns - self._end_ns) / 1e9
             if abs(late_s) > ingest.max_jump_s:
                 text = f"{name}: the stream's clock is {late_s:.6g} s from where it was before the restart"
@@ -381,11 +386,8 @@ class MachineMonitor:
                 text = f"{name}: {late_s:.6g} s of data are missing over the restart"
                 verdict = Admission(text=text, gap_s=late_s)
         if dropped and verdict.gap_s > 0:
-            text = (
-                f"{self.machine.site}/{self.machine.name}: {dropped} blocks ({verdict.gap_s:.6g} s of data) were "
-                "not evaluated: the monitor cannot keep up"
-            )
-            verdict = replace(verdict, text=text)
+            text = f"{dropped} blocks ({verdict.gap_s:.6g} s of data) were not evaluated: the monitor cannot keep up"
+            verdict = replace(verdict, text=f"{self._name}: {text}")
         return self._count(verdict)
 
     def _count(self, verdict: Admission) -> Admission:
@@ -455,9 +457,8 @@ class MachineMonitor:
         calm = evaluation.calm(outside=verdict.outside_model)
         if not self._plan.states and self._levels.reference is not None:
             calm, reason = HealthState.UNCHANGED, ""
-        state = self._state(calm)
         return Report(
-            **self._window_now(statistics.start_ns, end_ns, state),
+            **self._window_now(statistics.start_ns, end_ns, self._state(calm)),
             speed_rad_s=evaluation.speed_rad_s,
             parameters=evaluation.readings,
             equations=evaluation.equations,

@@ -9,6 +9,7 @@ from typing import Literal
 from models.signals.wire import sender_of
 
 _MOST_ODD = 16
+_PATIENCE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,7 @@ class Inbox:
         self._calls: deque[Callable[[], None]] = deque()
         self._changed = threading.Condition()
         self._closed = False
+        self._enough = 1
         self._dropped = self._unread = 0
 
     @property
@@ -116,7 +118,13 @@ class Inbox:
                     block = self._with_room(block)
                 (self._others if theirs else self._blocks).append(block)
                 self._bytes += len(block.payload)
-            self._changed.notify_all()
+            if self._is_worth_it():
+                self._changed.notify_all()
+
+    def _is_worth_it(self) -> bool:
+        """Whether there is something to do that need not wait for more."""
+        others = self._closed or self._calls or self._odd or self._others
+        return bool(others) or len(self._blocks) >= self._enough or (bool(self._blocks) and self._is_full)
 
     @property
     def _is_full(self) -> bool:
@@ -143,9 +151,20 @@ class Inbox:
                 self._changed.notify_all()
             return not self._closed
 
-    def get(self) -> RawBlock | Callable[[], None] | None:
-        """Take what is to be called, or else the oldest block, waiting for one; None after `close`."""
+    def get(self, enough: int = 1) -> RawBlock | Callable[[], None] | None:
+        """Take what is to be called, or else the oldest block, waiting for one; None after `close`.
+
+        Parameters
+        ----------
+        enough : int
+            How many blocks a worker that has taken everything wants to wait for: to be woken for each of them costs
+            more than most have to say. It waits half a second at most, and a call lets it take what is there.
+        """
         with self._changed:
+            if not (self._calls or len(self)):
+                self._enough = min(enough, max(1, self._bound // 4))
+                self._changed.wait_for(self._is_worth_it, _PATIENCE_S)
+                self._enough = 1
             self._changed.wait_for(lambda: self._closed or bool(self._calls) or len(self) > 0)
             if self._calls:
                 return self._calls.popleft()

@@ -358,7 +358,7 @@ class MachineWorker:
                 self._catch_up(self._recorded_since_ns)
         except Exception as error:  # what it brought to light must not end the monitoring of the machine
             self._failed(error)
-        while (item := self.inbox.get()) is not None:
+        while (item := self.inbox.get(self._monitor.blocks_to_hop)) is not None:
             try:
                 if isinstance(item, RawBlock):
                     self._take(item)

@@ -2,6 +2,7 @@
 
 import json
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -70,6 +71,52 @@ def test_full_inbox_drops_what_waits_and_counts_it() -> None:
     taken = [inbox.get(), inbox.get()]
     assert [block.payload for block in taken if isinstance(block, RawBlock)] == [bytes([6]), bytes([7])]
     assert len(inbox) == 0
+
+
+def test_a_worker_that_waits_for_more_blocks_is_woken_by_enough_of_them_or_by_a_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
+    inbox, order = Inbox(100, "drop"), list[bytes]()
+
+    def work() -> None:
+        while (item := inbox.get(3)) is not None:
+            order.append(item.payload if isinstance(item, RawBlock) else b"call")
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    for number in range(3):
+        inbox.put(RawBlock(bytes([number]), b"", ""))
+    until(lambda: len(order) == 3, "blocks that were enough", 20.0)
+    inbox.put(RawBlock(b"\3", b"", ""))
+    time.sleep(0.05)  # that it would take to be woken by a single one
+    inbox.call(lambda: None)
+    until(lambda: len(order) == 5, "a block that a call let be taken", 20.0)
+    inbox.close()
+    thread.join()
+    assert order == [b"\0", b"\1", b"\2", b"call", b"\3"]
+
+
+@pytest.mark.parametrize(("bound", "odd"), [(2, False), (100, True)])
+def test_nobody_waits_for_more_where_there_is_no_room_or_something_is_wrong(
+    bound: int, odd: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.stream.inbox._PATIENCE_S", 600.0)
+    inbox, taken = Inbox(bound, "wait", may_be_block=lambda _: not odd), list[object]()
+    thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
+    thread.start()
+    inbox.put(RawBlock(b"", b"", ""))
+    until(lambda: bool(taken), "a block by itself")
+    thread.join()
+
+
+def test_a_block_by_itself_is_taken_before_long() -> None:
+    inbox, taken = Inbox(100, "drop"), list[object]()
+    thread = threading.Thread(target=lambda: taken.append(inbox.get(50)), daemon=True)
+    thread.start()
+    inbox.put(RawBlock(b"", b"", ""))
+    until(lambda: bool(taken), "a block by itself")
+    thread.join()
 
 
 def test_closed_inbox_frees_everybody_who_waits() -> None:
