@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from benchmarks.studies.ablation import ablation
+from benchmarks.studies.agreement import agreement
 from benchmarks.studies.delay import delay
 from benchmarks.studies.evaluate import evaluate
 from benchmarks.studies.level_years import level_years
@@ -22,6 +23,7 @@ from models.errors import RotorwatchError
 
 STUDIES = {
     "evaluate": evaluate,
+    "agreement": agreement,
     "peers": peers,
     "unknown": unknown,
     "sensors": sensors,

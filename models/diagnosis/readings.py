@@ -209,6 +209,12 @@ class Diagnosis:
     # Part of the variances in `common`, by parameter, that longer healthy recordings do not remove either: what a
     # relation is off in conditions that it was not learned in.
     elsewhere: Mapping[str, float] = field(default_factory=dict)
+    # Degrees of freedom of the standard errors (Student's t), by parameter: far from zero a reading with few of them is
+    # less unlikely than a normal one. What is not in it is normal.
+    freedom: Mapping[str, float] = field(default_factory=dict)
+    # Of a parameter, what the reading takes for a change of it when another one changes by 1, which it takes as
+    # unchanged.
+    taken_for: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     # Over-identification: how far the window is from anything the model can explain, standard normal where the model
     # holds; None where the diagnostician has no such test.
     misfit_z: float | None = None

@@ -83,7 +83,9 @@ class Agreement(Record):
         description="agree, disagree, or only-one where only one of them could read the parameter", examples=["agree"]
     )
     difference_z: Number = Field(
-        default=None, description="second minus first change in combined standard errors", examples=[0.8]
+        default=None,
+        description="second minus first change in combined standard errors, fewer where these have heavy tails",
+        examples=[0.8],
     )
 
 

@@ -21,7 +21,7 @@ from models.diagnosis.networks.amortised import NetworkDiagnostician
 from models.diagnosis.networks.bundle import Bundle
 from models.diagnosis.networks.relation import RelationDiagnostician
 from models.diagnosis.readings import Diagnosis, Diagnostician, beyond, no_reading
-from models.diagnosis.verdict.calibration import agreements
+from models.diagnosis.verdict.calibration import agreements, beside
 from models.diagnosis.verdict.sequential import SequentialSettings
 from models.diagnosis.verdict.stretch import determined, with_shared_error
 from models.diagnosis.window import WindowStatistics
@@ -244,7 +244,7 @@ class KnownMachineEvaluator(WindowEvaluator):
                 opinions.append(Opinion(by=other.by, reason=str(error)))
                 continue
             equations = diagnosis.equations or equations
-            opinions.append(_opinion(deciding, diagnosis))
+            opinions.append(_opinion(deciding, beside(deciding, diagnosis)))
         return Evaluation(deciding, evaluated, equations, tuple(opinions), speed)
 
     def checkpoint(self) -> dict[str, np.ndarray]:

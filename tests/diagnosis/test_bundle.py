@@ -44,6 +44,7 @@ def test_round_trip(tmp_path: Path) -> None:
     loaded = again.amortised
     assert loaded is not None
     assert loaded.calibration == shipped.amortised.calibration
+    assert (loaded.coherent, loaded.coherence_limit) == (shipped.amortised.coherent, shipped.amortised.coherence_limit)
     x = np.random.default_rng(SEED).standard_normal((3, loaded.networks[0].direct.shape[0])).astype(np.float32)
     for part, expected in zip(loaded.networks[0](x), shipped.amortised.networks[0](x), strict=True):
         np.testing.assert_array_equal(part, expected)
@@ -100,6 +101,9 @@ def flip_a_byte(directory: Path) -> None:
         (edit_manifest(lambda m: m["equations"][0]["channels"].reverse()), "equation 28: channels are"),
         (edit_manifest(lambda m: m["equations"][0]["healthy"].update(z_scale=[1.0])), "28: lengths of z_scale"),
         (edit_manifest(lambda m: m["equations"][0]["healthy"].update(z_scale=[-1.0, 1.0])), "z_scale.*above 0"),
+        (edit_manifest(lambda m: m["equations"][0]["healthy"].update(gain=[1.0])), "28: length of gain"),
+        (edit_manifest(lambda m: m["equations"][0]["healthy"].update(gain=[0.0, 1.0])), "gain.*above 0"),
+        (edit_manifest(lambda m: m["amortised"]["coherent"].pop("e")), "calibrated are .* expected .*'e'"),
         (edit_manifest(lambda m: m["equations"].append(m["equations"][0])), "occurs twice"),
         (edit_weights(lambda a: a.update({"28.input_scale": np.zeros(4)})), "input_scale has a value"),
         (edit_manifest(lambda m: m["equations"][0].update(units="um")), "units: expected SI"),

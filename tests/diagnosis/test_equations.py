@@ -53,6 +53,16 @@ def test_an_equation_reads_its_own_parameters_and_is_blind_to_the_rest(
             np.testing.assert_allclose(read, expected, atol=0.012 if equation.number == "29" else 1e-4)
 
 
+@pytest.mark.parametrize("name", ["lab", "heavy"])
+def test_it_is_known_what_a_changed_shaft_looks_like_to_the_equation_of_the_unbalance(name: str) -> None:
+    machine, equation = load_machine(name), EQUATIONS[1]
+    assert isinstance(equation, SynchronousEquation)
+    weights = linear_relation(equation, machine)
+    rows = equation.rows(theory(machine, {"EI": 0.01}, 1.0), machine)
+    read = np.linalg.lstsq(rows.signatures, rows.target - rows.inputs @ weights, rcond=None)[0]
+    assert 0.01 * equation.taken_for(machine)["EI"] == pytest.approx(float(read[0]), rel=0.15)
+
+
 def test_equations_do_not_depend_on_unmeasured_states() -> None:
     lab = load_machine("lab").descriptor.states
     absent = {equation.number: missing(equation, lab) for equation in EQUATIONS}

@@ -1,17 +1,19 @@
 """The choice among sets of parameters, two diagnosticians on one window, and what a reading says of itself."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import norm
+from scipy.stats import t as student
 
 import models
 import service
 import simulator
 from models.diagnosis.readings import Z95, Diagnosis, no_reading, parameter_reading, possible_reading
-from models.diagnosis.verdict.calibration import agreements
+from models.diagnosis.verdict.calibration import agreements, beside
 from models.diagnosis.verdict.isolation import Isolation, isolate_window, outside_confidence
 from models.diagnosis.verdict.stretch import added, from_scale, slope, stretch_of, to_scale
 from models.errors import EstimationError
@@ -197,6 +199,43 @@ def test_two_who_are_right_disagree_once_in_a_thousand_windows(common: int) -> N
         one, other = (dict.fromkeys(PARAMETERS[:common], reading) for reading in ((0.0, 0.01), (apart, 0.03)))
         found = agreements(diagnosis("likelihood", **one), diagnosis("network", **other))
         assert [each.verdict for each in found] == [verdict] * common
+
+
+@pytest.mark.parametrize("freedom", [3.0, 12.0, 100.0])
+def test_few_degrees_of_freedom_do_not_make_them_disagree_more_often(freedom: float) -> None:
+    """Whatever the tails are, one in a thousand lies beyond; the 95 % interval is that of the standard error."""
+    scale = 0.03 * norm.isf(0.025) / student.isf(0.025, freedom)
+    limit = float(student.isf(0.0005, freedom)) * scale
+    for apart, verdict in ((0.999 * limit, "agree"), (1.001 * limit, "disagree")):
+        second = replace(diagnosis("relation", k_by=(apart, 0.03)), freedom={"k_by": freedom})
+        (found,) = agreements(diagnosis("likelihood", k_by=(0.0, 1e-6)), second)
+        assert found.verdict == verdict
+        # Beside a likelihood whose error is much the larger, tails are normal.
+        (wide,) = agreements(diagnosis("likelihood", k_by=(0.0, 3.0)), second)
+        assert wide.difference_z == pytest.approx(apart / 3.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("rate", [0.01, 0.001])
+def test_few_degrees_of_freedom_do_not_make_a_window_changed_more_often(rate: float) -> None:
+    """In the scale in which a change of k and of its inverse weigh the same, about: errors are small."""
+    limit = float(student.isf(rate / 2, 5.0)) * 1e-4 * norm.isf(0.025) / student.isf(0.025, 5.0)
+    for apart, named in ((0.99 * limit, ()), (1.01 * limit, ("k_by",))):
+        one = replace(diagnosis("network", k_by=(apart, 1e-4)), freedom={"k_by": 5.0})
+        assert isolate_window(one, rate).changed == named
+
+
+def test_a_reading_that_takes_another_change_for_its_own_is_withdrawn_and_only_then() -> None:
+    second = replace(diagnosis("relation", e=(0.2, 0.01), k_by=(0.0, 0.01)), taken_for={"e": {"EI": -2.0}})
+    changed = diagnosis("likelihood", e=(0.0, 0.01), k_by=(0.0, 0.01), EI=(-0.1, 0.002))
+    told = {one.name: one for one in beside(changed, second).parameters}
+    assert told["e"].relative_change is None
+    assert told["e"].reason == "not told from the change of EI that the likelihood reads"
+    assert told["k_by"] == second.parameters[1]
+    verdicts = {one.name: one.verdict for one in agreements(changed, beside(changed, second))}
+    assert verdicts == {"k_by": "agree", "e": "only-one", "EI": "only-one"}
+    for EI in ((-0.1, 0.05), (-0.004, 0.0001)):  # not sure to have changed; sure, and too little to be seen in e
+        kept = diagnosis("likelihood", e=(0.0, 0.01), k_by=(0.0, 0.01), EI=EI)
+        assert beside(kept, second).parameters == second.parameters
 
 
 @pytest.mark.parametrize("change", [np.nan, np.inf, -np.inf])

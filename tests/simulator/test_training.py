@@ -12,13 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from models.diagnosis.networks.amortised import OWN, Calibration
-from models.diagnosis.networks.bundle import Bundle, load_bundle
+from models.diagnosis.networks.amortised import OWN, Calibration, NetworkDiagnostician
+from models.diagnosis.networks.bundle import Bundle, load_bundle, save_bundle
+from models.diagnosis.networks.calibration import calibrate, calibrate_networks
 from models.diagnosis.networks.equations import EQUATIONS
 from models.diagnosis.networks.features import ForceFeatures
 from models.diagnosis.networks.relation import read_equation
 from models.errors import EstimationError
 from models.machine import Machine, load_machine
+from simulator.training.calibration import calibrate_again
 from simulator.training.draws import Draw, Layout, Purpose, simulate_window
 from simulator.training.spectral_draws import LOG_RATIO, FeatureDraws, batches
 
@@ -45,7 +47,7 @@ def briefly() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("models.diagnosis.networks.training._ROUNDS", 3)
         patch.setattr("simulator.training.spectral_draws._BASIS_DRAWS", 96)
-        patch.setattr("simulator.training.command._CALIBRATION_SHARE", 1)
+        patch.setattr("simulator.training.calibration._AMORTISED_SHARE", 1)
         yield
 
 
@@ -72,8 +74,9 @@ def test_a_bundle_holds_both_networks_of_every_equation_and_says_how_they_were_t
     assert {one.equation.number for one in bundle.networks} == {"28", "29", "30", "31"}
     assert bundle.amortised is not None
     assert {one.equation for one in bundle.amortised.networks} == {"28", "29", "30", "31"}
+    assert bundle.amortised.coherent != bundle.amortised.calibration  # of windows with one source, and with several
     made = bundle.manifest.training
-    assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 2, 1, DRAWS)
+    assert (made.seed, made.training_windows, made.calibration_windows, made.drawn_conditions) == (SEED, 2, 5, DRAWS)
 
 
 def test_a_relation_network_is_trained_again_to_the_last_bit_and_progress_is_told(bundle: Bundle) -> None:
@@ -143,12 +146,21 @@ def test_too_few_windows_are_refused(recipe: FeatureDraws) -> None:
 
 
 def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    from models.diagnosis.networks.training import calibrate, train_network  # noqa: PLC0415
+    from models.diagnosis.networks.training import train_network  # noqa: PLC0415
 
     monkeypatch.setattr("models.diagnosis.networks.training._ROUNDS", 16)
     equation = EQUATIONS[0]
     network = train_network(equation, windows(SHORT, Purpose.TRAINING, 0, 12, equation.kept_nominal), SHORT, SEED)
-    trained = calibrate(network, windows(SHORT, Purpose.CALIBRATION, 0, 6, equation.kept_nominal), SHORT)
+    still = windows(SHORT, Purpose.CALIBRATION, 0, 6, equation.kept_nominal)
+    sizes = np.linspace(-0.3, 0.3, 10)
+    changed = [
+        (simulate_window(Draw(SHORT, SEED, Purpose.CALIBRATION, 1, faults=faults), number), faults)
+        for number, size in enumerate(sizes.tolist())
+        for faults in ({"k_by": size, "c_by": -size},)
+    ]
+    trained = calibrate(network, still, [changed], SHORT)
+    assert trained.healthy is not None
+    assert trained.healthy.gain == pytest.approx((1.0, 1.0), abs=0.3)
     draw = Draw(SHORT, SEED, Purpose.EVALUATION, 1, faults={"k_by": -0.2}, layout=Layout.INDEPENDENT)
     readings = [read_equation(trained, simulate_window(draw, number), SHORT).parameters for number in range(6)]
     k_by = np.array([reading[0].relative_change for reading in readings], dtype=np.float64)
@@ -157,15 +169,32 @@ def test_a_small_training_finds_and_sizes_a_fault_on_new_windows(monkeypatch: py
     assert abs(np.median([reading[1].z or 0.0 for reading in readings])) < 2  # c_by did not change
 
 
-def test_calibration_finds_the_true_size_of_the_errors() -> None:
-    from models.diagnosis.networks.training import calibrate_networks  # noqa: PLC0415
+def held(layout: Layout, count: int) -> list[tuple[Any, dict[str, float]]]:
+    draw = Draw(SHORT, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout)
+    return [(simulate_window(draw, number), {}) for number in range(count)]
 
+
+def test_calibration_finds_the_true_size_of_the_errors_and_tells_one_source_from_several() -> None:
     shipped = load_bundle("lab", LAB).amortised
     assert shipped is not None
-    draws = (Draw(SHORT, SEED, Purpose.EVALUATION, 400 + 10 * layout, layout=layout) for layout in Layout)
-    held_out = [[(simulate_window(draw, number), dict[str, float]()) for number in range(6)] for draw in draws]
-    calibrated = calibrate_networks(SHORT, replace(shipped, calibration={}), held_out)
-    assert set(calibrated.calibration) == {name for own in OWN.values() for name in own}
-    assert all(0.1 < scale < 8 for one in calibrated.calibration.values() for scale in one.z_scale)
+    one, several = held(Layout.ONE_SOURCE, 6), held(Layout.INDEPENDENT, 6)
+    calibrated = calibrate_networks(SHORT, replace(shipped, calibration={}, coherent={}), one, several)
+    for found in (calibrated.calibration, calibrated.coherent):
+        assert set(found) == {name for own in OWN.values() for name in own}
+        assert all(0.1 < scale < 8 for each in found.values() for scale in each.z_scale)
+    reader = NetworkDiagnostician(SHORT, calibrated)
+    for group, expected in ((one, calibrated.coherent), (several, calibrated.calibration)):
+        for window, _ in group[1:]:
+            assert calibrated.calibration_at(reader.coherence(window)) is expected
     doubled = Calibration(0.0, (-5.0, -3.0), (2.0, 4.0))
     np.testing.assert_allclose(doubled.scale(np.exp([-9.0, -4.0, 0.0])), [2.0, 3.0, 4.0])
+
+
+def test_a_bundle_is_calibrated_again_to_the_last_bit_without_training(bundle: Bundle, tmp_path: Path) -> None:
+    first = tmp_path / "trained"
+    save_bundle(first, COARSE, bundle.networks, bundle.manifest.training, bundle.amortised)
+    with briefly():
+        calibrate_again(COARSE, str(first), tmp_path / "again", 1)
+    again = load_bundle(tmp_path / "again", COARSE)
+    assert again.manifest == bundle.manifest
+    assert again.identity == bundle.identity

@@ -6,11 +6,12 @@ logarithmic ratio to nominal. It has learned the inverse of the theory, Eqs. (1)
 conditions, and answers in microseconds; its standard errors are calibrated on windows simulated in time.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
+from models.diagnosis.moments import ComplexArray
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, ForceFeatures
 from models.diagnosis.readings import Diagnosis, beyond, no_reading, parameter_reading
 from models.diagnosis.window import WindowStatistics
@@ -60,6 +61,7 @@ class Calibration:
     log_deviation: tuple[float, ...]  # logarithms of stated standard errors, ascending: knots
     # At each knot, what the standard error has to be multiplied by for its 95 % interval to hold 95 %.
     z_scale: tuple[float, ...]
+    freedom: float | None = None  # degrees of freedom of the scaled errors (Student's t); None: normal
 
     def scale(self, deviation: FloatArray) -> FloatArray:
         """Factor for stated standard errors."""
@@ -76,6 +78,13 @@ class AmortisedNetworks:
     calibration: dict[str, Calibration]  # for every parameter; empty before calibration
     novelty_limit: float  # largest `FeatureBasis.novelty` that is evaluated
     log_range: float  # parameters were drawn up to this logarithmic ratio, either sign
+    # In windows whose forces are as coherent as those of one source; empty: as in all others.
+    coherent: dict[str, Calibration] = field(default_factory=dict)
+    coherence_limit: float = 1.0  # mean squared coherence of the forces beyond which a window is one of these
+
+    def calibration_at(self, coherence: float) -> dict[str, Calibration]:
+        """Calibration of a window."""
+        return self.coherent if self.coherent and coherence > self.coherence_limit else self.calibration
 
 
 class NetworkDiagnostician:
@@ -92,20 +101,27 @@ class NetworkDiagnostician:
 
         None if a state the networks were trained with is not in the window.
         """
-        wanted = self._amortised.states
-        if any(name not in window.states for name in wanted):
+        if any(name not in window.states for name in self._amortised.states):
             return None
-        spectrum, synchronous = window.spectrum[None], window.synchronous
-        if wanted != window.states:
-            columns = [window.states.index(name) for name in wanted]
-            spectrum = spectrum[:, :, columns][:, :, :, columns]
-            synchronous = None if synchronous is None else synchronous[columns]
+        spectrum, synchronous = self._measured(window)
         basis, features, speed = self._amortised.basis, self._features, np.array([window.speed_rad_s])
         with np.errstate(divide="ignore", invalid="ignore"):  # a dead channel shows as novelty
             parts = [basis.condensed(features.series(features.force(spectrum))), features.consistency(spectrum, speed)]
             if synchronous is not None and basis.centre.size > basis.n_common:
                 parts.append(features.unbalance(spectrum, synchronous[None], speed))
             return basis.standardised(np.concatenate(parts, axis=1))
+
+    def coherence(self, window: WindowStatistics) -> float:
+        """Mean squared coherence of the forces on the nominal machine, over all pairs and frequencies, 0 to 1."""
+        return self._features.coherence(self._features.force(self._measured(window)[0]))
+
+    def _measured(self, window: WindowStatistics) -> tuple[ComplexArray, ComplexArray | None]:
+        """Spectra, shape (1, n_bins, n, n), and rotation-synchronous vectors of the states trained with."""
+        wanted, spectrum, synchronous = self._amortised.states, window.spectrum[None], window.synchronous
+        if wanted == window.states:
+            return spectrum, synchronous
+        columns = [window.states.index(name) for name in wanted]
+        return spectrum[:, :, columns][:, :, :, columns], None if synchronous is None else synchronous[columns]
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: what cannot be read carries its reason."""
@@ -125,16 +141,18 @@ class NetworkDiagnostician:
             )
         readings: list[Parameter] = []
         blocks: list[FloatArray] = []
+        calibration = amortised.calibration_at(self.coherence(window) if amortised.coherent else 0.0)
         for network in amortised.networks:
             n_inputs = network.direct.shape[0]
             if inputs.shape[1] < n_inputs:
                 readings += [no_reading(name, self.by, "no phase reference") for name in OWN[network.equation]]
                 continue
             mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
-            read, covariance = self._read(network.equation, mean[0], factor[0])
+            read, covariance = self._read(network.equation, mean[0], factor[0], calibration)
             readings += read
             blocks.append(covariance)
-        return Diagnosis(self.by, tuple(readings), covariance=_block_diagonal(blocks))
+        freedom = {name: one.freedom for name, one in calibration.items() if one.freedom is not None}
+        return Diagnosis(self.by, tuple(readings), covariance=_block_diagonal(blocks), freedom=freedom)
 
     def _disagreement(self, inputs: Float32Array) -> str:
         """Degrees of freedom of which two sensors tell different things; empty if none."""
@@ -148,14 +166,16 @@ class NetworkDiagnostician:
             if value > _MOST_APART
         )
 
-    def _read(self, equation: str, mean: FloatArray, factor: FloatArray) -> tuple[list[Parameter], FloatArray]:
+    def _read(
+        self, equation: str, mean: FloatArray, factor: FloatArray, calibrations: dict[str, Calibration]
+    ) -> tuple[list[Parameter], FloatArray]:
         """Readings of one equation and the covariance of those that could be made."""
         amortised = self._amortised
         covariance = factor @ factor.T
         readings, kept, scales = [], [], []
         for position, name in enumerate(OWN[equation]):
             log_ratio, deviation = float(mean[position]), float(np.sqrt(covariance[position, position]))
-            calibration = amortised.calibration.get(name)
+            calibration = calibrations.get(name)
             scale = 1.0
             if calibration is not None:
                 log_ratio -= calibration.bias

@@ -45,6 +45,9 @@ class HealthyEntry(BaseModel, extra="forbid", frozen=True):
     msd: float = Field(ge=0)
     z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...]
     spread: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...]
+    floor: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = ()
+    gain: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = ()
+    freedom: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = ()
 
 
 class EquationEntry(BaseModel, extra="forbid", frozen=True):
@@ -65,6 +68,7 @@ class CalibrationEntry(BaseModel, extra="forbid", frozen=True):
     bias: float = Field(allow_inf_nan=False)
     log_deviation: tuple[Annotated[float, Field(allow_inf_nan=False)], ...] = Field(min_length=1)
     z_scale: tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...] = Field(min_length=1)
+    freedom: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
 
 class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
@@ -75,6 +79,8 @@ class AmortisedEntry(BaseModel, extra="forbid", frozen=True):
     equations: tuple[Literal["28", "29", "30", "31"], ...]
     layers: tuple[int, ...]
     calibration: dict[str, CalibrationEntry]
+    coherent: dict[str, CalibrationEntry] = Field(default={}, description="where the forces are coherent; empty: same")
+    coherence_limit: float = Field(default=1.0, ge=0, le=1, description="mean squared coherence beyond which they are")
     calibration_windows: int = Field(ge=1)
     novelty_limit: float = Field(gt=0, allow_inf_nan=False)
     log_range: float = Field(gt=0, allow_inf_nan=False)
@@ -250,6 +256,11 @@ def _network(directory: Path, entry: EquationEntry, arrays: _Arrays) -> Equation
         ("parameters", entry.parameters, equation.parameters),
         ("hidden", entry.hidden, HIDDEN),
         ("lengths of z_scale and spread", (len(healthy.z_scale), len(healthy.spread)), (len(entry.parameters),) * 2),
+        *(
+            (f"length of {name}", len(values), len(entry.parameters))
+            for name in ("floor", "gain", "freedom")
+            if (values := getattr(healthy, name))
+        ),
     )
     for field, found, expected in checks:
         if found != expected:
@@ -290,6 +301,8 @@ def _amortised_entry(amortised: AmortisedNetworks, training: Training) -> Amorti
             "equations": tuple(network.equation for network in amortised.networks),
             "layers": LAYERS,
             "calibration": {name: asdict(one) for name, one in amortised.calibration.items()},
+            "coherent": {name: asdict(one) for name, one in amortised.coherent.items()},
+            "coherence_limit": amortised.coherence_limit,
             "calibration_windows": training.network_calibration_windows or training.calibration_windows,
             "novelty_limit": amortised.novelty_limit,
             "log_range": amortised.log_range,
@@ -303,9 +316,10 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
     if entry.layers != LAYERS:
         raise BundleError(f"{where}: layers are {entry.layers}, this program expects {LAYERS}")
     parameters = {name for number in entry.equations for name in OWN[number]}
-    if set(entry.calibration) != parameters:
-        raise BundleError(f"{where}: calibrated are {sorted(entry.calibration)}, expected {sorted(parameters)}")
-    for name, one in entry.calibration.items():
+    for calibrated in (entry.calibration, *([entry.coherent] if entry.coherent else [])):
+        if set(calibrated) != parameters:
+            raise BundleError(f"{where}: calibrated are {sorted(calibrated)}, expected {sorted(parameters)}")
+    for name, one in (*entry.calibration.items(), *entry.coherent.items()):
         if len(one.log_deviation) != len(one.z_scale) or list(one.log_deviation) != sorted(one.log_deviation):
             raise BundleError(f"{where}: calibration of {name}: expected ascending log_deviation, one z_scale for each")
     n_inputs = arrays.get("basis.centre", np.empty(0)).size
@@ -339,8 +353,20 @@ def _amortised(directory: Path, entry: AmortisedEntry, arrays: _Arrays) -> Amort
         )
         for number in entry.equations
     )
-    calibration = {name: Calibration(**dict(one)) for name, one in entry.calibration.items()}
-    return AmortisedNetworks(entry.channels, basis, networks, calibration, entry.novelty_limit, entry.log_range)
+    calibration, coherent = (
+        {name: Calibration(**dict(one)) for name, one in calibrated.items()}
+        for calibrated in (entry.calibration, entry.coherent)
+    )
+    return AmortisedNetworks(
+        entry.channels,
+        basis,
+        networks,
+        calibration,
+        entry.novelty_limit,
+        entry.log_range,
+        coherent,
+        entry.coherence_limit,
+    )
 
 
 def _differences(trained: Any, present: Any, path: str = "") -> list[str]:

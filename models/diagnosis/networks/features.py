@@ -136,6 +136,11 @@ class ForceFeatures:
             out[m + 2 * k], out[m + 2 * k + 1] = coherence.real, coherence.imag
         return out
 
+    def coherence(self, force: npt.NDArray[np.complexfloating]) -> float:
+        """Mean squared coherence over all windows, frequencies and pairs of forces; 0 where there is no pair."""
+        parts = self.series(force)[len(self._dofs) :]
+        return 2 * float(np.mean(parts**2)) if self._pairs else 0.0
+
     def consistency(self, spectrum: npt.NDArray[np.complexfloating], speed_rad_s: FloatArray) -> Float32Array:
         """Speed, and agreement of displacement and rate, shape (n_windows, n).
 

@@ -49,10 +49,19 @@ class Healthy:
 
     windows: int  # how many
     msd: float  # mean of the mean squared deviation
-    # What the standard errors are multiplied by so that 95 % intervals hold 95 %: from quantiles of the readings in
-    # their own standard errors, not from their mean square, which a few windows with one source decide.
+    # What the scatter over the hops is multiplied by, so that with `floor` 95 % intervals hold 95 %.
     z_scale: tuple[float, ...]
     spread: tuple[float, ...]  # robust standard deviation of each own parameter's reading
+    # Relative error that all hops of a window share and their scatter does not show; empty: none.
+    floor: tuple[float, ...] = ()
+    # How much of a change is read; the rest the network explains by itself. Empty: all of it.
+    gain: tuple[float, ...] = ()
+    freedom: tuple[float, ...] = ()  # degrees of freedom of the errors (Student's t); empty: normal
+
+    def stated(self, change: FloatArray, scatter: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Changes and their standard errors, of what the signatures see of the residual and its scatter."""
+        error = np.hypot(np.multiply(self.z_scale, scatter), self.floor or 0.0)
+        return change / (self.gain or 1.0), error
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +96,8 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     """Evaluate one equation on one window.
 
     The residual is projected on the signatures of the equation's own parameters: detection, location inside the
-    equation, and size in one step. The scatter over the window's hops gives the standard error.
+    equation, and size in one step. The scatter over the window's hops gives the standard error, with what calibration
+    found that all hops share.
     """
     equation = trained.equation
     absent = missing(equation, window.states if window.synchronous is None else (*window.states, "theta"))
@@ -104,7 +114,7 @@ def read_equation(trained: EquationNetwork, window: WindowStatistics, machine: M
     error = hops.std(axis=0, ddof=1) / np.sqrt(hops.shape[0])
     healthy = trained.healthy
     if healthy is not None:
-        error = error * np.array(healthy.z_scale)
+        change, error = healthy.stated(change, error)
     readings = tuple(
         possible_reading(name, "relation", float(value), float(spread))
         for name, value, spread in zip(equation.parameters, change, error, strict=True)
@@ -140,6 +150,17 @@ class RelationDiagnostician:
     def __init__(self, machine: Machine, networks: tuple[EquationNetwork, ...]) -> None:
         self._machine = machine
         self._networks = {trained.equation.number: trained for trained in networks}
+        self._freedom = {
+            name: freedom
+            for trained in networks
+            if trained.healthy is not None and trained.healthy.freedom
+            for name, freedom in zip(trained.equation.parameters, trained.healthy.freedom, strict=True)
+        }
+        self._taken_for = {
+            trained.equation.parameters[0]: trained.equation.taken_for(machine)
+            for trained in networks
+            if isinstance(trained.equation, SynchronousEquation)
+        }
 
     def diagnose(self, window: WindowStatistics) -> Diagnosis:
         """Judge one window; never raises: an equation that cannot be evaluated carries its reason."""
@@ -155,4 +176,4 @@ class RelationDiagnostician:
             parameters += reading.parameters or [
                 no_reading(name, self.by, reading.reason) for name in equation.parameters
             ]
-        return Diagnosis(self.by, tuple(parameters), tuple(equations))
+        return Diagnosis(self.by, tuple(parameters), tuple(equations), freedom=self._freedom, taken_for=self._taken_for)

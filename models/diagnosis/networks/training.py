@@ -1,4 +1,4 @@
-"""Training of the networks, of one equation each and amortised, and their calibration on windows of their own.
+"""Training of the networks, of one equation each and amortised.
 
 For one equation, the training windows keep the equation's own parameters nominal and draw everything else at random:
 the residual becomes blind to other faults and to the operating condition by construction.
@@ -14,33 +14,18 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from scipy.special import ndtri
 
-from models.diagnosis.networks.amortised import (
-    LAYERS,
-    LIMIT,
-    OWN,
-    AmortisedNetwork,
-    AmortisedNetworks,
-    Calibration,
-    NetworkDiagnostician,
-)
+from models.diagnosis.networks.amortised import LAYERS, LIMIT, OWN, AmortisedNetwork, AmortisedNetworks
 from models.diagnosis.networks.equations import Equation, SynchronousEquation
 from models.diagnosis.networks.features import FeatureBasis, Float32Array, fit_basis
-from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Healthy, Network, read_equation, window_view
-from models.diagnosis.readings import Z95
+from models.diagnosis.networks.relation import HIDDEN, EquationNetwork, Network, window_view
 from models.diagnosis.window import WindowStatistics
 from models.errors import EstimationError
 from models.machine import Machine
 from models.physics.rotor import PARAMETERS
-from models.signals.block import FloatArray
 
 _ROUNDS = 40
 _STEPS_PER_ROUND = 25
-_LEVELS = [0.9, 0.95]
-# Quantiles of |z| that calibrate the standard errors, and the normal distribution's: two scatter less than one.
-_NORMAL = np.array([[1.644854], [Z95]])
-_MAD = 1.4826  # median absolute deviation to standard deviation
 
 
 def train_network(
@@ -106,29 +91,6 @@ def train_network(
     return EquationNetwork(equation, Network(scale, *arrays), healthy=None)
 
 
-def calibrate(trained: EquationNetwork, windows: Sequence[WindowStatistics], machine: Machine) -> EquationNetwork:
-    """Measure the healthy spread on windows that training did not see.
-
-    Parameters
-    ----------
-    windows : sequence of WindowStatistics
-        Healthy in the equation's own parameters, at least ten, from seeds of their own.
-    """
-    readings = [
-        read_equation(EquationNetwork(trained.equation, trained.network, None), window, machine) for window in windows
-    ]
-    change = np.array([[reading.relative_change for reading in one.parameters] for one in readings], dtype=np.float64)
-    error = np.array([[reading.standard_error for reading in one.parameters] for one in readings], dtype=np.float64)
-    z = change / error
-    healthy = Healthy(
-        windows=len(windows),
-        msd=float(np.mean([reading.msd for reading in readings])),
-        z_scale=tuple(float(value) for value in np.mean(np.quantile(np.abs(z), _LEVELS, axis=0) / _NORMAL, axis=0)),
-        spread=tuple(float(value) for value in np.median(np.abs(change), axis=0) * _MAD),
-    )
-    return EquationNetwork(trained.equation, trained.network, healthy)
-
-
 _BATCH = 512
 _PASSES = 3.0  # how often a window is seen on average
 _BUFFER = 160_000
@@ -137,9 +99,6 @@ _RATE, _RATE_RISES_OVER = 2e-3, 100
 _WEIGHT_DECAY = 2e-2
 _USUAL = 0.3  # standard deviation of the drawn logarithmic ratios, about: the networks work in units of it
 _NOVELTY_QUANTILE, _NOVELTY_MARGIN = 0.999, 1.25
-_KNOTS = 3
-_QUANTILES = (0.9, 0.95, 0.98)
-_FEWEST = 30  # windows of one group from which a quantile is believed
 
 
 class _Learner:
@@ -291,66 +250,6 @@ class _Buffer:
         places = (self.seen + np.arange(features.shape[0])) % self._size
         self.features[places], self.log_ratio[places] = features, log_ratio
         self.seen += features.shape[0]
-
-
-def calibrate_networks(
-    machine: Machine, trained: AmortisedNetworks, groups: Sequence[Iterable[tuple[WindowStatistics, dict[str, float]]]]
-) -> AmortisedNetworks:
-    """Measure bias and true size of the standard errors on windows simulated in time.
-
-    Parameters
-    ----------
-    groups : sequence of iterables of (WindowStatistics, relative changes)
-        From seeds of their own, one group for every layout of the sources: no window says which one it is of, so the
-        group that needs the larger standard errors decides. Parameters that are not named are nominal.
-    """
-    reader = NetworkDiagnostician(machine, trained)
-    found: dict[str, list[FloatArray]] = {}
-    for windows in groups:
-        errors: dict[str, list[tuple[float, float]]] = {}
-        for window, changes in windows:
-            inputs = reader.inputs(window)
-            if inputs is None:
-                continue
-            for network in trained.networks:
-                n_inputs = network.direct.shape[0]
-                if inputs.shape[1] < n_inputs:
-                    continue
-                mean, factor = network(np.clip(inputs[:, :n_inputs], -LIMIT, LIMIT))
-                deviation = np.sqrt(np.einsum("ij,ij->i", factor[0], factor[0]))
-                for position, name in enumerate(OWN[network.equation]):
-                    error = float(mean[0, position] - np.log1p(changes.get(name, 0.0)))
-                    errors.setdefault(name, []).append((error, float(deviation[position])))
-        for name, pairs in errors.items():
-            found.setdefault(name, []).append(np.array(pairs))
-    calibration = {name: _calibration(pairs) for name, pairs in found.items()}
-    return AmortisedNetworks(
-        trained.states, trained.basis, trained.networks, calibration, trained.novelty_limit, trained.log_range
-    )
-
-
-def _calibration(groups: list[FloatArray]) -> Calibration:
-    """Bias and scale of z in thirds of the stated standard error: what is easy to see and what is hard differ."""
-    pairs = np.concatenate(groups)
-    error, deviation = pairs[:, 0], pairs[:, 1]
-    # Weighted median: windows that see the parameter well decide.
-    order, weight = np.argsort(error), 1 / deviation**2
-    cumulated = np.cumsum(weight[order])
-    bias = float(error[order][np.searchsorted(cumulated, cumulated[-1] / 2)])
-    knots, scales = [], []
-    edges = np.quantile(deviation, np.linspace(0, 1, _KNOTS + 1))
-    for low, high in pairwise(edges):
-        parts = [part[(part[:, 1] >= low) & (part[:, 1] <= high)] for part in groups]
-        fewest = min(_FEWEST, max(len(part) for part in parts))
-        knots.append(float(np.median(np.log(np.concatenate(parts)[:, 1]))))
-        scales.append(max(_scale(part, bias) for part in parts if len(part) >= fewest))
-    return Calibration(bias, tuple(knots), tuple(scales))
-
-
-def _scale(pairs: FloatArray, bias: float) -> float:
-    """Quantiles of |z| over the normal distribution's: several scatter less than one, and see the tail."""
-    z = np.abs(pairs[:, 0] - bias) / pairs[:, 1]
-    return float(np.mean(np.quantile(z, _QUANTILES) / ndtri((1 + np.array(_QUANTILES)) / 2)))
 
 
 def _array(part: torch.Tensor) -> Float32Array:

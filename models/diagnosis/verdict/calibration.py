@@ -1,14 +1,14 @@
 """Declared false-alarm rates, thresholds that keep them, changes that they let show, and diagnosticians that differ."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from scipy.special import ndtr, ndtri
+from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
-from models.diagnosis.readings import Diagnosis
+from models.diagnosis.readings import Z95, Diagnosis, no_reading
 from models.diagnosis.verdict.stretch import Stretch, from_scale, to_scale
 from models.physics.rotor import PARAMETERS
 from rotorwatch.records.windows import Agreement, Detectable, Parameter
@@ -168,7 +168,8 @@ def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
     found = []
     for name in PARAMETERS:
         if name in one and name in other:
-            z = _difference_z(one[name], other[name])
+            freedom = (first.freedom.get(name, math.inf), second.freedom.get(name, math.inf))
+            z = _difference_z(one[name], other[name], freedom)
             verdict: Literal["agree", "disagree"] = "agree" if abs(z) <= threshold else "disagree"
             found.append(Agreement(name=name, between=between, verdict=verdict, difference_z=z))
         elif name in one or name in other:
@@ -176,10 +177,70 @@ def agreements(first: Diagnosis, second: Diagnosis) -> tuple[Agreement, ...]:
     return tuple(found)
 
 
-def _difference_z(one: Parameter, other: Parameter) -> float:
+def _difference_z(one: Parameter, other: Parameter, freedom: tuple[float, float]) -> float:
+    """Difference of two readings as a standard normal value.
+
+    Standard errors are those whose 95 % interval holds 95 %. With few degrees of freedom the tails beyond are heavier;
+    those of the difference are Satterthwaite's (F. E. Satterthwaite, Biometrics Bulletin 2 (1946)).
+    """
     difference = (other.relative_change or 0.0) - (one.relative_change or 0.0)
-    error = math.hypot(one.standard_error or 0.0, other.standard_error or 0.0)
-    return difference / error if error > 0 else math.inf * difference if difference else 0.0
+    errors = (one.standard_error or 0.0, other.standard_error or 0.0)
+    if math.hypot(*errors) == 0:
+        return math.inf * difference if difference else 0.0
+    z = difference / math.hypot(*errors)
+    scales = [_scale(n) * error for error, n in zip(errors, freedom, strict=True)]
+    variance = sum(scale**2 for scale in scales)
+    uncertain = sum(scale**4 / n for scale, n in zip(scales, freedom, strict=True))
+    if uncertain == 0:
+        return z
+    tail = float(stdtr(variance**2 / uncertain, -abs(difference) / math.sqrt(variance)))
+    return math.copysign(_upper(tail), difference) if tail > 0 else z
+
+
+def _scale(freedom: float) -> float:
+    """Scale of the t distribution of which a standard error of 1 holds 95 % in 1.96 either way."""
+    return Z95 / float(stdtrit(freedom, 0.975)) if freedom < math.inf else 1.0
+
+
+def widened(diagnosis: Diagnosis, rate: float) -> Diagnosis:
+    """The diagnosis with errors so wide that normal thresholds keep a declared rate, however few degrees of freedom.
+
+    Parameters
+    ----------
+    rate : float
+        Probability that a healthy window is called changed.
+    """
+    if not diagnosis.freedom:
+        return diagnosis
+    readings = diagnosis.evaluable
+    tail = _shared(rate, max(1, len(readings))) / 2
+    wider = np.ones(len(readings))
+    for position, reading in enumerate(readings):
+        freedom = diagnosis.freedom.get(reading.name, math.inf)
+        if freedom < math.inf:
+            wider[position] = -float(stdtrit(freedom, tail)) * _scale(freedom) / _upper(tail)
+    return replace(diagnosis, covariance=diagnosis.full_covariance * np.outer(wider, wider))
+
+
+def beside(first: Diagnosis, second: Diagnosis) -> Diagnosis:
+    """The second diagnosis without what it would only take for changed, because the first finds that another one did.
+
+    Equation (29) reads the unbalance with the shaft as it was: a shaft that has changed looks to it like an unbalance.
+    """
+    read = {reading.name: reading for reading in first.evaluable}
+    changed = {name for name, one in read.items() if abs(one.z or 0.0) > window_thresholds(_RATE, 1).first}
+    parameters = []
+    for one in second.parameters:
+        shifts = {
+            name: times * (read[name].relative_change or 0.0)
+            for name, times in second.taken_for.get(one.name, {}).items()
+            if name in changed
+        }
+        if one.relative_change is not None and sum(map(abs, shifts.values())) > (one.standard_error or 0.0):
+            reason = f"not told from the change of {', '.join(shifts)} that the {first.by} reads"
+            one = no_reading(one.name, second.by, reason)  # noqa: PLW2901
+        parameters.append(one)
+    return replace(second, parameters=tuple(parameters))
 
 
 _POWER = 0.95

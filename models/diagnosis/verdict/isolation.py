@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from models.diagnosis.readings import Diagnosis, possible_reading
-from models.diagnosis.verdict.calibration import Thresholds, window_thresholds
+from models.diagnosis.verdict.calibration import Thresholds, widened, window_thresholds
 from models.diagnosis.verdict.stretch import Stretch, from_scale, slope, stretch_of
 from models.physics.rotor import PARAMETERS
 from models.signals.block import FloatArray
@@ -71,7 +71,7 @@ def isolate_window(diagnosis: Diagnosis, rate: float) -> Isolation:
     rate : float
         Probability that a healthy window is called changed; the test of the model has the same rate to itself.
     """
-    stretch = stretch_of(diagnosis, 0, 0).complete().believed()
+    stretch = stretch_of(widened(diagnosis, rate), 0, 0).complete().believed()
     isolation = isolate(stretch, window_thresholds(rate, max(1, len(stretch.known))), by=diagnosis.by)
     return replace(isolation, changed=(), readings=(), outside=True) if stretch.unexplained else isolation
 
