@@ -45,7 +45,7 @@ from service.runtime.shard import run_shard
 from service.runtime.standing import EVENTS, Question, Standing, latest_from_bytes
 from service.settings.service import MachineEntry, ServiceSettings
 from service.stream.monitored import MachineStatus
-from service.stream.shard_link import NoAnswerError, ask, hear
+from service.stream.shard_link import NoAnswerError, RelaySettings, ask, hear
 from service.stream.transport import Link, LinkError
 from service.terminal.logs import logger
 
@@ -347,7 +347,7 @@ class Shards:
         self._link = self._settings.link
         if self._link.listen:
             listen = (*self._link.listen, streams)
-            self._router = Link(self._link.model_copy(update={"mode": "router", "listen": listen}))
+            self._router = Link(RelaySettings(**dict(self._link) | {"mode": "router", "listen": listen}))
             undo.callback(self._router.close)
             alone = {"mode": "client", "listen": (), "connect": (streams,), "tls": None, "user": None}
             self._link = self._link.model_copy(update=alone | {"password_file": None, "password_variable": None})

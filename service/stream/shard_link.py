@@ -6,15 +6,27 @@ from concurrent.futures import ThreadPoolExecutor
 import zenoh
 
 from models.errors import RotorwatchError
+from models.signals.link import LinkSettings
 from service.stream.transport import Link
 
 _NEWS = "news"
 _THREADS = 4
 _ANSWER_S = 15.0
+_DROPPED_US = 1_000_000
 
 
 class NoAnswerError(RotorwatchError):
     """Nobody answered, or not in time."""
+
+
+class RelaySettings(LinkSettings):
+    """Those of a router within a monitor, by which streams come to the shards."""
+
+    def zenoh_items(self) -> dict[str, str]:
+        """As `LinkSettings.zenoh_items`; what a publisher has has kept comes at once, and is waited for."""
+        items = super().zenoh_items()
+        items["transport/link/tx/queue/congestion_control/drop/wait_before_drop"] = str(_DROPPED_US)
+        return items
 
 
 class ShardLink:
