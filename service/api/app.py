@@ -29,6 +29,7 @@ from service.api.routes.snapshots import add_snapshot_routes
 from service.api.routes.tokens import add_token_routes
 from service.api.samples import SampleReader
 from service.api.views import PLACE, MachineName, ServiceView, SiteName, found_machine
+from service.stream.monitored import NoAnswerError
 
 _DESCRIPTION = """Health of rotating machines: which parameter changed, by how much, how sure.
 
@@ -92,6 +93,11 @@ def create_app(service: ServiceView, guard: Guard) -> FastAPI:
         redoc_url=None,
     )
     add_problems(app)
+
+    @app.exception_handler(NoAnswerError)
+    async def not_monitored(request: Request, error: Exception) -> JSONResponse:
+        return problem_answer(request, 503, str(error))
+
     _add_machine_routes(app, service, guard)
     add_history_routes(app, service, guard)
     add_operation_routes(app, service, guard)

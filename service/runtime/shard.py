@@ -4,6 +4,8 @@ It goes on until the other one says so or ends, and is told apart from a monitor
 """
 
 import signal
+import threading
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -19,10 +21,14 @@ from service.settings.service import ServiceSettings
 from service.stream.shard_link import ShardLink
 from service.stream.transport import Link
 from service.stream.worker import MachineWorker
-from service.terminal.logs import configure_logging
+from service.terminal.logs import configure_logging, logger
 from service.terminal.memory import prepare_memory
 
 _STATUS_S = 1.0
+_PATIENCE_S = 15.0
+"""For SQLite's one lock, which other processes hold in turn."""
+
+_log = logger(part="shard")
 
 
 def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> None:
@@ -48,14 +54,16 @@ def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> 
             shard = _Shard(settings, inner, starting)
             undo = starting.pop_all()
     except Exception as error:  # whatever it is, somebody waits to hear it
+        if not isinstance(error, RotorwatchError):
+            _log.exception("a shard cannot begin")
         connection.send_bytes(f"{type(error).__name__}\n{error}".encode())
         return
     connection.send_bytes(b"")
-    while not connection.poll(_STATUS_S):
-        shard.tell_all()
     lost = ""
     try:
-        undo.close()
+        with undo:
+            while not connection.poll(_STATUS_S):
+                shard.tell_all()
     except RotorwatchError as error:
         lost = str(error)
     lost = "; ".join(filter(None, (lost, shard.refused())))
@@ -69,10 +77,12 @@ class _Shard:
     """The machines of this process, and what is told of them."""
 
     def __init__(self, settings: ServiceSettings, inner: str, undo: ExitStack) -> None:
-        self._store = Store(settings.history.database, settings.history.retention, shared=True)
+        self._store = Store(settings.history.database, settings.history.retention, timeout_s=_PATIENCE_S, shared=True)
         machines = LocalMachines(settings, self._store, self)
         self.refused = machines.refused
+        self._machines = machines
         self._told: dict[str, int] = {}
+        self._looking = threading.Lock()
         self._link: ShardLink | None = None
         machines.connect(undo)
         self._store.open()
@@ -86,7 +96,7 @@ class _Shard:
 
     def health(self, health: Health) -> None:
         """Hear that a machine's health has changed."""
-        self._tell(f"{health.site}/{health.machine}", health)
+        self._tell(f"{health.site}/{health.machine}", changed=True)
 
     def wake(self) -> None:
         """Hear that alarm events were committed."""
@@ -99,20 +109,24 @@ class _Shard:
         for place in self._workers:
             self._tell(place)
 
-    def _tell(self, place: str, health: Health | None = None) -> None:
+    def _tell(self, place: str, *, changed: bool = False) -> None:
         if self._link is not None:
-            self._link.tell(self._standing(place, health).model_dump_json().encode())
+            self._link.tell(self._standing(place, changed=changed).model_dump_json().encode())
 
-    def _standing(self, place: str, health: Health | None) -> Standing:
+    def _standing(self, place: str, *, changed: bool) -> Standing:
         worker = self._workers[place]
-        sequence = self._told[place] = worker.history.last_sequence()
-        status = replace(worker.status(), history_trouble=self._store.trouble)
-        return Standing(place=place, sequence=sequence, status=status, health=health)
+        with self._looking:  # so that what has a larger number was seen later
+            number = time.monotonic_ns()  # goes on when this process is started again
+            health = worker.health() if changed else None
+            sequence = self._told[place] = worker.history.last_sequence()
+            status = worker.status()
+        status = replace(status, history_trouble=self._store.trouble, session_open=self._machines.session_open)
+        return Standing(place=place, number=number, sequence=sequence, status=status, health=health)
 
     def _answer(self, place: str, content: bytes) -> bytes:
         question = Question.model_validate_json(content)
         answers: dict[str, Callable[[MachineWorker], bytes]] = {
-            "standing": lambda one: self._standing(place, one.health()).model_dump_json().encode(),
+            "standing": lambda _: self._standing(place, changed=True).model_dump_json().encode(),
             "alarms": lambda one: one.alarms(include_normal=question.include_normal).model_dump_json().encode(),
             "detectable": lambda one: one.detectable(question.change).model_dump_json().encode(),
             "operate": lambda one: EVENTS.dump_json(() if question.action is None else one.operate(question.action)),

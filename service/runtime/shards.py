@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -44,8 +45,8 @@ from service.runtime.machines import Listener
 from service.runtime.shard import run_shard
 from service.runtime.standing import EVENTS, Question, Standing, latest_from_bytes
 from service.settings.service import MachineEntry, ServiceSettings
-from service.stream.monitored import MachineStatus
-from service.stream.shard_link import NoAnswerError, RelaySettings, ask, hear
+from service.stream.monitored import MachineStatus, NoAnswerError
+from service.stream.shard_link import RelaySettings, ask, hear
 from service.stream.transport import Link, LinkError
 from service.terminal.logs import logger
 
@@ -91,7 +92,8 @@ def _why_one(settings: ServiceSettings) -> str | None:
     link = settings.link
     if settings.history.in_memory:
         return "a history in memory cannot be shared"
-    if link.listen and (link.grants or link.passwords_file is not None or (link.tls is not None and link.tls.mutual)):
+    names = link.grants or link.user is not None or link.passwords_file is not None
+    if link.listen and (names or (link.tls is not None and link.tls.mutual)):
         return "where link.listen asks for names, run rotorwatch router with these settings and connect to it"
     return None
 
@@ -103,24 +105,30 @@ class RemoteMachine:
         self._entry = entry
         self._link = link
         self._lock = threading.Lock()
+        self._numbers = [-1, -1]  # of status and health
         self._latest: LatestData | None = None
         self._latest_s = 0.0
         self.machine = entry.load()
         self.history = store.reader(self.machine.site, self.machine.name)
         self.down = ""  # why nobody monitors it now; empty if somebody does
         self._status = MachineStatus()
+        self._taking = threading.Lock()
         self._heard_s = self._told_s = 0.0
 
     def ask_standing(self) -> None:
         """Ask for all that its shard tells."""
-        self.take(Standing.model_validate_json(self._ask(Question(about="standing"))))
+        question = Question(about="standing").model_dump_json().encode()
+        self.take(Standing.model_validate_json(ask(self._link, self.history.title, question, _ERRORS)))
 
     def take(self, standing: Standing) -> None:
-        """Take note of what its shard tells."""
-        self.history.go_on_from(standing.sequence)
-        self._status, self._told_s = standing.status, time.monotonic()
-        if standing.health is not None:
-            self._health, self._heard_s = standing.health, time.monotonic()
+        """Take note of what its shard tells, from any thread; what is older than what is known does not count."""
+        with self._taking:
+            self.history.go_on_from(standing.sequence)
+            self._told_s = time.monotonic()
+            if standing.number > self._numbers[0]:
+                self._status, self._numbers[0] = standing.status, standing.number
+            if standing.health is not None and standing.number > self._numbers[1]:
+                self._health, self._heard_s, self._numbers[1] = standing.health, self._told_s, standing.number
 
     @property
     def not_monitored(self) -> str:
@@ -167,7 +175,9 @@ class RemoteMachine:
 
     def status(self) -> MachineStatus:
         """How its monitoring is at work."""
-        return MachineStatus(trouble=why) if (why := self.not_monitored) else self._status
+        if not (why := self.not_monitored):
+            return self._status
+        return replace(self._status, trouble=why, alive=self._status.alive and not self.down)
 
     def alarms(self, *, include_normal: bool = False) -> AlarmStates:
         """Return the alarms as they are now."""
@@ -189,8 +199,10 @@ class RemoteMachine:
             raise NotInTime(f"{error}; look at the alarm before trying again") from error
 
     def _ask(self, question: Question) -> bytes:
-        place = f"{self.machine.site}/{self.machine.name}"
-        return ask(self._link, place, question.model_dump_json().encode(), _ERRORS)
+        """Ask its shard; of one that hangs or has ended nothing is asked, for whoever asks waits."""
+        if why := self.not_monitored:
+            raise NoAnswerError(f"{self.history.title}: {why}")
+        return ask(self._link, self.history.title, question.model_dump_json().encode(), _ERRORS)
 
 
 class _Shard:
@@ -218,7 +230,8 @@ class _Shard:
         said = self._received(_START_S)
         if said is None:
             self._end(0.0)
-            said = f"\nthe process of {len(self.settings.machines)} machines ended (exit {self._process.exitcode})"
+            ended = f"ended (exit {self._process.exitcode}) or was not ready in {_START_S:g} s"
+            said = f"\nthe process of {len(self.settings.machines)} machines {ended}"
         if said:
             kind, _, why = said.partition("\n")
             raise _KINDS.get(kind, RotorwatchError)(why)
@@ -248,10 +261,18 @@ class _Shard:
     def _begin(self) -> None:
         # Not a fork: threads of this process hold locks that nobody would let go of in a copy.
         context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=run_shard, args=(self.settings, self._inner, theirs))
-        self._process.start()
-        theirs.close()
+        try:
+            ours, theirs = context.Pipe()
+            with theirs:
+                process = context.Process(target=run_shard, args=(self.settings, self._inner, theirs))
+                try:
+                    process.start()
+                except OSError:
+                    ours.close()
+                    raise
+        except OSError as error:
+            raise RotorwatchError(f"the system lets no further process begin: {error.strerror or error}") from error
+        self._connection, self._process = ours, process
 
     def _end(self, patience_s: float) -> None:
         self._process.join(patience_s)
@@ -289,8 +310,9 @@ class _Shard:
                     self.ready()
                     for one in self.machines:
                         one.ask_standing()
-                except RotorwatchError as error:
-                    self._log.error("a shard could not be started again", why=str(error))
+                    self._listener.wake()  # events that were committed and not told any more
+                except Exception as error:  # whatever it is, the machines must not stay without anybody
+                    self._log.error("a shard could not be started again", exc_info=_unknown(error), why=str(error))
                     self._say(f"{why}, which failed: {error}")
                     self._stopping.wait(wait_s)
                     wait_s = min(2 * wait_s, _LONGEST_AGAIN_S)
@@ -301,17 +323,26 @@ class _Shard:
                     break
 
     def _look(self) -> None:
-        """Tell of a process that hangs, and of its end."""
+        """Tell of a process that hangs, and when it is heard again."""
         hangs = any(one.not_monitored for one in self.machines)
         if hangs != self._hangs:
             self._hangs = hangs
             self._log.error("a shard says nothing" if hangs else "a shard is heard again")
-            self._say("")
+            self._tell()
 
     def _say(self, down: str) -> None:
         for one in self.machines:
             one.down = down
+        self._tell()
+
+    def _tell(self) -> None:
+        for one in self.machines:
             self._listener.health(one.health())
+
+
+def _unknown(error: Exception) -> Exception | None:
+    """An error, unless it says by itself what is wrong."""
+    return None if isinstance(error, RotorwatchError) else error
 
 
 class Shards:
@@ -337,8 +368,9 @@ class Shards:
 
     @property
     def session_open(self) -> bool:
-        """Whether the Zenoh session is open that streams come in by."""
-        return self._router is None or self._router.is_open
+        """Whether the Zenoh sessions are open that streams come in by."""
+        opened = all(one.status().session_open for one in self._remote.values())
+        return opened and (self._router is None or self._router.is_open)
 
     def connect(self, undo: ExitStack) -> None:
         """Listen where the settings say, for the shards, and for what they tell; raises `LinkError`."""

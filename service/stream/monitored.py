@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from models.errors import RotorwatchError
 from models.machine import MachineFile
 from rotorwatch.records.alarms import AlarmCloudEvent, AlarmStates
 from rotorwatch.records.health import Health
@@ -15,6 +16,10 @@ from service.monitor.reports import Identity, Tally
 from service.recordings.recorder import RecorderStatus
 
 
+class NoAnswerError(RotorwatchError):
+    """Who monitors a machine did not answer, or not in time."""
+
+
 @dataclass(frozen=True, slots=True)
 class MachineStatus:
     """How the monitoring of a machine is at work; counts since it was started."""
@@ -22,6 +27,7 @@ class MachineStatus:
     alive: bool = False  # the thread that evaluates the blocks runs
     errors: int = 0  # blocks lost to an error inside the monitor
     last_error: str = ""
+    session_open: bool = True  # the Zenoh session that its stream comes in by
     trouble: str = ""  # why the machine is not monitored as it should be; empty if it is
     busy_s: float = 0.0  # how long the thread has been at work on the same block
     queue_blocks: int = 0  # blocks that wait for evaluation

@@ -7,16 +7,13 @@ import zenoh
 
 from models.errors import RotorwatchError
 from models.signals.link import LinkSettings
+from service.stream.monitored import NoAnswerError
 from service.stream.transport import Link
 
 _NEWS = "news"
 _THREADS = 4
 _ANSWER_S = 15.0
 _DROPPED_US = 1_000_000
-
-
-class NoAnswerError(RotorwatchError):
-    """Nobody answered, or not in time."""
 
 
 class RelaySettings(LinkSettings):

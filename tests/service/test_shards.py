@@ -166,6 +166,9 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         until(lambda: not http.get("/readyz").is_success, "that it is told")
         assert "demo/pump: the process that monitors it has said nothing" in problem(http.get("/readyz"), 503).detail
         assert pump.health().state is HealthState.NOT_EVALUABLE
+        # Nobody waits for one that hangs until it does not answer.
+        assert "has said nothing" in problem(http.get("/api/v1/machines/demo/pump/orbits"), 503).detail
+        assert http.get("/api/v1/machines/demo/lab/orbits").status_code == 200
         os.kill(second, signal.SIGCONT)
         until(lambda: bool(http.get("/readyz").is_success), "that it is heard again")
         assert pump.health().state is not HealthState.NOT_EVALUABLE
@@ -174,7 +177,10 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         assert "demo/lab: the process that monitored it ended (exit -9)" in problem(http.get("/readyz"), 503).detail
         assert lab.health().state is HealthState.ALERT  # what was raised stays in sight
         assert "is being started again" in lab.health().reason
-        assert http.get("/api/v1/machines/demo/pump/orbits").status_code == 200
+        for path in ("/orbits", "/alarms", "/detectable"):
+            assert "is being started again" in problem(http.get(f"/api/v1/machines/demo/lab{path}"), 503).detail
+            assert http.get(f"/api/v1/machines/demo/pump{path}").status_code == 200
+        assert lab.status().tally.blocks == 440  # what was counted is no less for that
         until(lambda: bool(http.get("/readyz").is_success), "a new process")
         assert second in children()
         assert len(children()) == 2
@@ -252,9 +258,13 @@ def test_how_many_processes(tmp_path: Path) -> None:
     users = tmp_path / "users"
     users.write_text("pump:secret\n", encoding="utf-8")
     users.chmod(0o600)
-    named = LinkSettings(listen=("tcp/127.0.0.1:0",), passwords_file=users)
-    with pytest.raises(MachineFileError, match=r"expected 1: where link.listen asks for names"):
-        shard_count(plan_for(tmp_path, 2).model_copy(update={"link": named}))
+    listen = ("tcp/127.0.0.1:0",)
+    for named in (
+        LinkSettings(listen=listen, passwords_file=users),
+        LinkSettings(listen=listen, connect=listen, user="pump", password_file=users),
+    ):
+        with pytest.raises(MachineFileError, match=r"expected 1: where link.listen asks for names"):
+            shard_count(plan_for(tmp_path, 2).model_copy(update={"link": named}))
 
 
 def test_a_machine_that_cannot_be_monitored_is_named(tmp_path: Path) -> None:
