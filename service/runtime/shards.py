@@ -50,7 +50,7 @@ from service.stream.shard_link import RelaySettings, ask, hear
 from service.stream.transport import Link, LinkError
 from service.terminal.logs import logger
 
-_OF_A_SHARD = 10
+_OF_A_SHARD = 15
 """Machines from which on another process is worth its memory."""
 _START_S = 120.0
 _STOP_S = 60.0

@@ -157,7 +157,7 @@ class ShardSettings(BaseModel, extra="forbid", frozen=True):
         default=None,
         ge=1,
         le=1024,
-        description="how many there are; left out, one for every ten machines, and no more than there are cores",
+        description="how many there are; left out, one for every fifteen machines, and no more than there are cores",
     )
 
 

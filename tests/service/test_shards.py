@@ -250,7 +250,7 @@ def test_how_many_processes(tmp_path: Path) -> None:
     plan = plan_for(tmp_path, None)
     assert shard_count(plan) == 1  # few machines
     cores = len(os.sched_getaffinity(0))
-    assert shard_count(plan.model_copy(update={"machines": 20 * plan.machines})) == min(cores, 4)
+    assert shard_count(plan.model_copy(update={"machines": 30 * plan.machines})) == min(cores, 4)
     assert shard_count(plan_for(tmp_path, 5)) == 2  # no more than machines
     in_memory = plan_for(tmp_path, 2).model_copy(update={"history": HistorySettings(url="sqlite:///:memory:")})
     with pytest.raises(MachineFileError, match=r"shards.count is 2, expected 1: a history in memory"):
