@@ -157,6 +157,7 @@ class RemoteMachine:
     def latest(self) -> LatestData:
         """What its monitor holds; asked for twice a second at most."""
         with self._lock:
+            self._check()
             if self._latest is None or time.monotonic() - self._latest_s > _LATEST_S:
                 self._latest, self._latest_s = latest_from_bytes(self._ask(Question(about="latest"))), time.monotonic()
             return self._latest
@@ -200,9 +201,12 @@ class RemoteMachine:
 
     def _ask(self, question: Question) -> bytes:
         """Ask its shard; of one that hangs or has ended nothing is asked, for whoever asks waits."""
+        self._check()
+        return ask(self._link, self.history.title, question.model_dump_json().encode(), _ERRORS)
+
+    def _check(self) -> None:
         if why := self.not_monitored:
             raise NoAnswerError(f"{self.history.title}: {why}")
-        return ask(self._link, self.history.title, question.model_dump_json().encode(), _ERRORS)
 
 
 class _Shard:

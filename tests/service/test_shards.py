@@ -20,8 +20,9 @@ from rotorwatch.records.health import Health, HealthState
 from rotorwatch.records.monitor import Readiness
 from rotorwatch.records.operations import OperationDone
 from service.analysis.snapshots.heading import LatestData
+from service.history.file import lock_file
 from service.runtime.runtime import Runtime, running
-from service.runtime.shards import shard_count
+from service.runtime.shards import Shards, shard_count
 from service.runtime.standing import latest_from_bytes, latest_to_bytes
 from service.settings.service import HistorySettings, MachineEntry, ServiceSettings, ShardSettings
 from simulator.scenario import parse_fault
@@ -160,8 +161,8 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         until(lambda: lab.health().quality.accepted_blocks == 440, "the first blocks")
         until(lambda: lab.health().state is HealthState.ALERT, "the alarm")
         before = lab.history.events(after=-1)
-        # The first process has the first machine.
-        first, second = children()
+        assert isinstance(runtime._machines, Shards)
+        first, second = (shard._process.pid or 0 for shard in runtime._machines._shards)  # of lab and of pump
         os.kill(second, signal.SIGSTOP)
         until(lambda: not http.get("/readyz").is_success, "that it is told")
         assert "demo/pump: the process that monitors it has said nothing" in problem(http.get("/readyz"), 503).detail
@@ -173,6 +174,16 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
         until(lambda: bool(http.get("/readyz").is_success), "that it is heard again")
         assert pump.health().state is not HealthState.NOT_EVALUABLE
         os.kill(first, signal.SIGKILL)
+        # The machine's history is held until all has been looked at: the next process waits for it.
+        lock = tmp_path / "history.sqlite.demo.lab.lock"
+        held: list[int] = []
+
+        def taken() -> bool:
+            if (found := lock_file(lock)) is not None:
+                held.append(found)
+            return bool(held)
+
+        until(taken, "the lock")
         until(lambda: not http.get("/readyz").is_success, "that it is told")
         assert "demo/lab: the process that monitored it ended (exit -9)" in problem(http.get("/readyz"), 503).detail
         assert lab.health().state is HealthState.ALERT  # what was raised stays in sight
@@ -181,6 +192,7 @@ def test_a_process_that_is_killed_is_started_again_and_goes_on(tmp_path: Path) -
             assert "is being started again" in problem(http.get(f"/api/v1/machines/demo/lab{path}"), 503).detail
             assert http.get(f"/api/v1/machines/demo/pump{path}").status_code == 200
         assert lab.status().tally.blocks == 440  # what was counted is no less for that
+        os.close(held[0])
         until(lambda: bool(http.get("/readyz").is_success), "a new process")
         assert second in children()
         assert len(children()) == 2
