@@ -20,7 +20,7 @@ class RelaySettings(LinkSettings):
     """Those of a router within a monitor, by which streams come to the shards."""
 
     def zenoh_items(self) -> dict[str, str]:
-        """As `LinkSettings.zenoh_items`; what a publisher has has kept comes at once, and is waited for."""
+        """As `LinkSettings.zenoh_items`; what a publisher has kept comes at once, and is waited for."""
         items = super().zenoh_items()
         items["transport/link/tx/queue/congestion_control/drop/wait_before_drop"] = str(_DROPPED_US)
         return items

@@ -56,11 +56,11 @@ def test_any_text_is_no_token_and_breaks_nothing(text: str) -> None:
     assert not token_is_valid(made()[0], parse_token(text), 1)
 
 
-@given(st.data())
-def test_one_wrong_character_is_enough(data: st.DataObject) -> None:
+@given(place=st.integers(0, 58), other=st.sampled_from([*ALPHABET, "_", "-", " ", "\n", "é", "\0"]))
+def test_one_wrong_character_is_enough(place: int, other: str) -> None:
     record, text = made()
-    place = data.draw(st.integers(0, len(text) - 1))
-    other = data.draw(st.sampled_from([*ALPHABET, "_", "-", " ", "\n", "é", "\0"]).filter(lambda c: c != text[place]))
+    assert len(text) == 59
+    other = "!" if other == text[place] else other
     for wrong in (text[:place] + other + text[place + 1 :], text[:place], text + other, other + text):
         assert not token_is_valid(record, parse_token(wrong), 1)
     assert token_is_valid(record, parse_token(text), 1)
