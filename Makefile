@@ -44,7 +44,7 @@ $(RUN): pyproject.toml constraints.txt
 
 $(READY): $(RUN)
 	@echo "installing what training and the checks need ..."
-	@$(INSTALL) '.[train,dev,io,postgres]'
+	@$(INSTALL) '.[train,dev,io,postgres,fleet]'
 	@touch $@
 
 demo: $(RUN)

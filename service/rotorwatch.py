@@ -91,17 +91,57 @@ def run(
     A simulation as fast as this computer can, started with [cyan]rotorsim publish k_by --pace max[/cyan] elsewhere:
     [cyan]rotorwatch run --when-full wait[/cyan]
     """
+    _prepare()
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+
+    settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
+    _serve(settings, config)
+
+
+@app.command()
+def fleet(
+    config: Annotated[
+        Path, typer.Option("--config", metavar="FILE", help="Settings (TOML), the same files on every computer.")
+    ],
+    address: Annotated[
+        str,
+        typer.Option("--address", metavar="ADDRESS", help="Ray cluster: auto is that of this computer, or HOST:PORT."),
+    ] = "auto",
+) -> None:
+    """Monitor the machines of a fleet on the computers of a Ray cluster, until Ctrl-C.
+
+    Ray gives each group of machines a computer with room, and another one when that is lost; this process serves HTTP,
+    the page, metrics and webhooks for all of them. It needs a history in PostgreSQL, Zenoh routers that sensors and
+    computers connect to, and an endpoint of its own: see "Fleets" in docs/service.md.
+
+    [bold]Example[/bold]
+
+    On the first computer, and with its address on each of the others:
+    [cyan]ray start --head --disable-usage-stats[/cyan]
+    [cyan]ray start --address 10.0.0.5:6379 --disable-usage-stats[/cyan]
+    Then on the first one:
+    [cyan]rotorwatch fleet --address auto --config fleet.toml[/cyan]
+    """
+    _prepare()
+    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
+
+    _serve(load_settings(config), config, address)
+
+
+def _prepare() -> None:
     check_address_space()
     prepare_numerics()
     raise_file_limit()
-    from service.runtime.runtime import running  # noqa: PLC0415  # must see the variables set above
-    from service.settings.service import load_settings  # noqa: PLC0415  # keeps --help quick
-    from service.terminal.logs import configure_logging  # noqa: PLC0415
+
+
+def _serve(settings: "ServiceSettings", config: Path | None, ray_address: str | None = None) -> None:
+    """Monitor until Ctrl-C."""
+    from service.runtime.runtime import running  # noqa: PLC0415  # must see the variables that were set
+    from service.terminal.logs import configure_logging  # noqa: PLC0415  # keeps --help quick
     from service.terminal.stopping import stop_request  # noqa: PLC0415
 
-    settings = _overridden(load_settings(config), machine, link, listen, connect, http_port, when_full, namespace)
     configure_logging(settings.log)
-    with stop_request() as stop, running(settings) as service:
+    with stop_request() as stop, running(settings, ray_address) as service:
         for worker in service.machines():
             networks = worker.identity["bundle"] or "none: the equations are not evaluated"
             typer.echo(f"machine {worker.machine.site}/{worker.machine.name}, bundle {networks}")

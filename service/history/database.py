@@ -39,6 +39,9 @@ _NEEDED = ("machines", "alarm_events", "checkpoints", "checkpoint_parts", "serie
 _POSTGRESQL = {"application_name": "rotorwatch", "tcp_user_timeout": 25_000} | {
     "keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3
 }  # fmt: skip
+_SERVER_KEEPALIVES = {
+    "tcp_keepalives_idle": 5, "tcp_keepalives_interval": 3, "tcp_keepalives_count": 3, "tcp_user_timeout": 15_000
+}  # fmt: skip
 _FORMS = "expected sqlite:////folder/file, sqlite:///:memory: or postgresql://user:password@host/database"
 
 
@@ -365,6 +368,9 @@ class Database:
             _ = record
             # The server ends by itself what `_break_off` has turned away from.
             connection.execute(f"SET statement_timeout = {round(1000 * self.answer_s)}")
+            # So that it lets go of the locks of a computer that was lost; without effect on a socket of its own.
+            for name, value in _SERVER_KEEPALIVES.items():
+                connection.execute(f"SET {name} = {value}")
             connection.commit()
 
         @event.listens_for(engine, "checkout")

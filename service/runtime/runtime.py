@@ -30,6 +30,7 @@ from service.history.shared import AuditLog
 from service.history.store import Store
 from service.recordings.catalogue import Catalogue
 from service.runtime.machines import LocalMachines
+from service.runtime.processes import OneComputer
 from service.runtime.shards import Shards, shard_count
 from service.settings.service import ServiceSettings
 from service.stream.monitored import Monitored
@@ -43,13 +44,18 @@ class Runtime:
 
     Building it reads every file; nothing runs or listens before `start`.
 
+    Parameters
+    ----------
+    ray_address : str, optional
+        Ray cluster whose computers share the machines; without it, this computer monitors them.
+
     Raises
     ------
     MachineFileError, BundleError
         If a machine file or bundle cannot be used.
     """
 
-    def __init__(self, settings: ServiceSettings) -> None:
+    def __init__(self, settings: ServiceSettings, ray_address: str | None = None) -> None:
         self.settings = settings
         self._monitored: Sequence[Monitored] = ()
         self._history_open = False
@@ -62,11 +68,16 @@ class Runtime:
         directory = settings.recording.directory
         self.catalogue = None if directory is None else Catalogue(Path(directory))
         self.replays = ReplayDesk(settings, self.catalogue)
-        count = shard_count(settings)
         self._machines: LocalMachines | Shards
-        self._machines = (
-            LocalMachines(settings, self.store, self) if count == 1 else Shards(settings, count, self.store, self)
-        )
+        if ray_address is not None:
+            from service.runtime.fleet import Fleet, fleet_count  # noqa: PLC0415  # needs what few have installed
+
+            fleet = fleet_count(settings), Fleet(settings, ray_address)
+            self._machines = Shards(settings, *fleet, self.store, self)
+        elif (count := shard_count(settings)) == 1:
+            self._machines = LocalMachines(settings, self.store, self)
+        else:
+            self._machines = Shards(settings, count, OneComputer(settings.link), self.store, self)
         self._server: HttpServer | None = None
         self._undo = ExitStack()
 
@@ -195,7 +206,7 @@ class Runtime:
 
 
 @contextmanager
-def running(settings: ServiceSettings) -> Iterator[Runtime]:
+def running(settings: ServiceSettings, ray_address: str | None = None) -> Iterator[Runtime]:
     """Run the service inside a ``with`` block.
 
     Raises
@@ -203,7 +214,7 @@ def running(settings: ServiceSettings) -> Iterator[Runtime]:
     RotorwatchError
         As `Runtime` and `Runtime.start`.
     """
-    runtime = Runtime(settings)
+    runtime = Runtime(settings, ray_address)
     runtime.start()
     try:
         yield runtime

@@ -3,9 +3,9 @@
 It goes on until the other one says so or ends, and is told apart from a monitor by nobody on the network.
 """
 
-import signal
 import threading
 import time
+import uuid
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -31,21 +31,19 @@ _PATIENCE_S = 15.0
 _log = logger(part="shard")
 
 
-def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> None:
+def run_shard(settings: ServiceSettings, inner: LinkSettings, connection: Connection) -> None:
     """Monitor machines until something comes over the connection, or its other end is closed.
 
-    Says over it, once it is ready, an empty text, or else the kind of an error and, after a line break, what is wrong;
-    and at its end what was lost.
+    Says over it, once it is ready, what its answers and news are known by, or else the kind of an error and, after a
+    line break, what is wrong; and at its end what was lost.
 
     Parameters
     ----------
     settings : ServiceSettings
         With the machines of this process alone.
-    inner : str
-        Zenoh endpoint of the process that serves them.
+    inner : LinkSettings
+        How to connect to the process that serves them.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):  # meant for that process, which decides when this one ends
-        signal.signal(number, signal.SIG_IGN)
     prepare_memory()
     configure_logging(settings.log)
     undo = ExitStack()
@@ -58,7 +56,7 @@ def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> 
             _log.exception("a shard cannot begin")
         connection.send_bytes(f"{type(error).__name__}\n{error}".encode())
         return
-    connection.send_bytes(b"")
+    connection.send_bytes(shard.process.encode())
     lost = ""
     try:
         with undo:
@@ -76,7 +74,8 @@ def run_shard(settings: ServiceSettings, inner: str, connection: Connection) -> 
 class _Shard:
     """The machines of this process, and what is told of them."""
 
-    def __init__(self, settings: ServiceSettings, inner: str, undo: ExitStack) -> None:
+    def __init__(self, settings: ServiceSettings, inner: LinkSettings, undo: ExitStack) -> None:
+        self.process = uuid.uuid4().hex
         self._store = Store(settings.history.database, settings.history.retention, timeout_s=_PATIENCE_S, shared=True)
         machines = LocalMachines(settings, self._store, self)
         self.refused = machines.refused
@@ -88,9 +87,9 @@ class _Shard:
         self._store.open()
         undo.callback(self._store.close)
         self._workers = {one.history.title: one for one in machines.open(undo)}
-        link = Link(LinkSettings(mode="client", connect=(inner,)))
+        link = Link(inner)
         undo.callback(link.close)
-        self._link = ShardLink(link, tuple(self._workers), self._answer)
+        self._link = ShardLink(link, self.process, tuple(self._workers), self._answer)
         undo.callback(self._link.close)
         machines.start(undo)
 
@@ -116,12 +115,14 @@ class _Shard:
     def _standing(self, place: str, *, changed: bool) -> Standing:
         worker = self._workers[place]
         with self._looking:  # so that what has a larger number was seen later
-            number = time.monotonic_ns()  # goes on when this process is started again
+            number = time.monotonic_ns()
             health = worker.health() if changed else None
             sequence = self._told[place] = worker.history.last_sequence()
             status = worker.status()
         status = replace(status, history_trouble=self._store.trouble, session_open=self._machines.session_open)
-        return Standing(place=place, number=number, sequence=sequence, status=status, health=health)
+        return Standing(
+            process=self.process, place=place, number=number, sequence=sequence, status=status, health=health
+        )
 
     def _answer(self, place: str, content: bytes) -> bytes:
         question = Question.model_validate_json(content)

@@ -28,8 +28,9 @@ class Standing(BaseModel):
 
     model_config = ConfigDict(frozen=True, arbitrary_types_allowed=True)
 
+    process: str
     place: str
-    number: int  # larger than those of all that was seen of the machine before
+    number: int  # larger than those of all that this process saw of the machine before
     sequence: int  # of the latest alarm event
     status: MachineStatus
     health: Health | None = None

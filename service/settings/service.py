@@ -9,13 +9,13 @@ import os
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, PydanticBaseSettingsSource, SettingsConfigDict, SettingsError
 
 from models.errors import MachineFileError
 from models.machine import MachineFile, load_machine_file
 from models.mistakes import in_folder, mistakes, read_toml
-from models.signals.link import LinkSettings
+from models.signals.link import LinkSettings, TlsSettings, endpoint_fault
 from service.history.records import Retention
 from service.settings.access import AccessSettings, check_access
 from service.settings.webhooks import WebhookSettings, repeated_name
@@ -161,6 +161,23 @@ class ShardSettings(BaseModel, extra="forbid", frozen=True):
     )
 
 
+class FleetSettings(BaseModel, extra="forbid", frozen=True):
+    """Where shards on other computers reach the process that serves their machines; only for ``rotorwatch fleet``."""
+
+    listen: str = Field(
+        description='endpoint that all computers of the fleet reach, as "tcp/10.0.0.5:7448"; whoever connects has to '
+        "know a password that is made anew at each start"
+    )
+    tls: TlsSettings | None = Field(default=None, description='certificates, if listen begins with "tls/"')
+
+    @field_validator("listen")
+    @classmethod
+    def _endpoint(cls, listen: str) -> str:
+        if (fault := endpoint_fault(listen)) is not None:
+            raise ValueError(fault)
+        return listen
+
+
 class ReplaySettings(BaseModel, extra="forbid", frozen=True):
     """Replays of recordings that are started over HTTP; results are kept below the directory of the recordings."""
 
@@ -200,6 +217,7 @@ class ServiceSettings(BaseSettings):
     queue: QueueSettings = Field(default=QueueSettings(), description="blocks that wait for evaluation")
     history: HistorySettings = Field(default=HistorySettings(), description="reports, alarms, restarts")
     shards: ShardSettings = Field(default=ShardSettings(), description="processes that share the machines")
+    fleet: FleetSettings | None = Field(default=None, description="shards on the computers of a Ray cluster")
     recording: RecordingSettings = Field(default=RecordingSettings(), description="recordings; off without directory")
     replay: ReplaySettings = Field(default=ReplaySettings(), description="replays over HTTP")
     webhooks: tuple[WebhookSettings, ...] = Field(default=(), description="who is told of alarm events")

@@ -1,16 +1,19 @@
 """Between processes that share the machines of one monitor: a Zenoh session of their own, which nobody else reaches."""
 
+import json
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import zenoh
+from pydantic import Field
 
 from models.errors import RotorwatchError
 from models.signals.link import LinkSettings
 from service.stream.monitored import NoAnswerError
 from service.stream.transport import Link
 
-_NEWS = "news"
+_NEWS, _HEARS = "news", "hears"
 _THREADS = 4
 _ANSWER_S = 15.0
 _DROPPED_US = 1_000_000
@@ -26,6 +29,19 @@ class RelaySettings(LinkSettings):
         return items
 
 
+class KnownSettings(LinkSettings):
+    """Those of a program that was told a password, which is in no file."""
+
+    name: str
+    secret: str = Field(repr=False)
+
+    def zenoh_items(self) -> dict[str, str]:
+        """As `LinkSettings.zenoh_items`."""
+        place = "transport/auth/usrpwd"
+        known = {f"{place}/user": json.dumps(self.name), f"{place}/password": json.dumps(self.secret)}
+        return super().zenoh_items() | known
+
+
 class ShardLink:
     """The side of the process that monitors machines.
 
@@ -33,6 +49,8 @@ class ShardLink:
     ----------
     link : Link
         Open session; must outlive this object.
+    process : str
+        Where questions are asked: below it, of ``process/site/machine``.
     places : sequence of str
         ``site/machine`` of what it monitors.
     answer : callable
@@ -40,11 +58,16 @@ class ShardLink:
         kind.
     """
 
-    def __init__(self, link: Link, places: tuple[str, ...], answer: Callable[[str, bytes], bytes]) -> None:
+    def __init__(
+        self, link: Link, process: str, places: tuple[str, ...], answer: Callable[[str, bytes], bytes]
+    ) -> None:
         self._news = link.session.declare_publisher(_NEWS, congestion_control=zenoh.CongestionControl.BLOCK)
         self._answer = answer
         self._pool = ThreadPoolExecutor(_THREADS, "answer")  # one that takes long holds up no other
-        self._declared = [link.session.declare_queryable(place, link.guarded(self._asked)) for place in places]
+        self._declared = [
+            link.session.declare_queryable(f"{process}/{place}", link.guarded(self._asked)) for place in places
+        ]
+        ask(link, _HEARS, b"")  # answered by whoever knows by then what was declared here
 
     def tell(self, content: bytes) -> None:
         """Tell the process that serves the machines."""
@@ -62,7 +85,8 @@ class ShardLink:
     def _reply(self, query: zenoh.Query) -> None:
         with query:
             try:
-                content = self._answer(str(query.key_expr), b"" if query.payload is None else query.payload.to_bytes())
+                place = str(query.key_expr).partition("/")[2]
+                content = self._answer(place, b"" if query.payload is None else query.payload.to_bytes())
             except RotorwatchError as error:
                 query.reply_err(str(error), encoding=type(error).__name__)
             except Exception as error:  # whoever asked must not wait for an answer that does not come
@@ -77,15 +101,25 @@ def hear(link: Link, callback: Callable[[bytes], None]) -> Callable[[], object]:
     def take(sample: zenoh.Sample) -> None:
         callback(sample.payload.to_bytes())
 
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, b"")
+
+    undo = ExitStack()
     # Indirect: what is heard is a lot to read, and Zenoh's own threads are needed meanwhile.
-    return link.session.declare_subscriber(_NEWS, zenoh.handlers.Callback(link.guarded(take), indirect=True)).undeclare
+    heard = zenoh.handlers.Callback(link.guarded(take), indirect=True)
+    undo.callback(link.session.declare_subscriber(_NEWS, heard).undeclare)
+    undo.callback(link.session.declare_queryable(_HEARS, link.guarded(answer)).undeclare)
+    return undo.close
 
 
-def ask(link: Link, place: str, question: bytes, errors: tuple[type[RotorwatchError], ...] = ()) -> bytes:
+def ask(link: Link, key: str, question: bytes, errors: tuple[type[RotorwatchError], ...] = ()) -> bytes:
     """Ask the process that monitors a machine.
 
     Parameters
     ----------
+    key : str
+        ``process/site/machine``.
     errors : tuple of type
         Kinds of error that are raised as what they were; others as `RotorwatchError`.
 
@@ -94,7 +128,7 @@ def ask(link: Link, place: str, question: bytes, errors: tuple[type[RotorwatchEr
     NoAnswerError
         If there is no answer in 15 s.
     """
-    for reply in link.session.get(place, payload=question, timeout=_ANSWER_S):
+    for reply in link.session.get(key, payload=question, timeout=_ANSWER_S):
         if reply.ok is not None:
             return reply.ok.payload.to_bytes()
         if reply.err is not None:
@@ -104,4 +138,4 @@ def ask(link: Link, place: str, question: bytes, errors: tuple[type[RotorwatchEr
                 raise kinds[str(reply.err.encoding)](text)
             if text != "Timeout":
                 raise RotorwatchError(text)
-    raise NoAnswerError(f"{place}: the process that monitors it does not answer")
+    raise NoAnswerError(f"{key.partition('/')[2]}: the process that monitors it does not answer")

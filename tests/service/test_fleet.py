@@ -1,0 +1,138 @@
+"""Shards on the computers of a Ray cluster: one that is lost, one that comes, and settings that are none of a fleet."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from ray.cluster_utils import Cluster
+from typer.testing import CliRunner
+
+from models.errors import BundleError, MachineFileError
+from models.signals.block import SampleBlock
+from models.signals.link import LinkSettings
+from rotorwatch.records.health import HealthState
+from service.rotorwatch import app
+from service.runtime.fleet import better_place, fleet_count
+from service.runtime.runtime import Runtime, running
+from service.runtime.shards import Shards
+from service.settings.service import FleetSettings, HistorySettings, MachineEntry, ServiceSettings
+from service.stream.transport import route
+from simulator.scenario import parse_fault
+from tests.service.live import Feed, endpoint, open_session, scenario_blocks, until
+from tests.service.postgres import postgres_server
+from tests.service.test_shards import SECONDS, plan_for
+
+
+def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
+    """Two machines, each in a shard of its own if there are two."""
+    plan = plan_for(folder, count)
+    changed = {
+        "link": LinkSettings(mode="client", connect=plan.link.listen),
+        "history": HistorySettings(url=database),
+        "fleet": FleetSettings(listen=endpoint()),
+    }
+    return plan.model_copy(update=changed)
+
+
+@contextmanager
+def cluster_of(computers: int) -> Iterator[Cluster]:
+    """A Ray cluster of so many, each with a core, beside one without any; all are this computer."""
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    try:
+        for _ in range(computers):
+            cluster.add_node(num_cpus=1)
+        yield cluster
+    finally:
+        cluster.shutdown()  # type: ignore[no-untyped-call]
+
+
+def computers_of(runtime: Runtime) -> list[str]:
+    """Where the shards run; empty for one that does not."""
+    assert isinstance(runtime._machines, Shards)
+    return [shard.process.computer for shard in runtime._machines._shards]  # type: ignore[attr-defined]  # actors
+
+
+def test_a_computer_that_is_lost_and_one_that_comes(tmp_path: Path) -> None:
+    blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
+    with postgres_server() as server, cluster_of(2) as cluster:
+        plan = fleet_plan(tmp_path, server.new_database("fleet"))
+        at = plan.link.connect[0]
+        broken = MachineEntry(file=plan.machines[1].file, bundle=str(tmp_path / "nothing"))
+        failed = Runtime(plan.model_copy(update={"machines": (plan.machines[0], broken)}), cluster.address)
+        with route(LinkSettings(listen=(at,))), pytest.raises(BundleError, match="nothing: not a bundle"):
+            failed.start()
+        with (
+            route(LinkSettings(listen=(at,))),
+            running(plan, cluster.address) as runtime,
+            open_session(at, "client") as session,
+        ):
+            machines = runtime.machines()
+            feeds = [Feed(session, one.machine) for one in machines]
+
+            def fed(chosen: Sequence[SampleBlock], counts: Callable[[int], bool]) -> None:
+                for feed in feeds:
+                    for block in chosen:
+                        feed.put(block)
+                for one in machines:
+                    until(lambda: counts(one.status().tally.blocks), f"blocks of {one.machine.name}")  # noqa: B023
+
+            fed(blocks[:440], lambda count: count == 440)
+            until(lambda: all(one.health().state is HealthState.ALERT for one in machines), "the alarms")
+            before = [one.history.events(after=-1) for one in machines]
+            there = computers_of(runtime)
+            assert len(set(there)) == 2
+            lost = next(node for node in cluster.worker_nodes if node.node_id == there[1])
+            cluster.remove_node(lost, allow_graceful=False)
+            until(lambda: not runtime.readiness().ready, "that it is told")
+            assert "its computer was lost and is being started again" in machines[1].health().reason
+            assert machines[1].health().state is HealthState.ALERT  # what was raised stays in sight
+            until(lambda: runtime.readiness().ready, "that it goes on")
+            assert computers_of(runtime) == [there[0], there[0]]
+            assert "00:42" not in machines[0].health().restart
+            assert machines[1].health().restart.startswith("went on where it stood at 2026-01-01T00:00:42")
+            cluster.add_node(num_cpus=1)
+            until(lambda: len(set(computers_of(runtime)) - {""}) == 2 and runtime.readiness().ready, "a move")
+            fed(blocks[440:], lambda count: count >= 10)
+            for one, log in zip(machines, before, strict=True):
+                after = one.history.events(after=-1)
+                assert after[: len(log)] == log
+                assert [event.sequence for event in after] == list(range(len(after)))
+                assert [event.alarm for event in after if event.kind == "raised"].count("k_by") == 1
+
+
+def test_settings_that_are_none_of_a_fleet(tmp_path: Path) -> None:
+    plan = fleet_plan(tmp_path, "postgresql://me@host/plant")
+    assert fleet_count(plan) == 2
+    many = plan.model_copy(update={"machines": 31 * plan.machines})
+    assert fleet_count(many) == 2
+    assert fleet_count(many.model_copy(update={"shards": plan.shards.model_copy(update={"count": None})})) == 5
+    for update, what in (
+        ({"fleet": None}, r"expected \[fleet\]"),
+        ({"history": HistorySettings(url=f"sqlite:///{tmp_path}/history.sqlite")}, "history.url: expected postgresql"),
+        ({"link": LinkSettings(listen=(endpoint(),))}, "link: expected connect"),
+    ):
+        with pytest.raises(MachineFileError, match=what):
+            fleet_count(plan.model_copy(update=update))
+
+
+def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text(
+        '[link]\nmode = "client"\nconnect = ["tcp/127.0.0.1:7447"]\n'
+        '[history]\nurl = "postgresql://me@127.0.0.1/plant"\n[fleet]\nlisten = "tcp/127.0.0.1:7448"\n',
+        encoding="utf-8",
+    )
+    command = ["fleet", "--config", str(tmp_path / "fleet.toml"), "--address", endpoint().removeprefix("tcp/")]
+    found = CliRunner().invoke(app, command)
+    assert found.exit_code == 1
+    assert "no Ray cluster at 127.0.0.1:" in found.output
+    assert "ray start --head" in found.output
+
+
+def test_where_a_shard_goes() -> None:
+    assert better_place([], {"a": 2.0}) is None
+    assert better_place([("a", 0.4), ("b", 0.4)], {"a": 2.0, "b": 2.0}) is None
+    assert better_place([("a", 0.4), ("a", 0.4), ("b", 0.4)], {"a": 2.0, "b": 2.0}) is None  # it would be the same
+    assert better_place([("a", 0.4)] * 3 + [("b", 0.4)], {"a": 2.0, "b": 2.0, "c": 2.0}) == (0, "c")
+    assert better_place([("a", 0.4)] * 2, {"a": 8.0, "b": 0.5}) is None  # a small one would be fuller
+    assert better_place([("lost", 0.4), ("a", 0.4)], {"a": 2.0, "b": 2.0}) is None
