@@ -51,7 +51,9 @@ class RemoteMachine:
         self.down = ""  # why nobody monitors it now; empty if somebody does
         self._status = MachineStatus()
         self._taking = threading.Lock()
-        self._heard_s = self._told_s = 0.0
+        self._told_s = 0.0
+        self._data_age_s: float | None = None
+        self._accepted = 0
 
     def follow(self, process: str) -> None:
         """Believe this process from now on, and ask for all that it tells."""
@@ -65,11 +67,12 @@ class RemoteMachine:
             if standing.process != self._process:  # one that was given up and does not know it
                 return
             self.history.go_on_from(standing.sequence)
-            self._told_s = time.monotonic()
             if standing.number > self._numbers[0]:
+                self._told_s = time.monotonic()
                 self._status, self._numbers[0] = standing.status, standing.number
+                self._data_age_s, self._accepted = standing.data_age_s, standing.accepted_blocks
             if standing.health is not None and standing.number > self._numbers[1]:
-                self._health, self._heard_s, self._numbers[1] = standing.health, self._told_s, standing.number
+                self._health, self._numbers[1] = standing.health, standing.number
 
     @property
     def not_monitored(self) -> str:
@@ -105,11 +108,15 @@ class RemoteMachine:
 
     def health(self) -> Health:
         """Where the machine stands now, as far as it was told."""
-        health = self._health
-        age_s = health.stream.data_age_s
+        with self._taking:
+            health, age_s, told_s, accepted = self._health, self._data_age_s, self._told_s, self._accepted
         if age_s is not None:
-            age_s = round(age_s + time.monotonic() - self._heard_s, 3)
-            health = health.model_copy(update={"stream": health.stream.model_copy(update={"data_age_s": age_s})})
+            age_s = round(age_s + time.monotonic() - told_s, 3)
+        now = {
+            "stream": health.stream.model_copy(update={"data_age_s": age_s}),
+            "quality": health.quality.model_copy(update={"accepted_blocks": accepted}),
+        }
+        health = health.model_copy(update=now)
         if not (why := self.not_monitored):
             return health
         state = HealthState.NOT_EVALUABLE if health.state in _CALM else health.state

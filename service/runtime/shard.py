@@ -116,12 +116,19 @@ class _Shard:
         worker = self._workers[place]
         with self._looking:  # so that what has a larger number was seen later
             number = time.monotonic_ns()
-            health = worker.health() if changed else None
+            health = worker.health()
             sequence = self._told[place] = worker.history.last_sequence()
             status = worker.status()
         status = replace(status, history_trouble=self._store.trouble, session_open=self._machines.session_open)
         return Standing(
-            process=self.process, place=place, number=number, sequence=sequence, status=status, health=health
+            process=self.process,
+            place=place,
+            number=number,
+            sequence=sequence,
+            status=status,
+            data_age_s=health.stream.data_age_s,
+            accepted_blocks=health.quality.accepted_blocks,
+            health=health if changed else None,
         )
 
     def _answer(self, place: str, content: bytes) -> bytes:

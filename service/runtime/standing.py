@@ -33,6 +33,9 @@ class Standing(BaseModel):
     number: int  # larger than those of all that this process saw of the machine before
     sequence: int  # of the latest alarm event
     status: MachineStatus
+    # What is no reason to tell all of its health.
+    data_age_s: float | None
+    accepted_blocks: int
     health: Health | None = None
 
 

@@ -186,7 +186,9 @@ FOLDS = (
 
 def unfolded(page: Page, *headings: str) -> None:
     for heading in headings:
-        page.locator("window-plots summary").filter(has_text=heading).press("Enter")  # not the mouse: what is above may grow meanwhile
+        page.locator("window-plots summary").filter(has_text=heading).press(
+            "Enter"
+        )  # not the mouse: what is above may grow meanwhile
 
 
 def diameters(snapshot: OrbitSnapshot) -> list[float]:
