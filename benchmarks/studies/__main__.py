@@ -17,7 +17,7 @@ from benchmarks.studies.pages import write_page
 from benchmarks.studies.peers import peers
 from benchmarks.studies.reproduction import reproduction
 from benchmarks.studies.sensors import sensors
-from benchmarks.studies.study import Options, read, run
+from benchmarks.studies.study import Options, read, run, spread_over
 from benchmarks.studies.unknown import unknown
 from models.errors import RotorwatchError
 
@@ -47,6 +47,9 @@ def main(
     windows: Annotated[int | None, typer.Option(min=1, help="Windows per cell: 100, or 2 with --small.")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 20261122,
     processes: Annotated[int, typer.Option(min=1)] = os.cpu_count() or 1,
+    ray: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="On all cores of this Ray cluster instead.")
+    ] = None,
     small: Annotated[bool, typer.Option("--small", help="The smallest plan: a check, not a result.")] = False,
     docs: Annotated[Path | None, typer.Option(help="Write the pages of these studies into this folder.")] = None,
 ) -> None:
@@ -62,12 +65,13 @@ def main(
             raise typer.BadParameter(f"{name!r}, expected among {', '.join(STUDIES)}, or all")
     options = Options(tuple(machine or ()), windows or (2 if small else 100), seed, small)
     try:
-        for name in chosen:
-            study = STUDIES[name](options)
-            written = [run(study, options, out, processes)]
-            if docs is not None:
-                written += write_page(study, options, read(study, out), docs)
-            typer.echo("written: " + ", ".join(map(str, written)))
+        with spread_over(processes, ray) as spread:
+            for name in chosen:
+                study = STUDIES[name](options)
+                written = [run(study, options, out, spread)]
+                if docs is not None:
+                    written += write_page(study, options, read(study, out), docs)
+                typer.echo("written: " + ", ".join(map(str, written)))
     except RotorwatchError as error:
         typer.echo(f"studies: {error}", err=True)
         raise typer.Exit(2) from error

@@ -9,9 +9,11 @@ an interrupted study carries on where it stopped; windows of another plan are ne
     Options ──> Study.cells ──> measure(learned, cell, number) ──> records ──> tables (CSV), goals, charts, page
 """
 
+import importlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import groupby
@@ -75,16 +77,17 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Over:
-    """Apply a function to tasks in worker processes, in order, with a progress bar."""
+    """Apply a function to tasks, in order, with a progress bar."""
 
     name: str
-    pool: ProcessPoolExecutor | None
+    spread: Callable[..., Iterable[Any]]
+    """Like `map`."""
     progress: Callable[[str, int, int], None]
 
     def __call__(self, label: str, function: Callable[[_Task], _Result], tasks: Sequence[_Task]) -> list[_Result]:
         """Results of all tasks; the function is at the top level of a module, or a partial of such a one."""
         results = []
-        for result in map(function, tasks) if self.pool is None else self.pool.map(function, tasks):
+        for result in self.spread(function, tasks):
             results.append(result)
             self.progress(f"{self.name}: {label}", len(results), len(tasks))
         return results
@@ -108,8 +111,28 @@ class Study:
     """Whatever else records of one file must share: digests of machine and bundle."""
 
 
-def run(study: Study, options: Options, folder: Path, processes: int) -> Path:
+@contextmanager
+def spread_over(processes: int, ray_address: str | None = None) -> Iterator[Callable[..., Iterable[Any]]]:
+    """A `map` over processes of this computer, or over all cores of a Ray cluster."""
+    with ExitStack() as undo:
+        if ray_address is not None:
+            from service.runtime.fleet import join_cluster  # noqa: PLC0415  # needs what few have installed
+
+            join_cluster(ray_address, undo)
+            yield undo.enter_context(importlib.import_module("ray.util.multiprocessing").Pool()).imap
+        elif processes > 1:
+            yield undo.enter_context(ProcessPoolExecutor(processes)).map
+        else:
+            yield map
+
+
+def run(study: Study, options: Options, folder: Path, spread: Callable[..., Iterable[Any]]) -> Path:
     """Measure what is missing of a study; returns the file of records.
+
+    Parameters
+    ----------
+    spread : callable
+        From `spread_over`.
 
     Raises
     ------
@@ -134,12 +157,9 @@ def run(study: Study, options: Options, folder: Path, processes: int) -> Path:
     tasks = [(cell, n) for cell in study.cells for n in range(cell.windows) if (cell.name, n) not in done]
     if not tasks:
         return kept
-    with ProcessPoolExecutor(processes) as pool, labelled_bars(remaining=True) as progress:
-        learned = (
-            None if study.learn is None else study.learn(Over(study.name, pool if processes > 1 else None, progress))
-        )
-        measure = partial(_measured, study.measure, learned)
-        found = pool.map(measure, tasks, chunksize=4) if processes > 1 else map(measure, tasks)
+    with labelled_bars(remaining=True) as progress:
+        learned = None if study.learn is None else study.learn(Over(study.name, spread, progress))
+        found = spread(partial(_measured, study.measure, learned), tasks)
         before = sum(cell.windows for cell in study.cells) - len(tasks)
         with kept.open("a", encoding="utf-8") as out:
             for at, line in enumerate(found, start=before + 1):

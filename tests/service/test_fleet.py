@@ -8,7 +8,9 @@ import pytest
 from ray.cluster_utils import Cluster
 from typer.testing import CliRunner
 
+from benchmarks.studies.study import spread_over
 from models.errors import BundleError, MachineFileError
+from models.machine import load_machine
 from models.signals.block import SampleBlock
 from models.signals.link import LinkSettings
 from rotorwatch.records.health import HealthState
@@ -21,6 +23,7 @@ from service.stream.transport import route
 from simulator.scenario import parse_fault
 from tests.service.live import Feed, endpoint, open_session, scenario_blocks, until
 from tests.service.postgres import postgres_server
+from tests.service.replaying import recording
 from tests.service.test_shards import SECONDS, plan_for
 
 
@@ -99,6 +102,39 @@ def test_a_computer_that_is_lost_and_one_that_comes(tmp_path: Path) -> None:
                 assert after[: len(log)] == log
                 assert [event.sequence for event in after] == list(range(len(after)))
                 assert [event.alarm for event in after if event.kind == "raised"].count("k_by") == 1
+
+
+def test_an_archive_and_a_study_on_a_cluster(tmp_path: Path) -> None:
+    plan = plan_for(tmp_path, 1)
+    kits = [load_machine(entry.file) for entry in plan.machines]
+    files = [
+        str(recording(tmp_path / f"{kit.name}.mcap", scenario_blocks(30.0 + 10.0 * number), kit))
+        for number, kit in enumerate(kits)
+    ]
+    machines = "".join(f'[[machines]]\nfile = "{entry.file}"\n' for entry in plan.machines)
+    (tmp_path / "plant.toml").write_text(machines, encoding="utf-8")
+    offline = ["replay", *files, "--offline", "--config", str(tmp_path / "plant.toml")]
+    for kit in kits:
+        alone = ["--key", f"{kit.site}/{kit.name}", "--out", str(tmp_path / f"{kit.name}.jsonl")]
+        assert CliRunner().invoke(app, [*offline, *alone]).exit_code == 0
+    with cluster_of(2) as cluster:
+        command = [*offline, "--ray", cluster.address, "--out", str(tmp_path / "results")]
+        found = CliRunner().invoke(app, command)
+        assert found.exit_code == 0, found.output
+        for kit in kits:
+            there = (tmp_path / "results" / f"{kit.site}.{kit.name}.jsonl").read_text(encoding="utf-8")
+            assert there == (tmp_path / f"{kit.name}.jsonl").read_text(encoding="utf-8")
+            assert there
+        assert "2 of 2" in found.output
+        again = CliRunner().invoke(app, command)
+        assert again.exit_code == 2
+        assert "exists already; --overwrite replaces it" in again.output
+        (tmp_path / "other.toml").write_text(machines.partition("\n[[")[0], encoding="utf-8")
+        missing = CliRunner().invoke(app, [*command, "--overwrite", "--config", str(tmp_path / "other.toml")])
+        assert missing.exit_code == 2
+        assert "none is demo/pump, which was recorded" in missing.output
+        with spread_over(1, cluster.address) as spread:
+            assert list(spread(abs, [-1, 2, -3])) == [1, 2, 3]
 
 
 def test_settings_that_are_none_of_a_fleet(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ from benchmarks.studies.results import (
     spread,
     within,
 )
-from benchmarks.studies.study import Cell, Options, Over, Study, read, run
+from benchmarks.studies.study import Cell, Options, Over, Study, read, run, spread_over
 from benchmarks.studies.subjects import SHIPPED, SUBJECTS, subject_named
 from benchmarks.studies.variants import VARIANTS, as_seen, linear_fit, variant_equation
 from models.commissioning.commissioned import KnowledgeLevel, knowledge_of
@@ -83,30 +83,31 @@ def toy(windows: int = 4, machine: str = "none") -> Study:
 
 @pytest.mark.parametrize("processes", [1, 2])
 def test_an_interrupted_study_carries_on_and_gives_the_same_records(tmp_path: Path, processes: int) -> None:
-    kept = run(toy(), Options(windows=4), tmp_path, processes)
-    whole = kept.read_text(encoding="utf-8")
-    assert len(read(toy(), tmp_path)) == 2 * 4 * 2
-    kept.write_text(whole[: len(whole) * 2 // 3], encoding="utf-8")  # in the middle of a line
-    assert 0 < len(read(toy(), tmp_path)) < 16
-    run(toy(), Options(windows=4), tmp_path, processes)
+    with spread_over(processes) as spread:
+        kept = run(toy(), Options(windows=4), tmp_path, spread)
+        whole = kept.read_text(encoding="utf-8")
+        assert len(read(toy(), tmp_path)) == 2 * 4 * 2
+        kept.write_text(whole[: len(whole) * 2 // 3], encoding="utf-8")  # in the middle of a line
+        assert 0 < len(read(toy(), tmp_path)) < 16
+        run(toy(), Options(windows=4), tmp_path, spread)
     assert kept.read_text(encoding="utf-8") == whole
     assert {record["sum"] for record in read(toy(), tmp_path)} == {6}
 
 
 def test_more_windows_are_welcome_and_another_plan_is_not(tmp_path: Path) -> None:
-    run(toy(2), Options(windows=2), tmp_path, 1)
-    kept = run(toy(3), Options(windows=3), tmp_path, 1)
+    run(toy(2), Options(windows=2), tmp_path, map)
+    kept = run(toy(3), Options(windows=3), tmp_path, map)
     assert (len(read(toy(3), tmp_path)), len(read(toy(2), tmp_path))) == (12, 8)
     for study, options in ((toy(), Options(seed=5)), (toy(machine="other"), Options())):
         with pytest.raises(RecordingError, match="choose another --out"):
-            run(study, options, tmp_path, 1)
+            run(study, options, tmp_path, map)
     kept.write_text("nonsense\n", encoding="utf-8")
     with pytest.raises(RecordingError, match="is not JSON"):
         read(toy(), tmp_path)
 
 
 def test_the_page_has_figures_goals_and_how_to_run_it_again(tmp_path: Path) -> None:
-    run(toy(), Options(windows=4), tmp_path, 1)
+    run(toy(), Options(windows=4), tmp_path, map)
     written = write_page(toy(), Options(windows=4, seed=7), read(toy(), tmp_path), tmp_path)
     text = written[0].read_text(encoding="utf-8")
     assert text.startswith("# Sensors at fault\n")

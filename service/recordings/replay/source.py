@@ -56,9 +56,11 @@ class RecordingSource:
         """Files in time order."""
         return tuple(file.path for file in self._files)
 
-    def paths_between(self, from_ns: int | None, to_ns: int | None) -> tuple[Path, ...]:
-        """Files that have data between two times, in time order."""
-        return tuple(file.path for file in self._files if self._touches(file, None, from_ns, to_ns))
+    def paths_between(
+        self, from_ns: int | None, to_ns: int | None, keys: frozenset[str] | None = None
+    ) -> tuple[Path, ...]:
+        """Files that have data between two times, under some keys if they are given, in time order."""
+        return tuple(file.path for file in self._files if self._touches(file, keys, from_ns, to_ns))
 
     @property
     def keys(self) -> frozenset[str]:
