@@ -293,7 +293,7 @@ def _unknown(key: str, above: _Place, model: type[BaseModel], fields: object) ->
     given = _value(above, fields)
     free = [name for name in known if not isinstance(given, Mapping) or name not in given]
     elsewhere = [table for table, other in _tables(model) if key in other.model_fields and other is not owner]
-    if 0 < len(elsewhere) <= 2:
+    if 0 < len(elsewhere) <= 3:
         return f"unknown here; {key} belongs {' or '.join(elsewhere)}", None
     name = _nearest(key, free) or _nearest(key, known)
     if name is not None:
