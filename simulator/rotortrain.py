@@ -78,7 +78,7 @@ def calibrate(
     """Calibrate the networks of a bundle anew, on simulated windows; they are not trained again.
 
     For a bundle that an earlier version made: what its networks read and how sure they say to be is compared with what
-    is true in some three thousand windows. Takes some ten minutes on one core.
+    is true in some three thousand windows.
 
     Example: rotortrain calibrate --machine lab --bundle lab-bundle --out lab-bundle
     """

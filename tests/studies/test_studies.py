@@ -1,6 +1,7 @@
 """The runner, the page, every study at its smallest size; rates and goals; variants of the relation networks."""
 
 import csv
+import pickle
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -132,6 +133,13 @@ def test_wrong_arguments_exit_with_2_and_a_sentence(tmp_path: Path) -> None:
         assert done.exit_code == 2
         assert message in " ".join(done.output.replace("│", " ").split())
         assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("name", command.STUDIES)
+def test_what_a_study_sends_to_other_processes_can_be_sent(name: str) -> None:
+    study = command.STUDIES[name](Options(windows=2, small=True))
+    for sent in (study.measure, study.cells):
+        assert pickle.loads(pickle.dumps(sent))  # noqa: S301  # what was just written
 
 
 @pytest.mark.long

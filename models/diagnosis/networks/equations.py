@@ -10,6 +10,7 @@ excitation drops out at every lag.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -196,6 +197,12 @@ def _disc_response_to_e(rotor: RotorParameters, speed_rad_s: float) -> float:
     return float(np.linalg.solve(dynamic[np.ix_(_DISC, _DISC)], force[_DISC])[0].real)
 
 
+def _over_mass(place: int, name: str, rotor: RotorParameters) -> tuple[float, ...]:
+    """A parameter of a bearing over the mass m1, at one of four inputs; no lambda, so that networks can be pickled."""
+    share = float(getattr(rotor, name)) / rotor.m1_kg
+    return tuple(share if at == place else 0.0 for at in range(4))
+
+
 def _shaft_over_inertia(rotor: RotorParameters) -> tuple[float, ...]:
     """Coefficients of y1, y2 and psi in row 3; the gyroscopic input does not scale with the shaft."""
     L = rotor.shaft_length_m
@@ -209,10 +216,7 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
         title="bearing, horizontal",
         target=Term("y1_dot", rate_reference=True),
         inputs=(Term("y1"), Term("y2"), Term("y1_dot"), Term("y2_dot", rate_reference=True)),
-        signatures={
-            "k_by": lambda rotor: (rotor.k_by_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0),
-            "c_by": lambda rotor: (0.0, 0.0, rotor.c_by_N_s_per_m / rotor.m1_kg, 0.0),
-        },
+        signatures={"k_by": partial(_over_mass, 0, "k_by_N_per_m"), "c_by": partial(_over_mass, 2, "c_by_N_s_per_m")},
     ),
     SynchronousEquation(number="29", title="unbalance at the disc"),
     Equation(
@@ -227,10 +231,7 @@ EQUATIONS: tuple[Equation | SynchronousEquation, ...] = (
         title="bearing, vertical",
         target=Term("z1_dot", rate_reference=True),
         inputs=(Term("z1"), Term("z2"), Term("z1_dot"), Term("z2_dot", rate_reference=True)),
-        signatures={
-            "k_bz": lambda rotor: (rotor.k_bz_N_per_m / rotor.m1_kg, 0.0, 0.0, 0.0),
-            "c_bz": lambda rotor: (0.0, 0.0, rotor.c_bz_N_s_per_m / rotor.m1_kg, 0.0),
-        },
+        signatures={"k_bz": partial(_over_mass, 0, "k_bz_N_per_m"), "c_bz": partial(_over_mass, 2, "c_bz_N_s_per_m")},
     ),
 )
 """The equations in the paper's order; adding a row here is all it takes."""
