@@ -47,6 +47,8 @@ typer.testing._get_command = cache(typer.testing._get_command)  # type: ignore[a
 _LONGEST = (
     "test_browser",
     "test_browser_replays",
+    "test_fleet",
+    "test_shards",
     "test_evidence",
     "test_browser_plots",
     "test_window_again",

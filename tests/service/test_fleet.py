@@ -1,7 +1,6 @@
 """Shards on the computers of a Ray cluster: one that is lost, one that comes, and settings that are none of a fleet."""
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -38,16 +37,16 @@ def fleet_plan(folder: Path, database: str, count: int = 2) -> ServiceSettings:
     return plan.model_copy(update=changed)
 
 
-@contextmanager
-def cluster_of(computers: int) -> Iterator[Cluster]:
-    """A Ray cluster of so many, each with a core, beside one without any; all are this computer."""
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    """A Ray cluster of two computers with a core each, beside one without any; all are this computer."""
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
     try:
-        for _ in range(computers):
-            cluster.add_node(num_cpus=1)
-        yield cluster
+        for _ in range(2):
+            made.add_node(num_cpus=1)
+        yield made
     finally:
-        cluster.shutdown()  # type: ignore[no-untyped-call]
+        made.shutdown()  # type: ignore[no-untyped-call]
 
 
 def computers_of(runtime: Runtime) -> list[str]:
@@ -56,9 +55,9 @@ def computers_of(runtime: Runtime) -> list[str]:
     return [shard.process.computer for shard in runtime._machines._shards]  # type: ignore[attr-defined]  # actors
 
 
-def test_a_computer_that_is_lost_and_one_that_comes(tmp_path: Path) -> None:
+def test_a_computer_that_is_lost_and_one_that_comes(cluster: Cluster, tmp_path: Path) -> None:
     blocks = scenario_blocks(SECONDS, parse_fault("k_by=-0.33@10"))
-    with postgres_server() as server, cluster_of(2) as cluster:
+    with postgres_server() as server:
         plan = fleet_plan(tmp_path, server.new_database("fleet"))
         at = plan.link.connect[0]
         broken = MachineEntry(file=plan.machines[1].file, bundle=str(tmp_path / "nothing"))
@@ -104,7 +103,7 @@ def test_a_computer_that_is_lost_and_one_that_comes(tmp_path: Path) -> None:
                 assert [event.alarm for event in after if event.kind == "raised"].count("k_by") == 1
 
 
-def test_an_archive_and_a_study_on_a_cluster(tmp_path: Path) -> None:
+def test_an_archive_and_a_study_on_a_cluster(cluster: Cluster, tmp_path: Path) -> None:
     plan = plan_for(tmp_path, 1)
     kits = [load_machine(entry.file) for entry in plan.machines]
     files = [
@@ -117,24 +116,23 @@ def test_an_archive_and_a_study_on_a_cluster(tmp_path: Path) -> None:
     for kit in kits:
         alone = ["--key", f"{kit.site}/{kit.name}", "--out", str(tmp_path / f"{kit.name}.jsonl")]
         assert CliRunner().invoke(app, [*offline, *alone]).exit_code == 0
-    with cluster_of(2) as cluster:
-        command = [*offline, "--ray", cluster.address, "--out", str(tmp_path / "results")]
-        found = CliRunner().invoke(app, command)
-        assert found.exit_code == 0, found.output
-        for kit in kits:
-            there = (tmp_path / "results" / f"{kit.site}.{kit.name}.jsonl").read_text(encoding="utf-8")
-            assert there == (tmp_path / f"{kit.name}.jsonl").read_text(encoding="utf-8")
-            assert there
-        assert "2 of 2" in found.output
-        again = CliRunner().invoke(app, command)
-        assert again.exit_code == 2
-        assert "exists already; --overwrite replaces it" in again.output
-        (tmp_path / "other.toml").write_text(machines.partition("\n[[")[0], encoding="utf-8")
-        missing = CliRunner().invoke(app, [*command, "--overwrite", "--config", str(tmp_path / "other.toml")])
-        assert missing.exit_code == 2
-        assert "none is demo/pump, which was recorded" in missing.output
-        with spread_over(1, cluster.address) as spread:
-            assert list(spread(abs, [-1, 2, -3])) == [1, 2, 3]
+    command = [*offline, "--ray", cluster.address, "--out", str(tmp_path / "results")]
+    found = CliRunner().invoke(app, command)
+    assert found.exit_code == 0, found.output
+    for kit in kits:
+        there = (tmp_path / "results" / f"{kit.site}.{kit.name}.jsonl").read_text(encoding="utf-8")
+        assert there == (tmp_path / f"{kit.name}.jsonl").read_text(encoding="utf-8")
+        assert there
+    assert "2 of 2" in found.output
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code == 2
+    assert "exists already; --overwrite replaces it" in again.output
+    (tmp_path / "other.toml").write_text(machines.partition("\n[[")[0], encoding="utf-8")
+    missing = CliRunner().invoke(app, [*command, "--overwrite", "--config", str(tmp_path / "other.toml")])
+    assert missing.exit_code == 2
+    assert "none is demo/pump, which was recorded" in missing.output
+    with spread_over(1, cluster.address) as spread:
+        assert list(spread(abs, [-1, 2, -3])) == [1, 2, 3]
 
 
 def test_settings_that_are_none_of_a_fleet(tmp_path: Path) -> None:
