@@ -42,10 +42,11 @@ def test_a_history_that_cannot_be_written_is_a_reason_until_it_can(
     runtime.start()
     try:
         with open_session(address) as session:
+            assert asked(runtime) == (200, runtime.readiness())  # nothing has come that could be on its way
+            assert runtime.readiness().ready
             feed = Feed(session)
             feed.put_good()
-            assert asked(runtime) == (200, runtime.readiness())
-            assert runtime.readiness().ready
+            until(lambda: runtime.machines()[0].health().quality.accepted_blocks == 1, "the first block")
             blocker = sqlite3.connect(file, isolation_level=None)  # another program that does not let go of the file
             blocker.execute("BEGIN IMMEDIATE")
             feed.start_ns += 3_000_000_000
