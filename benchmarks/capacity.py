@@ -18,6 +18,7 @@ import signal
 import tempfile
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import zenoh
+import zenoh.ext
 from running_monitor import on_loopback, started, url_of
 
 from models.diagnosis.moments import plan_for
@@ -40,6 +42,7 @@ BLOCK_S = 0.1
 KINDS = 4
 """Streams with a seed of their own; machines share them, each with its own times."""
 IN_TIME_S = 1.0
+CACHED = 1200
 
 
 def yardstick_s(machine: MachineFile) -> float:
@@ -97,6 +100,7 @@ class Plant:
     start_ns: int = field(default_factory=time.time_ns)
     sent_s: dict[tuple[str, int], float] = field(default_factory=dict)  # of every block, by its number
     heard: list[tuple[float, float]] = field(default_factory=list)  # when, and how late
+    windows: dict[str, list[tuple[float, int]]] = field(default_factory=lambda: defaultdict(list))  # when, and end
     behind_s: float = 0.0
 
     def hear(self, sample: zenoh.Sample) -> None:
@@ -104,11 +108,23 @@ class Plant:
         now_s, report = time.monotonic(), json.loads(sample.payload.to_bytes())
         last = -(-(report["end_ns"] - self.start_ns) // round(BLOCK_S * 1e9)) - 1
         self.heard.append((now_s, now_s - self.sent_s[report["machine"], last]))
+        self.windows[report["machine"]].append((now_s, report["end_ns"] - self.start_ns))
 
     def send(self, ended: threading.Event) -> None:
         """Send everything, at the pace of the data, until the end."""
         count, per_hop = len(self.machines), round(self.machines[0].window.hop_s / BLOCK_S)
         hashes = [machine.descriptor.schema_hash for machine in self.machines]
+        # As a real publisher: a monitor that begins again gets what it missed.
+        outlets = [
+            zenoh.ext.declare_advanced_publisher(
+                self.session,
+                machine.keys.stream,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                cache=zenoh.ext.CacheConfig(max_samples=CACHED),
+                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=1.0, sporadic_heartbeat=None),
+            )
+            for machine in self.machines
+        ]
         begin_s = time.monotonic()
         for tick in range(len(self.streams[0]) + per_hop):
             for number, machine in enumerate(self.machines):
@@ -122,13 +138,7 @@ class Plant:
                 block = replace(block, start_ns=block.start_ns + self.start_ns)
                 payload, attachment, encoding = encode_block(block, hashes[number])
                 self.sent_s[machine.name, at] = time.monotonic()
-                self.session.put(
-                    machine.keys.stream,
-                    payload,
-                    attachment=attachment,
-                    encoding=encoding,
-                    congestion_control=zenoh.CongestionControl.BLOCK,
-                )
+                outlets[number].put(payload, attachment=attachment, encoding=encoding)
                 self.behind_s = time.monotonic() - due_s
 
 
@@ -150,6 +160,27 @@ def monitored(folder: Path, machines: Sequence[MachineFile]) -> Iterator[tuple[P
         Process(process.pid).signal(signal.SIGCONT)
         process.terminate()
         process.wait(120)
+
+
+@contextmanager
+def sending(
+    endpoint: str, machines: Sequence[MachineFile], streams: list[list[SampleBlock]]
+) -> Iterator[tuple[Plant, threading.Thread]]:
+    """A plant that sends and hears reports, and the thread that does until the streams end or the block is left."""
+    config = zenoh.Config()
+    for path, value in LinkSettings(mode="client", connect=(endpoint,)).zenoh_items().items():
+        config.insert_json5(path, value)
+    with zenoh.open(config) as session:
+        plant, ended = Plant(machines, session, streams), threading.Event()
+        subscriber = session.declare_subscriber("rotorwatch/*/*/report", plant.hear)
+        sender = threading.Thread(target=plant.send, args=(ended,))
+        sender.start()
+        try:
+            yield plant, sender
+        finally:
+            ended.set()
+            sender.join()
+            subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
 def lost(url: str) -> int:
@@ -183,29 +214,17 @@ def measure(count: int, seed: int, length_s: float, stall_s: float) -> None:
         tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name,
         monitored(Path(name), machines) as (process, endpoint, url),
     ):
-        config = zenoh.Config()
-        for path, value in LinkSettings(mode="client", connect=(endpoint,)).zenoh_items().items():
-            config.insert_json5(path, value)
-        with zenoh.open(config) as session:
-            plant, ended = Plant(machines, session, streams), threading.Event()
-            subscriber = session.declare_subscriber("rotorwatch/*/*/report", plant.hear)
-            idle_mb = process.memory_mb()
-            sender = threading.Thread(target=plant.send, args=(ended,))
-            sender.start()
-            try:
-                time.sleep(warm_s)
-                before, begin_s = (process.cpu_s(), process.written_mb(), time.process_time()), time.monotonic()
-                first = len(plant.heard)
-                again_s = _stalled(process, plant, stall_s, length_s) if stall_s else None
-                time.sleep(max(0.0, begin_s + length_s - time.monotonic()))
-                took_s = time.monotonic() - begin_s
-                cpu_s, written_mb = process.cpu_s() - before[0], process.written_mb() - before[1]
-                late = np.array([one for _, one in plant.heard[first:]])
-                memory_mb, missing = process.memory_mb(), lost(url)
-            finally:
-                ended.set()
-                sender.join()
-                subscriber.undeclare()  # type: ignore[no-untyped-call]
+        idle_mb = process.memory_mb()
+        with sending(endpoint, machines, streams) as (plant, _):
+            time.sleep(warm_s)
+            before, begin_s = (process.cpu_s(), process.written_mb(), time.process_time()), time.monotonic()
+            first = len(plant.heard)
+            again_s = _stalled(process, plant, stall_s, length_s) if stall_s else None
+            time.sleep(max(0.0, begin_s + length_s - time.monotonic()))
+            took_s = time.monotonic() - begin_s
+            cpu_s, written_mb = process.cpu_s() - before[0], process.written_mb() - before[1]
+            late = np.array([one for _, one in plant.heard[first:]])
+            memory_mb, missing = process.memory_mb(), lost(url)
     expected = count * took_s / base.window.hop_s
     print(
         f"{count:4d} machines: {cpu_s / took_s:5.2f} cores ({1e3 * cpu_s / expected:.0f} ms a hop, "
