@@ -101,7 +101,7 @@ class _Shard:
         """Hear that alarm events were committed."""
         for place, worker in self._workers.items():
             if worker.history.last_sequence() != self._told.get(place):
-                self._tell(place)
+                self._tell(place, changed=True)
 
     def tell_all(self) -> None:
         """Tell how the machines are monitored."""

@@ -188,14 +188,17 @@ def test_without_an_announced_descriptor_the_machine_file_s_own_is_marked_as_suc
 
 def test_files_are_closed_by_age_also_when_nothing_more_comes(tmp_path: Path) -> None:
     time_s = [0.0]
-    recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), lambda _: (), clock=lambda: time_s[0])
+
+    def clock() -> float:
+        time_s[0] += 0.1  # or a message written after the last second would never be confirmed
+        return time_s[0]
+
+    recorder = MachineRecorder(LAB, into(tmp_path, rotate_s=300), lambda _: (), clock=clock)
     recorder.start()
     put(recorder, blocks(3))
-    until(lambda: bool(recorder.status().file), "open file")
-    time_s[0] = 299.0
     until(lambda: recorder.status().synced == 3, "confirmed messages")
     assert recorder.status().files == 0
-    time_s[0] = 300.0
+    time_s[0] += 300.0
     until(lambda: recorder.status().files == 1, "closed file")
     put(recorder, blocks(1, start_ns=NOW_NS + 300_000_000_000))
     recorder.stop()

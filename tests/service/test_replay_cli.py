@@ -124,12 +124,13 @@ def test_files_that_cannot_be_used(tmp_path: Path, faulty: Path) -> None:
 def test_a_monitor_in_the_namespace_of_a_replay(faulty: Path, tmp_path: Path) -> None:
     """By the commands of the page: monitor, replay, alarm; and without a directory, nothing is recorded."""
     address = endpoint()
-    (tmp_path / "plant.toml").write_text('[recording]\ndirectory = "recordings"\n', encoding="utf-8")
+    text = '[recording]\ndirectory = "recordings"\n\n[queue]\nwhen_full = "wait"\n'
+    (tmp_path / "plant.toml").write_text(text, encoding="utf-8")
     arguments = ("--config", str(tmp_path / "plant.toml"), "--listen", address, "--http-port", "0")
     with program(tmp_path, "service.rotorwatch", "run", *arguments, "--namespace", "replay/x") as monitor:
         monitor.wait_for("HTTP API")
         assert "Zenoh namespace replay/x" in monitor.output()
-        options = ("--prefix", "replay/x", "--pace", "100", "--connect", address, "--wait-for-subscriber", "20")
+        options = ("--prefix", "replay/x", "--pace", "max", "--connect", address, "--wait-for-subscriber", "20")
         found = run(faulty, *options)
         assert found.returncode == 0, found.stderr
         assert "801 messages replayed" in found.stderr

@@ -127,6 +127,7 @@ def test_operators_and_listeners_reach_a_machine_of_another_process(tmp_path: Pa
             assert answered(done, OperationDone).alarm.state == "acknowledged"
             told = next(event for event in events if event.event == "alarm")
             assert '"acknowledged"' in told.data
+            assert '"acknowledged"' in http.get("/api/v1/machines/demo/lab/health").text  # who hears it finds it there
             health = next(event for event in events if event.event == "health" and '"acknowledged"' in event.data)
             assert Health.model_validate_json(health.data).machine == "lab"
         again = http.post(f"{place}/k_by/acknowledge", json={}, headers={"If-Match": seen.headers["etag"]})
